@@ -1,0 +1,224 @@
+"""A Foxglove layout for a log: what to look at, and which series to plot.
+
+The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
+Foxglove and in Lichtblick. Each plotted series names one number: a slice would be drawn as one
+zig-zag line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gymnasium import spaces
+
+from mcaprl.recorder.metadata import LogMetadata
+from mcaprl.recorder.spaces import observation_leaves
+
+LAYOUT_NAME = "foxglove-layout.json"
+VALUES_TOPIC = "/rl/values"
+# Observations of more numbers than this get a series for each of the first ones only.
+MAX_SERIES = 24
+# The depth image's colours span this much, millimetres.
+DEPTH_RANGE_MM = (0, 50_000)
+_COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
+
+Node = dict[str, Any] | str
+
+
+def layout_of(
+    metadata: LogMetadata,
+    topics: Sequence[str],
+    telemetry_names: Sequence[str] = (),
+    follow_frame: str = "",
+) -> dict[str, Any]:
+    """The layout for a log with these topics.
+
+    Args:
+        metadata: of the log: its spaces and names.
+        topics: that the log has beside `/rl/step` and `/rl/episode`.
+        telemetry_names: fields of `/telemetry`.
+        follow_frame: the frame that the 3D view moves with; empty to stand still.
+    """
+    panels: dict[str, dict[str, Any]] = {}
+    views = _views(metadata, topics, follow_frame, panels)
+    plots = _plots(metadata, topics, telemetry_names, panels)
+    panels["StateTransitions!actions"] = _state_transitions(metadata)
+    below: list[Node] = ["StateTransitions!actions"]
+    if "/rosout" in topics:
+        panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/rosout"}
+        below.append("RosOut!log")
+    right = _stack([*plots, *below], "column")
+    root = _split(_stack(views, "column", first_percent=68), right, "row", 52) if views else right
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": root,
+    }
+
+
+def _views(
+    metadata: LogMetadata,
+    topics: Sequence[str],
+    follow_frame: str,
+    panels: dict[str, dict[str, Any]],
+) -> list[Node]:
+    """The 3D panel and the images."""
+    names: list[Node] = []
+    if "/scene" in topics:
+        panels["3D!scene"] = _three_d(follow_frame)
+        names.append("3D!scene")
+    if "/camera/depth" in topics:
+        low, high = DEPTH_RANGE_MM
+        panels["Image!depth"] = _image(
+            "/camera/depth", colorMode="colormap", colorMap="turbo", minValue=low, maxValue=high
+        )
+        names.append("Image!depth")
+    for leaf in observation_leaves(metadata.observation_space):
+        if leaf.encoding is not None:
+            panels[f"Image!{leaf.name}"] = _image(leaf.topic)
+            names.append(f"Image!{leaf.name}")
+    return names
+
+
+def _plots(
+    metadata: LogMetadata,
+    topics: Sequence[str],
+    telemetry_names: Sequence[str],
+    panels: dict[str, dict[str, Any]],
+) -> list[Node]:
+    """One plot of the rewards, one for each unit of the telemetry, one of observations."""
+    series = {"reward": {"reward": "/rl/step.reward"}}
+    if VALUES_TOPIC in topics:
+        actions = _action_names(metadata)
+        series["q_values"] = {
+            f"Q {name}": f"{VALUES_TOPIC}.q[{index}]" for index, name in enumerate(actions)
+        }
+    shown = [name for name in telemetry_names if name in ("speed_m_s", "lateral_offset_m")]
+    for name in shown:
+        series[name] = {name: f"/telemetry.{name}"}
+    if not shown:
+        series["observation"] = _observation_series(metadata)
+    names: list[Node] = []
+    for title, paths in series.items():
+        if paths:
+            panels[f"Plot!{title}"] = _plot(title.replace("_", " "), paths)
+            names.append(f"Plot!{title}")
+    return names
+
+
+def _observation_series(metadata: LogMetadata) -> dict[str, str]:
+    """A named path for each number of the vector observations, as far as they fit a plot."""
+    paths = {}
+    for leaf in observation_leaves(metadata.observation_space):
+        if leaf.encoding is not None:
+            continue
+        named = leaf.path == () and len(metadata.observation_names) == leaf.size
+        for index in range(leaf.size):
+            label = metadata.observation_names[index] if named else f"{leaf.name}[{index}]"
+            suffix = f"[{index}]" if leaf.shape else ""
+            paths[label] = f"/rl/step.{leaf.name}{suffix}"
+    return dict(list(paths.items())[:MAX_SERIES])
+
+
+def _action_names(metadata: LogMetadata) -> list[str]:
+    space = metadata.action_space
+    count = int(space.n) if isinstance(space, spaces.Discrete) else 0
+    meanings = metadata.action_meanings
+    return list(meanings) if len(meanings) == count else [str(index) for index in range(count)]
+
+
+def _state_transitions(metadata: LogMetadata) -> dict[str, Any]:
+    paths = [_state("/rl/step.episode", "episode")]
+    if isinstance(metadata.action_space, spaces.Discrete):
+        names = enumerate(_action_names(metadata), start=int(metadata.action_space.start))
+        legend = ", ".join(f"{value} {name}" for value, name in names)
+        paths.insert(0, _state("/rl/step.action", f"action ({legend})"))
+    return {"foxglovePanelTitle": "Action and episode", "isSynced": True, "paths": paths}
+
+
+def _state(path: str, label: str) -> dict[str, Any]:
+    return {"value": path, "label": label, "enabled": True, "timestampMethod": "receiveTime"}
+
+
+def _plot(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": title,
+        "paths": [
+            {
+                "value": path,
+                "label": label,
+                "color": _COLORS[index % len(_COLORS)],
+                "enabled": True,
+                "timestampMethod": "receiveTime",
+            }
+            for index, (label, path) in enumerate(paths.items())
+        ],
+        "xAxisVal": "timestamp",
+        "isSynced": True,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showPlotValuesInLegend": True,
+    }
+
+
+def _image(topic: str, **mode: Any) -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": topic,
+        "cameraState": {},
+        "followMode": "follow-none",
+        "imageMode": {"imageTopic": topic, "synchronize": False, **mode},
+        "layers": {},
+        "publish": {},
+        "scene": {},
+        "topics": {},
+        "transforms": {},
+    }
+
+
+def _three_d(follow_frame: str) -> dict[str, Any]:
+    return {
+        "foxglovePanelTitle": "Scene",
+        "cameraState": {
+            "perspective": True,
+            "distance": 26,
+            "phi": 62,
+            "thetaOffset": 90,
+            "targetOffset": [4, 0, 0],
+            "target": [0, 0, 0],
+            "targetOrientation": [0, 0, 0, 1],
+            "fovy": 45,
+            "near": 0.5,
+            "far": 5000,
+        },
+        "followMode": "follow-pose" if follow_frame else "follow-none",
+        "followTf": follow_frame or "map",
+        "scene": {"backgroundColor": "#10141c"},
+        "transforms": {},
+        "topics": {"/scene": {"visible": True}, "/scene/static": {"visible": True}},
+        "layers": {},
+        "publish": {},
+        "imageMode": {},
+    }
+
+
+def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
+    return {
+        "first": first,
+        "second": second,
+        "direction": direction,
+        "splitPercentage": percent,
+    }
+
+
+def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:
+    """Panels one after the other, of equal size unless the first one's share is given."""
+    first, *rest = nodes
+    if not rest:
+        return first
+    percent = first_percent if first_percent is not None else 100 / len(nodes)
+    return _split(first, _stack(rest, direction), direction, percent)

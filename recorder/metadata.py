@@ -1,0 +1,170 @@
+"""What a log says of itself, so that it opens without the simulator that made it.
+
+It is the metadata record `mcaprl.dataset`, the first after the file's header, and again the channel
+metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
+
+    format_version      "1"
+    env_id              Gymnasium id, empty if there is none
+    env_kwargs          JSON object: arguments to gymnasium.make
+    observation_space   JSON, see `spaces.space_to_json`
+    action_space        JSON
+    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": where it is}
+    observation_names   JSON list, a name for each number of a vector observation; may be empty
+    action_meanings     JSON list, a name for each discrete action; may be empty
+    step_duration_ns    simulated time between two records
+    policy, epsilon, seed   of the recording, where one holds for all of it; else empty
+    versions            JSON object: package -> version
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+from mcaprl._version import __version__
+from mcaprl.errors import LogError
+from mcaprl.recorder.spaces import observation_leaves, space_from_json, space_to_json
+
+FORMAT_VERSION = "1"
+METADATA_NAME = "mcaprl.dataset"
+DEFAULT_STEP_DURATION_NS = 100_000_000
+_VERSIONED = ("gymnasium", "numpy", "numba", "highway-env")
+
+
+@dataclass(frozen=True)
+class LogMetadata:
+    """The description of a log.
+
+    Attributes:
+        observation_space: of the environment.
+        action_space: of the environment.
+        env_id: Gymnasium id; empty if unknown.
+        env_kwargs: arguments to `gymnasium.make`; JSON types only.
+        observation_names: one for each number of a vector observation, or empty.
+        action_meanings: one for each discrete action, or empty.
+        step_duration_ns: simulated time between two records.
+        policy: who acted, where it was one for the whole log; else empty.
+        epsilon: its exploration, as text; empty if unknown.
+        seed: of the recording, as text; empty if unknown.
+        versions: of the packages that the recording ran with.
+    """
+
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    env_id: str = ""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    observation_names: tuple[str, ...] = ()
+    action_meanings: tuple[str, ...] = ()
+    step_duration_ns: int = DEFAULT_STEP_DURATION_NS
+    policy: str = ""
+    epsilon: str = ""
+    seed: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def to_strings(self) -> dict[str, str]:
+        """The map that is written to the file."""
+        fields = [
+            {
+                "path": leaf.path,
+                **({"topic": leaf.topic} if leaf.encoding else {"field": leaf.name}),
+            }
+            for leaf in observation_leaves(self.observation_space)
+        ]
+        return {
+            "format_version": FORMAT_VERSION,
+            "env_id": self.env_id,
+            "env_kwargs": json.dumps(dict(self.env_kwargs), default=repr),
+            "observation_space": space_to_json(self.observation_space),
+            "action_space": space_to_json(self.action_space),
+            "observation_fields": json.dumps(fields),
+            "observation_names": json.dumps(self.observation_names),
+            "action_meanings": json.dumps(self.action_meanings),
+            "step_duration_ns": str(self.step_duration_ns),
+            "policy": self.policy,
+            "epsilon": self.epsilon,
+            "seed": self.seed,
+            "versions": json.dumps(dict(self.versions)),
+        }
+
+    @classmethod
+    def from_strings(cls, strings: Mapping[str, str]) -> LogMetadata:
+        """Read the map from a file.
+
+        Raises:
+            LogError: a later format version, or a value that does not parse.
+        """
+        found = strings.get("format_version", "")
+        if found != FORMAT_VERSION:
+            raise LogError(
+                f"format version {found or 'missing'}; mcaprl {__version__} reads"
+                f" {FORMAT_VERSION}: pip install -U mcaprl"
+            )
+        try:
+            return cls(
+                observation_space=space_from_json(strings["observation_space"]),
+                action_space=space_from_json(strings["action_space"]),
+                env_id=strings.get("env_id", ""),
+                env_kwargs=json.loads(strings.get("env_kwargs", "{}")),
+                observation_names=tuple(json.loads(strings.get("observation_names", "[]"))),
+                action_meanings=tuple(json.loads(strings.get("action_meanings", "[]"))),
+                step_duration_ns=int(strings.get("step_duration_ns", DEFAULT_STEP_DURATION_NS)),
+                policy=strings.get("policy", ""),
+                epsilon=strings.get("epsilon", ""),
+                seed=strings.get("seed", ""),
+                versions=json.loads(strings.get("versions", "{}")),
+            )
+        except (KeyError, ValueError, TypeError) as error:
+            raise LogError(f"metadata record '{METADATA_NAME}' does not parse: {error}") from error
+
+    @classmethod
+    def of_env(
+        cls,
+        env: gym.Env[Any, Any],
+        *,
+        step_duration_s: float | None = None,
+        policy: str = "",
+        epsilon: str = "",
+        seed: str = "",
+    ) -> LogMetadata:
+        """Describe an environment: its spaces, id and arguments, and its own names for things.
+
+        The time of a step is, in this order: the argument, the environment's `step_duration_s`, one
+        over `metadata["render_fps"]`, 0.1 s.
+        """
+        inner = env.unwrapped
+        if step_duration_s is None:
+            fps = inner.metadata.get("render_fps")
+            fallback = 1 / fps if fps else DEFAULT_STEP_DURATION_NS / 1e9
+            step_duration_s = float(getattr(inner, "step_duration_s", fallback))
+        kwargs = dict(env.spec.kwargs) if env.spec else {}
+        kwargs.pop("render_mode", None)
+        return cls(
+            observation_space=env.observation_space,
+            action_space=env.action_space,
+            env_id=env.spec.id if env.spec else "",
+            env_kwargs=kwargs,
+            observation_names=tuple(getattr(inner, "observation_names", ())),
+            action_meanings=tuple(getattr(inner, "action_meanings", ())),
+            step_duration_ns=round(step_duration_s * 1e9),
+            policy=policy,
+            epsilon=epsilon,
+            seed=seed,
+            versions=installed_versions(),
+        )
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of what a recording depends on."""
+    found = {"mcaprl": __version__}
+    for package in _VERSIONED:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

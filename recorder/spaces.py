@@ -1,0 +1,239 @@
+"""Gymnasium spaces as the log sees them: JSON text, and a flat list of leaves.
+
+A leaf is one array of an observation or action. A Dict space has one per key, any other supported
+space is a single leaf. Supported are Box, Discrete, MultiDiscrete, MultiBinary and, for
+observations, Dict of these at any depth.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import SpaceError
+
+# The smallest edge that makes a uint8 array a picture rather than a vector; SB3 draws no line, its
+# Nature CNN needs 36.
+MIN_IMAGE_EDGE = 8
+IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One array of an observation or action.
+
+    Attributes:
+        name: the field's name in `/rl/step`, or the last part of an image's topic.
+        path: keys that lead to it from the root of a Dict space; empty for the root itself.
+        shape: of one value; empty for a scalar.
+        dtype: of the values that the environment gives.
+        encoding: of an image (`mono8`, `rgb8`, `rgba8`); None for anything else.
+    """
+
+    name: str
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    encoding: str | None = None
+
+    @property
+    def size(self) -> int:
+        """How many numbers one value has."""
+        return math.prod(self.shape)
+
+    @property
+    def topic(self) -> str:
+        """Where an image leaf's messages go."""
+        return f"/rl/observation/{self.name}"
+
+    def of(self, observation: Any) -> Any:
+        """Follow the path into an observation."""
+        for key in self.path:
+            observation = observation[key]
+        return observation
+
+
+def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
+    """List the arrays of an observation space, in the space's own order.
+
+    Raises:
+        SpaceError: a part of it is of a kind that a log cannot hold.
+    """
+    taken: set[str] = set()
+    found = []
+    for path, part in _walk(space, ()):
+        shape, dtype = _shape_and_dtype(part, "observation", path)
+        encoding = _image_encoding(part)
+        words = path or (("image",) if encoding else ())
+        name = _field_name(words if encoding else ("observation", *words), taken)
+        found.append(Leaf(name, path, shape, dtype, encoding))
+    return tuple(found)
+
+
+def action_leaf(space: spaces.Space[Any]) -> Leaf:
+    """The one array of an action space.
+
+    Raises:
+        SpaceError: the space is a Dict, or of a kind that a log cannot hold.
+    """
+    shape, dtype = _shape_and_dtype(space, "action", ())
+    return Leaf("action", (), shape, dtype)
+
+
+def nest(leaves: tuple[Leaf, ...], arrays: list[NDArray[Any]]) -> Any:
+    """Put the leaves' arrays back into the space's own form: one array, or nested dicts."""
+    if leaves[0].path == ():
+        return arrays[0]
+    nested: dict[str, Any] = {}
+    for leaf, array in zip(leaves, arrays, strict=True):
+        inner = nested
+        for key in leaf.path[:-1]:
+            inner = inner.setdefault(key, {})
+        inner[leaf.path[-1]] = array
+    return nested
+
+
+def space_to_json(space: spaces.Space[Any]) -> str:
+    """Write a space as JSON text; `space_from_json` gives an equal space.
+
+    Raises:
+        SpaceError: the space, or a part of it, is of a kind that a log cannot hold.
+    """
+    return json.dumps(_to_plain(space))
+
+
+def space_from_json(text: str) -> spaces.Space[Any]:
+    """Read a space that `space_to_json` wrote.
+
+    Raises:
+        SpaceError: the text describes no space.
+    """
+    try:
+        return _from_plain(json.loads(text))
+    except (ValueError, KeyError, TypeError, AssertionError) as error:
+        raise SpaceError(f"no description of a space: {text[:80]!r}") from error
+
+
+def _walk(
+    space: spaces.Space[Any], path: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], spaces.Space[Any]]]:
+    if isinstance(space, spaces.Dict):
+        for key, part in space.spaces.items():
+            yield from _walk(part, (*path, key))
+    else:
+        yield path, space
+
+
+def _shape_and_dtype(
+    space: spaces.Space[Any], role: str, path: tuple[str, ...]
+) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    where = role + "".join(f"['{key}']" for key in path)
+    if not isinstance(
+        space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    ):
+        allowed = "Box, Discrete, MultiDiscrete, MultiBinary"
+        allowed += ", or a Dict of these" if role == "observation" else ""
+        raise SpaceError(f"{where} is a {type(space).__name__} space; a log can hold {allowed}")
+    shape = tuple(space.shape or ())
+    if math.prod(shape) == 0:
+        raise SpaceError(f"{where} has shape {shape}, no numbers at all; leave it out of the space")
+    dtype = np.dtype(space.dtype)
+    if dtype.kind not in "biuf" or dtype.itemsize > 8:
+        raise SpaceError(f"{where} has dtype {dtype}; a log can hold bool, integers and floats")
+    return shape, dtype
+
+
+def _image_encoding(space: spaces.Space[Any]) -> str | None:
+    """The encoding of an image space: uint8, (height, width) or (height, width, 1 | 3 | 4)."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return None
+    if len(space.shape) not in (2, 3) or min(space.shape[:2]) < MIN_IMAGE_EDGE:
+        return None
+    return IMAGE_ENCODINGS.get(space.shape[2] if len(space.shape) == 3 else 1)
+
+
+def _field_name(words: tuple[str, ...], taken: set[str]) -> str:
+    """A ROS field name: lower case letters, digits and single underscores."""
+    plain = [re.sub(r"[^a-z0-9]+", "_", word.lower()).strip("_") or "x" for word in words]
+    name = candidate = "_".join(plain)
+    if not name[0].isalpha():
+        name = candidate = f"key_{name}"
+    number = 2
+    while candidate in taken:
+        candidate, number = f"{name}_{number}", number + 1
+    taken.add(candidate)
+    return candidate
+
+
+def _to_plain(space: spaces.Space[Any]) -> dict[str, Any]:
+    match space:
+        case spaces.Box():
+            return {
+                "type": "Box",
+                "low": _numbers(space.low),
+                "high": _numbers(space.high),
+                "shape": list(space.shape),
+                "dtype": str(space.dtype),
+            }
+        case spaces.Discrete():
+            return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+        case spaces.MultiDiscrete():
+            return {
+                "type": "MultiDiscrete",
+                "nvec": space.nvec.tolist(),
+                "start": space.start.tolist(),
+                "dtype": str(space.dtype),
+            }
+        case spaces.MultiBinary():
+            return {"type": "MultiBinary", "shape": list(space.shape)}
+        case spaces.Dict():
+            parts = [[key, _to_plain(part)] for key, part in space.spaces.items()]
+            return {"type": "Dict", "spaces": parts}
+        case _:
+            raise SpaceError(f"a {type(space).__name__} space cannot be written to a log")
+
+
+def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
+    match plain["type"]:
+        case "Box":
+            shape, dtype = tuple(plain["shape"]), np.dtype(plain["dtype"])
+            low = _bounds(plain["low"], shape, dtype)
+            high = _bounds(plain["high"], shape, dtype)
+            return spaces.Box(low, high, shape, dtype.type)
+        case "Discrete":
+            return spaces.Discrete(plain["n"], start=plain["start"])
+        case "MultiDiscrete":
+            dtype = np.dtype(plain["dtype"])
+            return spaces.MultiDiscrete(plain["nvec"], dtype=dtype.type, start=plain["start"])
+        case "MultiBinary":
+            return spaces.MultiBinary(plain["shape"])
+        case "Dict":
+            return spaces.Dict([(key, _from_plain(part)) for key, part in plain["spaces"]])
+        case other:
+            raise ValueError(other)
+
+
+def _numbers(bounds: NDArray[Any]) -> Any:
+    """Bounds as JSON: a single number where all are equal; infinities as strings."""
+    flat = [_number(value) for value in bounds.ravel().tolist()]
+    return flat[0] if len(set(flat)) == 1 else flat
+
+
+def _number(value: float) -> float | str:
+    return value if math.isfinite(value) else str(value)
+
+
+def _bounds(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    flat = plain if isinstance(plain, list) else [plain]
+    values = np.array([float(v) if isinstance(v, str) else v for v in flat]).astype(dtype)
+    return np.broadcast_to(values if len(flat) > 1 else values[0], (math.prod(shape),)).reshape(
+        shape
+    )

@@ -1,0 +1,113 @@
+"""Plane geometry of a closed path: where its points are, and which one is nearest."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mcaprl.sims.compiled import compiled
+
+
+class Path(NamedTuple):
+    """A closed polyline of N legs, addressed by the distance along it."""
+
+    points_m: NDArray[np.float64]
+    """(N + 1, 2) corners; the last one is the first again."""
+    along_m: NDArray[np.float64]
+    """(N + 1,) distance of each corner from the start, along the path."""
+    yaw_rad: NDArray[np.float64]
+    """(N,) direction of each leg, counter-clockwise from x."""
+    length_m: float
+
+
+class Projection(NamedTuple):
+    """The path point nearest to a position."""
+
+    along_m: float
+    offset_m: float
+    """Distance from it, positive to the left of the path's direction."""
+    yaw_rad: float
+    """Direction of the path there."""
+
+
+def closed_path(corners: ArrayLike) -> Path:
+    """Make a path through corners of shape (N + 1, 2), metres, the last equal to the first.
+
+    Raises:
+        ValueError: the corners do not form a closed polyline of legs longer than 0.
+    """
+    points = np.array(corners, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+        raise ValueError(f"corners have shape {points.shape}: at least (3, 2) is needed")
+    if not np.array_equal(points[0], points[-1]):
+        raise ValueError(f"the path is open: it starts at {points[0]} and ends at {points[-1]}")
+    legs = np.diff(points, axis=0)
+    lengths = np.hypot(legs[:, 0], legs[:, 1])
+    if not np.all(lengths > 0):
+        raise ValueError("two neighbouring corners are the same point")
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    return Path(points, along, np.arctan2(legs[:, 1], legs[:, 0]), float(along[-1]))
+
+
+@compiled
+def wrap_angle(angle_rad: float) -> float:
+    """Bring an angle into [-pi, pi)."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+@compiled
+def leg_at(path: Path, along_m: float) -> int:
+    """Give the index of the leg that holds a distance along the path; any lap will do."""
+    rest_m = along_m % path.length_m
+    leg = 0
+    while leg + 1 < len(path.yaw_rad) and path.along_m[leg + 1] <= rest_m:
+        leg += 1
+    return leg
+
+
+@compiled
+def point_at(path: Path, along_m: float) -> tuple[float, float]:
+    """Give the point (x, y) at a distance along the path, metres; any lap will do."""
+    leg = leg_at(path, along_m)
+    rest_m = along_m % path.length_m - path.along_m[leg]
+    share = rest_m / (path.along_m[leg + 1] - path.along_m[leg])
+    start, end = path.points_m[leg], path.points_m[leg + 1]
+    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+
+
+@compiled
+def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
+    """Find the nearest of the path points between two distances along it.
+
+    The window [from_m, to_m] keeps a traveller on its own pass where the path meets itself. It may
+    begin on any lap, and the result's `along_m` lies inside it.
+    """
+    leg = leg_at(path, from_m)
+    leg_start_m = from_m - (from_m % path.length_m - path.along_m[leg])
+    best = Projection(from_m, math.inf, 0.0)
+    while leg_start_m <= to_m:
+        leg_length_m = path.along_m[leg + 1] - path.along_m[leg]
+        yaw_rad = path.yaw_rad[leg]
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        dx, dy = x_m - path.points_m[leg, 0], y_m - path.points_m[leg, 1]
+        first_m = max(0.0, from_m - leg_start_m)
+        last_m = min(leg_length_m, to_m - leg_start_m)
+        along_leg_m = min(max(dx * cos + dy * sin, first_m), last_m)
+        distance_m = math.hypot(dx - along_leg_m * cos, dy - along_leg_m * sin)
+        if distance_m < abs(best.offset_m):
+            offset_m = distance_m if cos * dy - sin * dx >= 0.0 else -distance_m
+            best = Projection(leg_start_m + along_leg_m, offset_m, yaw_rad)
+        leg_start_m += leg_length_m
+        leg = (leg + 1) % len(path.yaw_rad)
+    return best
+
+
+@compiled
+def in_body_frame(
+    dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float
+) -> tuple[float, float]:
+    """Turn a map vector into a body's frame: (forward, left), metres."""
+    return dx_m * cos_yaw + dy_m * sin_yaw, dy_m * cos_yaw - dx_m * sin_yaw

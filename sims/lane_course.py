@@ -1,0 +1,142 @@
+"""The course of the lane sim: its path, its streets, and what stands beside them.
+
+The path is two squares of about 130 m that share a leg, 1,026 m in all: the first square is driven
+clockwise, the second counter-clockwise. Coordinates are right-handed with z up, so y is mirrored
+against the published course, whose y points right; turning right in one is turning right in the
+other. Nothing here is random: the same course stands on every machine.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry import closed_path
+
+CORNERS_M = (
+    (0.0, 1.0),
+    (130.0, 1.0),
+    (130.0, -125.0),
+    (0.0, -125.0),
+    (0.0, 1.0),
+    (130.0, 1.0),
+    (130.0, 128.0),
+    (0.0, 128.0),
+    (0.0, 1.0),
+)
+COURSE = closed_path(CORNERS_M)
+
+LANE_HALF_WIDTH_M = 3.5
+RAIL_OFFSET_M = 4.0
+"""Distance of the rails' inner faces from the centre line."""
+RAIL_HEIGHT_M = 0.7
+RAIL_THICKNESS_M = 0.12
+GROUND_HALF_SIDE_M = 1000.0
+"""The ground reaches beyond the last row of pixels under the horizon."""
+
+
+class Box(NamedTuple):
+    """An upright box on the ground, its edges along x, y and z; metres."""
+
+    x_m: float
+    y_m: float
+    length_m: float
+    width_m: float
+    height_m: float
+
+
+def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Give each leg's two ends (2,), metres; the leg that the path takes twice comes once."""
+    legs = {
+        tuple(sorted([start, end]))
+        for start, end in zip(CORNERS_M[:-1], CORNERS_M[1:], strict=True)
+    }
+    return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
+
+
+def street_bounds(half_width_m: float) -> NDArray[np.float64]:
+    """Give (K, 4) rectangles x0, y0, x1, y1 around the streets, square ends included; metres."""
+    ends = np.array(streets())
+    return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
+
+
+class Pavement(NamedTuple):
+    """The union of the streets, cut into cells by the lines through all rectangles' edges."""
+
+    x_m: NDArray[np.float64]
+    """(M + 1,) cell borders."""
+    y_m: NDArray[np.float64]
+    """(N + 1,) cell borders."""
+    paved: NDArray[np.bool_]
+    """(M, N)"""
+
+
+def pavement(half_width_m: float) -> Pavement:
+    """Cut the union of the streets into cells; the cells show where it ends."""
+    bounds = street_bounds(half_width_m)
+    x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
+    middle_x, middle_y = (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
+    paved = np.zeros((len(middle_x), len(middle_y)), dtype=np.bool_)
+    for x0, y0, x1, y1 in bounds:
+        inside_x, inside_y = (middle_x > x0) & (middle_x < x1), (middle_y > y0) & (middle_y < y1)
+        paved |= np.outer(inside_x, inside_y)
+    return Pavement(x_m, y_m, paved)
+
+
+def outline(half_width_m: float) -> NDArray[np.float64]:
+    """Give the edge of the streets' union as (M, 2, 2) segments: start and end, x and y, metres."""
+    x_m, y_m, paved = pavement(half_width_m)
+    padded = np.pad(paved, 1)
+    across_x = np.argwhere(padded[1:, 1:-1] != padded[:-1, 1:-1])
+    across_y = np.argwhere(padded[1:-1, 1:] != padded[1:-1, :-1])
+    edges = [((x_m[i], y_m[j]), (x_m[i], y_m[j + 1])) for i, j in across_x]
+    edges += [((x_m[i], y_m[j]), (x_m[i + 1], y_m[j])) for i, j in across_y]
+    return np.array(edges)
+
+
+def rails() -> list[Box]:
+    """Give the guard rails: thin boxes around the streets, open where streets meet."""
+    boxes = []
+    for (x0, y0), (x1, y1) in outline(RAIL_OFFSET_M + RAIL_THICKNESS_M / 2):
+        length_m, width_m = x1 - x0 + RAIL_THICKNESS_M, y1 - y0 + RAIL_THICKNESS_M
+        boxes.append(Box((x0 + x1) / 2, (y0 + y1) / 2, length_m, width_m, RAIL_HEIGHT_M))
+    return boxes
+
+
+def _spread(index: int, low: float, high: float) -> float:
+    """Give the index-th number of an evenly spread sequence (multiples of the golden ratio)."""
+    return low + (high - low) * (index * 0.6180339887498949 % 1.0)
+
+
+def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
+    apart_x = np.minimum(bounds[:, 2] - box.x_m, box.x_m - bounds[:, 0]) <= -box.length_m / 2
+    apart_y = np.minimum(bounds[:, 3] - box.y_m, box.y_m - bounds[:, 1]) <= -box.width_m / 2
+    return bool(np.any(~(apart_x | apart_y)))
+
+
+def buildings() -> list[Box]:
+    """Give the houses along both sides of each street; none stands on a street or another."""
+    taken = street_bounds(RAIL_OFFSET_M + 2.0)
+    boxes: list[Box] = []
+    index = 0
+    for start, end in streets():
+        length_m = float(np.hypot(*(end - start)))
+        forward = (end - start) / length_m
+        for left in (np.array([-forward[1], forward[0]]), np.array([forward[1], -forward[0]])):
+            along_m = -12.0
+            while along_m < length_m + 12.0:
+                index += 1
+                front_m, deep_m = _spread(index, 8.0, 18.0), _spread(3 * index, 8.0, 15.0)
+                off_m = _spread(5 * index, 7.5, 11.5) + deep_m / 2
+                middle = start + forward * (along_m + front_m / 2) + left * off_m
+                size = np.abs(forward) * front_m + np.abs(left) * deep_m
+                height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
+                box = Box(*middle.tolist(), *size.tolist(), height_m)
+                if not _overlaps(box, taken):
+                    boxes.append(box)
+                    corner = [*(middle - size / 2 - 1.0), *(middle + size / 2 + 1.0)]
+                    taken = np.vstack([taken, corner])
+                along_m += front_m + _spread(13 * index, 2.0, 6.0)
+    return boxes
