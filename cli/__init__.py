@@ -1,1 +1,1 @@
-"""mcaprl.cli"""
+"""mcaprl.cli."""

@@ -1,1 +1,1 @@
-"""mcaprl.offline"""
+"""mcaprl.offline."""

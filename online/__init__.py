@@ -1,1 +1,1 @@
-"""mcaprl.online"""
+"""mcaprl.online."""

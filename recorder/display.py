@@ -13,8 +13,8 @@ from __future__ import annotations
 import struct
 
 from mcaprl.recorder import messages
-from mcaprl.recorder.columns import ImageColumn
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
+from mcaprl.recorder.rows import ImageColumn
 from mcaprl.recorder.scene import (
     DepthSource,
     SceneSource,

@@ -102,8 +102,8 @@ class LogWriter:
             OutputExistsError, LogError: the file cannot be created.
         """
         leaves = observation_leaves(metadata.observation_space)
+        self.metadata = metadata
         self.action = action_leaf(metadata.action_space)
-        self.vectors = tuple(leaf for leaf in leaves if leaf.encoding is None)
         self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
         name, text = step_schema(metadata.observation_space, metadata.action_space)
         dtype = message_dtype(text)

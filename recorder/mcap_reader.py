@@ -205,7 +205,13 @@ class McapReader:
             offset = content + length
 
     def _indexes(self, channel: Channel) -> Iterator[tuple[ChunkIndex, NDArray[Any]]]:
-        for chunk in self.chunks:
+        for number, chunk in enumerate(self.chunks):
+            cut_off = not self.complete and number == len(self.chunks) - 1
+            if not chunk.message_index_offsets and not cut_off:
+                raise LogError(
+                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} has no message"
+                    " index; write the file anew with message indexes"
+                )
             offset = chunk.message_index_offsets.get(channel.id)
             if offset is None:
                 continue
@@ -244,7 +250,10 @@ class McapReader:
             if opcode == Opcode.CHUNK:
                 if not scan:
                     break
-                pending = self._scanned_chunk(offset, len(content))
+                try:
+                    pending = self._scanned_chunk(offset, len(content))
+                except CorruptLogError as error:
+                    raise CorruptLogError(f"{self.path}: {error}") from error
                 self.chunks.append(pending)
             elif opcode == Opcode.MESSAGE_INDEX and pending is not None:
                 (channel_id,) = struct.unpack_from("<H", content)
@@ -282,12 +291,22 @@ class McapReader:
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> Any:
         try:
-            return _PARSERS[opcode].read(_stream(content))
-        # The library raises whatever its parsing meets; none of it is more than "damaged".
-        except Exception as error:
-            raise CorruptLogError(
-                f"{self.path}: the {Opcode(opcode).name.lower()} record at byte {offset} is damaged"
-            ) from error
+            return parse_record(opcode, content)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
+
+
+def parse_record(opcode: int, content: memoryview) -> Any:
+    """A record of the `mcap` library from its content.
+
+    Raises:
+        CorruptLogError: the content is no such record.
+    """
+    try:
+        return _PARSERS[opcode].read(_stream(content))
+    # The library raises whatever its parsing meets; none of it is more than "damaged".
+    except Exception as error:
+        raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
 
 
 def _stream(content: memoryview) -> ReadDataStream:

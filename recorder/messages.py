@@ -12,6 +12,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from mcaprl.errors import CorruptLogError
+
 EPISODE_TYPE = "mcaprl_msgs/msg/Episode"
 EPISODE_TEXT = """\
 # One episode, told at its end.
@@ -64,8 +66,16 @@ def encode(message: Any) -> bytes:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """CDR bytes as a message. Raises what rosbags raises where they do not fit the type."""
-    return typestore().deserialize_cdr(data, type_name)
+    """CDR bytes as a message.
+
+    Raises:
+        CorruptLogError: they do not fit the type.
+    """
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    # The library raises whatever its parsing meets; none of it is more than "does not fit".
+    except Exception as error:
+        raise CorruptLogError(f"{len(data)} bytes are no {type_name}: {error}") from error
 
 
 def stamp(time_ns: int) -> Any:

@@ -17,11 +17,11 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
-from mcaprl.recorder.columns import ImageColumn, StepColumns, leaf_writers
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
 from mcaprl.recorder.metadata import LogMetadata
+from mcaprl.recorder.rows import ImageColumn, StepColumns, leaf_writers
 
 
 class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):

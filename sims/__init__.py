@@ -1,1 +1,52 @@
-"""mcaprl.sims"""
+"""Sims that record well and learn fast: plain Gymnasium environments, registered on import.
+
+    >>> import mcaprl.sims
+    >>> sorted(mcaprl.sims.SIMS)
+    ['lane']
+
+Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import gymnasium as gym
+
+from mcaprl.errors import UnknownNameError, UsageError, import_extra
+
+SIMS: Final[dict[str, str]] = {"lane": "mcaprl/LaneKeeping-v0"}
+"""Short name of each sim, and the id that Gymnasium knows it by."""
+
+gym.register(
+    id=SIMS["lane"],
+    entry_point="mcaprl.sims.lane:LaneKeepingEnv",
+    max_episode_steps=400,
+)
+
+
+def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
+    """Make an environment from a sim's short name or from any Gymnasium id.
+
+    Args:
+        name: `lane`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
+
+    Raises:
+        UnknownNameError: there is no such sim, or the sim does not know the value of an argument.
+        MissingExtraError: the packages that the sim needs are not installed.
+        UsageError: the environment takes no such argument, or cannot be made.
+    """
+    env_id = SIMS.get(name, name)
+    if env_id in SIMS.values():
+        import_extra("numba", "sims")
+    try:
+        return gym.make(env_id, **kwargs)
+    except gym.error.UnregisteredEnv as error:
+        raise UnknownNameError("sim", name, [*SIMS, *gym.registry]) from error
+    except (TypeError, gym.error.Error, ModuleNotFoundError) as error:
+        given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
+        raise UsageError(f"cannot make sim '{name}' with {given}: {error}") from error
+
+
+__all__ = ["SIMS", "make_sim"]

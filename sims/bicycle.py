@@ -43,9 +43,7 @@ def roll(
 
 
 @compiled
-def steering_for_lateral(
-    lateral_m_s2: float, speed_m_s: float, wheelbase_m: float
-) -> float:
+def steering_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
     """Give the steering angle, radians, that makes a sideways acceleration at a speed.
 
     The car turns on a radius of l / sin(beta), so v^2 sin(beta) / l = lateral; at low speed no

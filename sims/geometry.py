@@ -106,8 +106,6 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
 
 
 @compiled
-def in_body_frame(
-    dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float
-) -> tuple[float, float]:
+def in_body_frame(dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
     """Turn a map vector into a body's frame: (forward, left), metres."""
     return dx_m * cos_yaw + dy_m * sin_yaw, dy_m * cos_yaw - dx_m * sin_yaw

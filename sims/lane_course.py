@@ -8,6 +8,7 @@ other. Nothing here is random: the same course stands on every machine.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -49,10 +50,7 @@ class Box(NamedTuple):
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Give each leg's two ends (2,), metres; the leg that the path takes twice comes once."""
-    legs = {
-        tuple(sorted([start, end]))
-        for start, end in zip(CORNERS_M[:-1], CORNERS_M[1:], strict=True)
-    }
+    legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 
 
@@ -133,7 +131,7 @@ def buildings() -> list[Box]:
                 middle = start + forward * (along_m + front_m / 2) + left * off_m
                 size = np.abs(forward) * front_m + np.abs(left) * deep_m
                 height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
-                box = Box(*middle.tolist(), *size.tolist(), height_m)
+                box = Box(middle[0], middle[1], size[0], size[1], height_m)
                 if not _overlaps(box, taken):
                     boxes.append(box)
                     corner = [*(middle - size / 2 - 1.0), *(middle + size / 2 + 1.0)]
