@@ -154,7 +154,7 @@ def _check_contents(path: Path, report: Report) -> None:
         total = float(sum(episode.rewards.tolist()))
         if total != episode.total_reward and not np.isnan(total):
             report(
-                f"/rl/episode tells a return of {episode.total_reward}, the rewards add up to {total}",
+                f"/rl/episode tells a return of {episode.total_reward}, its rewards give {total}",
                 f"episode {episode.index}",
             )
 

@@ -1,0 +1,136 @@
+"""Scores policies on the same episodes, with intervals that say how sure one can be."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, Policy, rollout
+
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class PolicyScore:
+    """What one policy reached.
+
+    Attributes:
+        policy: its name.
+        results: episodes of each training seed; scripted policies have one "seed".
+        mean_return: over seeds and episodes.
+        interval: 95 % bootstrap interval of the mean, over seeds and episodes.
+        normalized_score: 0 as random, 1 as the pilot; None without a pilot.
+        normalized_interval: the interval on that scale.
+    """
+
+    policy: str
+    results: tuple[tuple[EpisodeResult, ...], ...]
+    mean_return: float
+    interval: tuple[float, float]
+    normalized_score: float | None = None
+    normalized_interval: tuple[float, float] | None = None
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """(seeds, episodes)."""
+        return np.array([[episode.total_reward for episode in seed] for seed in self.results])
+
+    @property
+    def ends(self) -> dict[str, int]:
+        """Episodes by the reason they ended."""
+        return dict(Counter(e.reason for seed in self.results for e in seed).most_common())
+
+    def to_json(self) -> dict[str, Any]:
+        """As `mcaprl evaluate --json` prints it."""
+        returns = self.returns
+        return {
+            "policy": self.policy,
+            "episodes": int(returns.size),
+            "mean_return": self.mean_return,
+            "interval": list(self.interval),
+            "normalized_score": self.normalized_score,
+            "normalized_interval": self.normalized_interval and list(self.normalized_interval),
+            "seed_means": returns.mean(axis=1).tolist(),
+            "mean_length": float(np.mean([e.length for seed in self.results for e in seed])),
+            "ends": self.ends,
+            "returns": returns.ravel().tolist(),
+        }
+
+
+def evaluate(
+    env: gym.Env[Any, Any],
+    policies: Sequence[Policy | None],
+    *,
+    name: str,
+    episodes: int,
+    seed: int,
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> PolicyScore:
+    """Run one policy, or one per training seed, greedily through the same episodes.
+
+    Args:
+        env: to run in.
+        policies: of the training seeds; [None] acts at random.
+        name: for tables.
+        episodes: for each of `policies`; the same starts for all.
+        seed: of the episodes.
+        on_episode: called after each one.
+    """
+    results = tuple(
+        tuple(
+            rollout(
+                env,
+                EpsilonGreedy(policy, 0.0, env.action_space),
+                seed=seed,
+                episodes=episodes,
+                on_episode=on_episode,
+            )
+        )
+        for policy in policies
+    )
+    returns = np.array([[episode.total_reward for episode in one] for one in results])
+    return PolicyScore(name, results, float(returns.mean()), bootstrap_interval(returns))
+
+
+def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
+    """Add the score on the scale random = 0, pilot = 1; as it is if there is no pilot."""
+    if pilot is None or pilot.mean_return == random.mean_return:
+        return score
+    span = pilot.mean_return - random.mean_return
+
+    def scaled(value: float) -> float:
+        return (value - random.mean_return) / span
+
+    low, high = score.interval
+    return replace(
+        score,
+        normalized_score=scaled(score.mean_return),
+        normalized_interval=(scaled(low), scaled(high)),
+    )
+
+
+def bootstrap_interval(returns: NDArray[np.float64], *, seed: int = 0) -> tuple[float, float]:
+    """95 % percentile interval of the mean return.
+
+    Training seeds are drawn with replacement, and episodes within each, so that the interval
+    covers both what another training run and what other episodes would have given.
+
+    Args:
+        returns: (seeds, episodes).
+        seed: of the resampling.
+    """
+    random = np.random.default_rng(seed)
+    seeds, episodes = returns.shape
+    rows = random.integers(seeds, size=(RESAMPLES, seeds, 1))
+    columns = random.integers(episodes, size=(RESAMPLES, seeds, episodes))
+    means = returns[rows, columns].mean(axis=(1, 2))
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(means, [tail, 100 - tail])
+    return float(low), float(high)
