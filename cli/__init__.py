@@ -1,1 +1,75 @@
-"""mcaprl.cli."""
+"""The command line: parse, call, print. `mcaprl --help` lists the commands.
+
+Every command exits 0 on success, 1 on failure, 2 on wrong usage. A user's mistake is one line on
+stderr. Commands import what they need when they run, so that `mcaprl info` needs no torch.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from mcaprl._version import __version__
+from mcaprl.cli.evaluate import evaluate
+from mcaprl.cli.logs import check, info, layout
+from mcaprl.cli.record import record
+from mcaprl.cli.train_offline import train_offline
+from mcaprl.errors import McaprlError
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="mcaprl", message="%(prog)s %(version)s")
+def cli() -> None:
+    """The robot's log is the dataset: record, learn from and replay MCAP files."""
+
+
+for _command in (record, train_offline, evaluate, info, check, layout):
+    cli.add_command(_command)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the program and exit.
+
+    Args:
+        arguments: without the program's name; default: the process's own.
+    """
+    # A terminated recording closes its file on the way out, as an interrupted one does.
+    signal.signal(signal.SIGTERM, _terminate)
+    warnings.showwarning = _print_warning
+    sys.exit(run(arguments))
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the program and return its exit code; errors of the user's are told on stderr."""
+    try:
+        code = cli.main(arguments, prog_name="mcaprl", standalone_mode=False)
+    except click.UsageError as error:
+        command = error.ctx.command_path if error.ctx else "mcaprl"
+        return _fail(f"{error.format_message()} (see {command} --help)", error.exit_code)
+    except click.ClickException as error:
+        return _fail(error.format_message(), error.exit_code)
+    except McaprlError as error:
+        return _fail(str(error), error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        return _fail("interrupted; what was finished is kept", 1)
+    return code if isinstance(code, int) else 0
+
+
+def _fail(message: str, code: int) -> int:
+    line = " ".join(message.split())
+    click.echo(f"mcaprl: {line}", err=True)
+    return code
+
+
+def _terminate(number: int, frame: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """One line, without the place in our code that means nothing to a user."""
+    click.echo(f"mcaprl: warning: {' '.join(str(message).split())}", err=True)

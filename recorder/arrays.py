@@ -139,15 +139,14 @@ def _last_steps(
     last = ends.copy()
     last[-1] = True
     for observation, following in zip(here, there, strict=True):
-        same = _bytes_of(observation[1:]) == _bytes_of(following[:-1])
-        last[:-1] |= ~same.all(axis=1)
+        differ = _bytes_of(observation)[1:] != _bytes_of(following)[:-1]
+        last[:-1] |= differ.any(axis=1)
     return np.flatnonzero(last)
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
     """Rows as bytes, so that NaN equals itself."""
-    flat = np.ascontiguousarray(array).reshape(len(array), -1)
-    return flat.view(np.uint8).reshape(len(array), -1)
+    return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)
 
 
 def _assemble(

@@ -193,7 +193,7 @@ def _to_plain(space: spaces.Space[Any]) -> dict[str, Any]:
                 "dtype": str(space.dtype),
             }
         case spaces.MultiBinary():
-            return {"type": "MultiBinary", "shape": list(space.shape)}
+            return {"type": "MultiBinary", "n": space.n}
         case spaces.Dict():
             parts = [[key, _to_plain(part)] for key, part in space.spaces.items()]
             return {"type": "Dict", "spaces": parts}
@@ -214,7 +214,7 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
             dtype = np.dtype(plain["dtype"])
             return spaces.MultiDiscrete(plain["nvec"], dtype=dtype.type, start=plain["start"])
         case "MultiBinary":
-            return spaces.MultiBinary(plain["shape"])
+            return spaces.MultiBinary(plain["n"])
         case "Dict":
             return spaces.Dict([(key, _from_plain(part)) for key, part in plain["spaces"]])
         case other:

@@ -1,0 +1,160 @@
+"""`mcaprl info`, `check` and `layout`: what is in a log, whether it is whole, how to look at it."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from mcaprl.cli.show import print_json, print_table, size, write_json
+from mcaprl.errors import CorruptLogError, OutputExistsError
+from mcaprl.recorder.check import check_log
+from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.reader import describe, find_logs, open_logs
+
+
+@click.command()
+@click.argument("data", nargs=-1, required=True)
+@click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+def info(data: tuple[str, ...], strict: bool, as_json: bool) -> int:
+    """Tell what is in DATA: files, folders or globs of logs."""
+    paths = find_logs(data)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dataset = open_logs(paths)
+    facts = describe_dataset(dataset)
+    facts["size_bytes"] = sum(path.stat().st_size for path in paths)
+    facts["problems"] = [str(warning.message) for warning in caught] + facts["problems"]
+    if as_json:
+        print_json(facts)
+    else:
+        _print_facts(facts, dataset, len(paths))
+    return int(strict and bool(facts["problems"]))
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+def check(files: tuple[str, ...], as_json: bool) -> int:
+    """Read every byte of FILE... and tell what is wrong. Exits with 1 if anything is."""
+    paths = find_logs(files)
+    problems = [problem for path in paths for problem in check_log(path)]
+    if as_json:
+        print_json({"ok": not problems, "problems": [asdict(problem) for problem in problems]})
+    else:
+        for problem in problems:
+            click.echo(str(problem))
+        if not problems:
+            click.echo(f"{len(paths)} file{'s' * (len(paths) > 1)} checked, nothing wrong")
+    return int(bool(problems))
+
+
+@click.command()
+@click.argument("source", metavar="SIM|FILE")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+def layout(source: str, out: Path, overwrite: bool) -> None:
+    """Write the Foxglove layout of a log, or of the logs that a sim will give."""
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
+    found = _layout_of_file(Path(source)) if Path(source).exists() else _layout_of_sim(source)
+    write_json(out, found)
+    click.echo(f"{out}: in Foxglove, open the layout menu and import this file")
+
+
+def describe_dataset(dataset: Dataset) -> dict[str, Any]:
+    """The facts that `info --json` gives, but for the files' size."""
+    statistics = dataset.statistics
+    meanings = dict(enumerate(dataset.action_meanings))
+    start = int(getattr(dataset.action_space, "start", 0))
+    not_finite = {k: c.not_finite for k, c in statistics.observations.items() if c.not_finite}
+    problems = [
+        f"{count} values of {name} are NaN or infinite" for name, count in not_finite.items()
+    ]
+    bad_rewards = int((~np.isfinite(dataset.rewards)).sum())
+    if bad_rewards:
+        problems.append(f"{bad_rewards} rewards are NaN or infinite")
+    return {
+        "env_id": dataset.env_id,
+        "episodes": statistics.episodes,
+        "steps": statistics.steps,
+        "mean_return": statistics.mean_return,
+        "return_range": [float(statistics.returns.min()), float(statistics.returns.max())],
+        "mean_length": float(statistics.lengths.mean()),
+        "duration_s": statistics.duration_s,
+        "observations": str(dataset.observation_space),
+        "actions": str(dataset.action_space),
+        "action_counts": {
+            meanings.get(action - start, str(action)): count
+            for action, count in statistics.action_counts.items()
+        },
+        "policies": sorted({episode.policy for episode in dataset.episodes if episode.policy}),
+        "ends": dict(statistics.ends),
+        "problems": problems,
+    }
+
+
+def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
+    low, high = facts["return_range"]
+    rows = [
+        ["environment", facts["env_id"] or "unknown"],
+        ["files", f"{files}, {size(facts['size_bytes'])}"],
+        ["episodes", str(facts["episodes"])],
+        ["steps", f"{facts['steps']}, {facts['mean_length']:.1f} an episode"],
+        ["simulated time", f"{facts['duration_s']:.1f} s"],
+        ["mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"],
+        ["observations", _short(facts["observations"])],
+        ["actions", _short(facts["actions"])],
+        ["taken", _counts(facts["action_counts"]) or "-"],
+        ["policies", ", ".join(facts["policies"]) or "unknown"],
+        ["ends", _counts(facts["ends"])],
+        ["problems", "; ".join(facts["problems"]) or "none"],
+    ]
+    print_table(", ".join(str(path) for path in dataset.sources[:3]), ["", ""], rows)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def _short(text: str) -> str:
+    """A space's text on one line; the bounds of a large Box would fill the screen."""
+    line = " ".join(text.split())
+    return line if len(line) <= 90 else f"{line[:40]} ... {line[-40:]}"
+
+
+def _layout_of_file(path: Path) -> dict[str, Any]:
+    """The layout that is attached to a log; made from its topics if none is."""
+    reader = McapReader(path)
+    attached = reader.attachment(LAYOUT_NAME)
+    if attached is None:
+        description, _ = describe(reader)
+        return layout_of(description, [channel.topic for channel in reader.channels.values()])
+    try:
+        found: dict[str, Any] = json.loads(attached)
+    except ValueError as error:
+        raise CorruptLogError(f"{path}: attachment {LAYOUT_NAME} is no JSON") from error
+    return found
+
+
+def _layout_of_sim(sim: str) -> dict[str, Any]:
+    """The layout that a recording of the sim would carry: one is made and thrown away."""
+    import tempfile
+
+    from mcaprl.recorder.wrapper import RecordMcap
+    from mcaprl.sims import make_sim
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "reset.mcap"
+        env = RecordMcap(make_sim(sim), path, camera=True)
+        env.reset(seed=0)
+        env.close()
+        return _layout_of_file(path)

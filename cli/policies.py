@@ -1,0 +1,60 @@
+"""What POLICY means on the command line: `pilot`, `random`, or the path of a trained one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from mcaprl.errors import UnknownNameError
+from mcaprl.sims.rollout import Policy, check_fit
+
+SCRIPTED = ("pilot", "random")
+
+
+def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
+    """The policies that a name means in an environment: one, or one per training seed of a run.
+
+    Args:
+        name: `pilot`; `random`, which is [None]; or a path.
+        env: that they are to act in.
+
+    Raises:
+        UnknownNameError: no such policy, or the sim has no pilot.
+        PolicyError: the path holds none that fits.
+    """
+    if name == "random":
+        return [None]
+    if name == "pilot":
+        from mcaprl.sims.pilots import make_pilot
+
+        return [make_pilot(env)]
+    path = Path(name)
+    if not path.exists():
+        raise UnknownNameError("policy", name, [*SCRIPTED, *_neighbours(path)])
+    loaded: list[Policy | None] = []
+    for policy in _load(path):
+        check_fit(policy, env)
+        loaded.append(policy)
+    return loaded
+
+
+def policy_name(name: str) -> str:
+    """How tables call it: a path by its last part."""
+    return name if name in SCRIPTED else Path(name).name
+
+
+def _load(path: Path) -> list[Policy]:
+    from mcaprl.offline.policy import load_policies
+
+    return list(load_policies(path))
+
+
+def _neighbours(path: Path) -> list[str]:
+    """Folders beside a path that does not exist, which may be what was meant."""
+    if not path.parent.is_dir():
+        return []
+    return [
+        str(found) for found in sorted(path.parent.iterdir()) if (found / "config.json").exists()
+    ]

@@ -1,0 +1,213 @@
+"""`mcaprl record`: a policy acts, the log fills."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from mcaprl.cli.options import sim_options
+from mcaprl.cli.policies import policies_of, policy_name
+from mcaprl.cli.show import progress, size
+from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.recorder.mcap_writer import COMPRESSIONS
+from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.sims import make_sim
+from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, rollout
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What to record.
+
+    Attributes:
+        sim: short name or Gymnasium id.
+        sim_options: arguments to the environment.
+        out: file to write.
+        policy: `pilot`, `random` or a path.
+        epsilon: probability of a random action.
+        episodes: how many, or None to count steps.
+        steps: how many, or None.
+        first_episode: number of the first episode, on which its seed depends.
+        seed: of the recording.
+        scene: record what viewers show.
+        camera: record metric depth images.
+        compression: of chunks.
+        overwrite: replace a file that is there.
+    """
+
+    sim: str
+    sim_options: dict[str, Any]
+    out: Path
+    policy: str
+    epsilon: float
+    episodes: int | None
+    steps: int | None
+    first_episode: int
+    seed: int
+    scene: bool
+    camera: bool
+    compression: str
+    overwrite: bool
+
+
+@click.command()
+@click.argument("sim")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
+@click.option("--policy", default="pilot", show_default=True, help="pilot, random, or a path.")
+@click.option(
+    "--epsilon",
+    default=0.0,
+    show_default=True,
+    type=click.FloatRange(0, 1),
+    help="Probability of a random action instead of the policy's.",
+)
+@click.option("--episodes", type=click.IntRange(1), help="How many episodes to record.")
+@click.option("--steps", type=click.IntRange(1), help="How many steps, instead.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option(
+    "--envs",
+    default=1,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Processes; with more than one, OUT is a folder with a file of each.",
+)
+@sim_options
+@click.option("--no-scene", is_flag=True, help="Leave out what only viewers show.")
+@click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
+@click.option("--compression", default="zstd", show_default=True, type=click.Choice(COMPRESSIONS))
+@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+def record(
+    sim: str,
+    out: Path,
+    policy: str,
+    epsilon: float,
+    episodes: int | None,
+    steps: int | None,
+    seed: int,
+    envs: int,
+    sim_arguments: dict[str, Any],
+    no_scene: bool,
+    camera: bool,
+    compression: str,
+    overwrite: bool,
+) -> None:
+    """Record episodes of SIM into an MCAP file.
+
+    SIM is lane, or any Gymnasium id. Each finished episode is on disk at once.
+    """
+    if (episodes is None) == (steps is None):
+        raise UsageError("record needs --episodes N or --steps N, one of the two")
+    whole = Recording(
+        sim=sim,
+        sim_options=sim_arguments,
+        out=out,
+        policy=policy,
+        epsilon=epsilon,
+        episodes=episodes,
+        steps=steps,
+        first_episode=0,
+        seed=seed,
+        scene=not no_scene,
+        camera=camera,
+        compression=compression,
+        overwrite=overwrite,
+    )
+    with progress(f"recording {sim}", episodes or steps) as advance:
+
+        def on_episode(result: EpisodeResult) -> None:
+            advance(1 if episodes else result.length)
+
+        results = run_recording(whole, on_episode) if envs == 1 else run_shards(whole, envs)
+    returns = np.array([result.total_reward for result in results])
+    length = sum(result.length for result in results)
+    files = [out] if out.is_file() else sorted(out.glob("*.mcap"))
+    bytes_ = sum(path.stat().st_size for path in files)
+    click.echo(
+        f"{out}: {len(results)} episodes, {length} steps, mean return {returns.mean():.2f}"
+        f" (standard deviation {returns.std():.2f}), {size(bytes_)}"
+    )
+
+
+def run_recording(
+    recording: Recording, on_episode: Callable[[EpisodeResult], None] | None = None
+) -> list[EpisodeResult]:
+    """Record one file in this process."""
+    env = make_sim(recording.sim, **recording.sim_options)
+    with closing(env):
+        policy = policies_of(recording.policy, env)[0]
+        behavior = EpsilonGreedy(policy, recording.epsilon, env.action_space)
+        recorder = RecordMcap(
+            env,
+            recording.out,
+            policy=policy_name(recording.policy),
+            epsilon=behavior.epsilon,
+            seed=recording.seed,
+            compression=recording.compression,
+            overwrite=recording.overwrite,
+            scene=recording.scene,
+            camera=recording.camera,
+        )
+
+        def tell_probability(probability: float) -> None:
+            recorder.behavior_prob = probability
+
+        with closing(recorder):
+            return rollout(
+                recorder,
+                behavior,
+                seed=recording.seed,
+                episodes=recording.episodes,
+                steps=recording.steps,
+                first_episode=recording.first_episode,
+                on_action=tell_probability,
+                on_episode=on_episode,
+            )
+
+
+def run_shards(whole: Recording, processes: int) -> list[EpisodeResult]:
+    """Record shards of a folder in as many processes; together the same episodes as one would.
+
+    Raises:
+        OutputExistsError: the folder holds logs already, and they may not be replaced.
+    """
+    old = sorted(whole.out.glob("*.mcap")) if whole.out.is_dir() else []
+    if (old and not whole.overwrite) or whole.out.is_file():
+        raise OutputExistsError(f"{whole.out} exists: choose another folder, or pass --overwrite")
+    for path in old:
+        path.unlink()
+    shards = [
+        replace(
+            whole,
+            out=whole.out / f"shard-{number:02d}.mcap",
+            episodes=None if whole.episodes is None else end - start,
+            steps=None if whole.steps is None else end - start,
+            # Counted in steps, a shard cannot know how many episodes the others have.
+            first_episode=start if whole.episodes is not None else number << 20,
+        )
+        for number, (start, end) in enumerate(
+            _shares(whole.episodes or whole.steps or 0, processes)
+        )
+        if end > start
+    ]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(len(shards), mp_context=context) as pool:
+        return [result for results in pool.map(run_recording, shards) for result in results]
+
+
+def _shares(total: int, parts: int) -> list[tuple[int, int]]:
+    """Split a count into runs that differ by one at most.
+
+    >>> _shares(5, 2)
+    [(0, 2), (2, 5)]
+    """
+    edges = [total * part // parts for part in range(parts + 1)]
+    return list(itertools.pairwise(edges))

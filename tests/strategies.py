@@ -1,0 +1,77 @@
+"""Hypothesis strategies: spaces that a log can hold, and transitions in them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import hypothesis.extra.numpy as numpy_strategies
+import hypothesis.strategies as st
+import numpy as np
+from gymnasium import spaces
+
+DTYPES = ("float32", "float64", "float16", "int64", "int32", "int16", "int8", "uint8", "uint64")
+
+
+@st.composite
+def boxes(draw: st.DrawFn) -> spaces.Box:
+    """Unbounded Boxes of any dtype, from scalars to small stacks, pictures included."""
+    dtype = np.dtype(draw(st.sampled_from(DTYPES)))
+    shape = draw(st.sampled_from([(), (1,), (3,), (7,), (2, 2), (2, 3, 2), (8, 9, 3), (9, 8)]))
+    if dtype.kind == "f":
+        return spaces.Box(-np.inf, np.inf, shape, dtype.type)
+    low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
+    return spaces.Box(low, high, shape, dtype.type)
+
+
+def simple_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
+    """Every space that is one array."""
+    return st.one_of(
+        boxes(),
+        st.builds(
+            lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 9), st.integers(-5, 5)
+        ),
+        st.builds(spaces.MultiBinary, st.integers(1, 6)),
+        st.builds(
+            lambda n: spaces.MultiDiscrete(n), st.lists(st.integers(1, 9), min_size=1, max_size=4)
+        ),
+    )
+
+
+def observation_spaces() -> st.SearchStrategy[spaces.Space[Any]]:
+    """Simple spaces, and Dicts of them with any keys."""
+    keys = st.text(min_size=1, max_size=6)
+    dicts = st.dictionaries(keys, simple_spaces(), min_size=1, max_size=3).map(spaces.Dict)
+    return st.one_of(simple_spaces(), dicts)
+
+
+@st.composite
+def values_of(draw: st.DrawFn, space: spaces.Space[Any], rows: int) -> Any:
+    """`rows` values of a space as arrays, with every bit pattern of its dtype."""
+    if isinstance(space, spaces.Dict):
+        return {key: draw(values_of(part, rows)) for key, part in space.spaces.items()}
+    dtype, shape = np.dtype(space.dtype), (rows, *(space.shape or ()))
+    if isinstance(space, spaces.Box):
+        unsigned = np.dtype(f"u{dtype.itemsize}")
+        bits = draw(numpy_strategies.arrays(unsigned, shape))
+        return bits.view(dtype)
+    space.seed(draw(st.integers(0, 2**31)))
+    return np.stack([np.asarray(space.sample()) for _ in range(rows)])
+
+
+@st.composite
+def transitions(draw: st.DrawFn) -> dict[str, Any]:
+    """Keyword arguments to `Dataset.from_arrays`, with spaces."""
+    observation_space, action_space = draw(observation_spaces()), draw(simple_spaces())
+    rows = draw(st.integers(1, 12))
+    ends = numpy_strategies.arrays(np.bool_, rows)
+    rewards = numpy_strategies.arrays(np.uint64, rows).map(lambda bits: bits.view(np.float64))
+    return {
+        "observation_space": observation_space,
+        "action_space": action_space,
+        "observations": draw(values_of(observation_space, rows)),
+        "next_observations": draw(values_of(observation_space, rows)),
+        "actions": draw(values_of(action_space, rows)),
+        "rewards": draw(rewards),
+        "terminated": draw(ends),
+        "truncated": draw(ends),
+    }
