@@ -1,0 +1,178 @@
+"""Others' code reads our logs, and every value is the one that we read ourselves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+import mcaprl
+from mcaprl.recorder.log_writer import EpisodeSummary
+from mcaprl.recorder.schema import stored_dtype
+from mcaprl.recorder.spaces import observation_leaves
+from tests.conftest import need
+from tests.recordings import MIXED_SPACE, leaves_of, record
+
+NODE = Path(__file__).parent / "node"
+Messages = dict[str, list[tuple[int, Any]]]
+
+
+@pytest.fixture(scope="module", params=["zstd", "lz4", "none"])
+def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two topics of images, vectors of all dtypes, NaN and infinities, several chunks each."""
+    path = tmp_path_factory.mktemp("foreign") / "log.mcap"
+    record(path, MIXED_SPACE, spaces.Discrete(5), [120, 1, 33], compression=request.param)
+    return path
+
+
+def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
+    """What we read: for each topic, its fields as one array over the messages."""
+    dataset = mcaprl.open(path)
+    leaves = observation_leaves(dataset.observation_space)
+    topics: dict[str, dict[str, np.ndarray[Any, Any]]] = {}
+    step: dict[str, list[Any]] = defaultdict(list)
+    images: dict[str, list[Any]] = defaultdict(list)
+    for episode in dataset.episodes:
+        last = episode.length
+        for row in range(last + 1):
+            final = row == last
+            source = episode.next_observations if final else episode.observations
+            index = row - 1 if final else row
+            for leaf, array in zip(leaves, leaves_of(source), strict=True):
+                (images if leaf.encoding else step)[leaf.name].append(array[index])
+            step["reward"].append(0.0 if final else episode.rewards[row])
+            step["action"].append(0 if final else episode.actions[row])
+            step["behavior_prob"].append(np.nan if final else episode.behavior_probs[row])
+            step["terminated"].append(not final and episode.terminated[row])
+            step["truncated"].append(not final and episode.truncated[row])
+            step["final"].append(final)
+            step["episode"].append(episode.index)
+            step["step"].append(row)
+    topics["/rl/step"] = {name: np.array(values) for name, values in step.items()}
+    for leaf in leaves:
+        if leaf.encoding:
+            topics[leaf.topic] = {"data": np.array(images[leaf.name])}
+    summaries = [vars(episode.summary) for episode in dataset.episodes]
+    topics["/rl/episode"] = {
+        name: np.array([summary[name] for summary in summaries])
+        for name in EpisodeSummary.__dataclass_fields__
+    }
+    return topics
+
+
+def by_mcap_indexed(path: Path) -> Messages:
+    with path.open("rb") as file:
+        return _by_mcap(
+            SeekingReader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        )
+
+
+def by_mcap_streaming(path: Path) -> Messages:
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return _by_mcap(reader)
+
+
+def _by_mcap(reader: SeekingReader | NonSeekingReader) -> Messages:
+    messages: Messages = defaultdict(list)
+    for _, channel, message, decoded in reader.iter_decoded_messages():
+        messages[channel.topic].append((message.log_time, decoded))
+    return messages
+
+
+def by_rosbags(path: Path) -> Messages:
+    messages: Messages = defaultdict(list)
+    with AnyReader([path]) as bag:
+        for connection, time_ns, data in bag.messages():
+            decoded = bag.deserialize(data, connection.msgtype)
+            messages[connection.topic].append((time_ns, decoded))
+    return messages
+
+
+def by_node(path: Path) -> Messages:
+    need(shutil.which("node") is not None, "Node is not installed")
+    need((NODE / "node_modules").is_dir(), "packages of tests/node are not installed: npm ci")
+    command = ["node", str(NODE / "dump.mjs"), str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    messages: Messages = defaultdict(list)
+    for line in done.stdout.splitlines():
+        found = json.loads(line)
+        messages[found["topic"]].append((int(found["logTime"]), found["value"]))
+    return messages
+
+
+READERS = [by_mcap_indexed, by_mcap_streaming, by_rosbags, by_node]
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_every_value_is_ours(log: Path, read: Callable[[Path], Messages]) -> None:
+    found, expected = read(log), ours(log)
+    for topic, fields in expected.items():
+        for name, column in fields.items():
+            values = [_field(message, name) for _, message in found[topic]]
+            _assert_equal(values, column, f"{topic}.{name}")
+    times = {topic: [time for time, _ in messages] for topic, messages in found.items()}
+    for topic in expected:
+        assert (np.diff(times[topic]) > 0).all(), f"log_time of {topic} does not rise"
+        if topic != "/rl/episode":
+            assert times[topic] == times["/rl/step"]
+
+
+def test_streaming_gives_all_topics(log: Path) -> None:
+    counts = {topic: len(messages) for topic, messages in by_mcap_streaming(log).items()}
+    indexed = {topic: len(messages) for topic, messages in by_mcap_indexed(log).items()}
+    assert counts == indexed
+    assert counts["/rosout"] == 6
+
+
+def test_doctor_finds_nothing(log: Path) -> None:
+    doctor = Path(sys.executable).with_name("pymcap-cli")
+    need(doctor.exists(), "pymcap-cli is not installed")
+    done = subprocess.run(
+        [str(doctor), "doctor", str(log)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "passed" in done.stdout
+
+
+def _field(message: Any, name: str) -> Any:
+    return message[name] if isinstance(message, dict) else getattr(message, name)
+
+
+def _assert_equal(values: list[Any], column: np.ndarray[Any, Any], where: str) -> None:
+    """Compare as the dtype of our column, bit for bit; texts and None by their own equality."""
+    assert len(values) == len(column), f"{where}: {len(values)} messages, not {len(column)}"
+    if column.dtype.kind in "OU":
+        assert [_known(value) for value in values] == column.tolist(), where
+        return
+    dtype = stored_dtype(column.dtype)
+    # One element at a time: a list of big integers as text must not pass through float.
+    lists = [list(value) if isinstance(value, bytes) else value for value in values]
+    flat = [_number(part, dtype) for value in lists for part in np.ravel(value).tolist()]
+    actual = np.array(flat, dtype)
+    expected = column.astype(dtype).ravel()
+    assert actual.tobytes() == expected.tobytes(), where
+
+
+def _number(value: Any, dtype: np.dtype[Any]) -> Any:
+    return int(value) if dtype.kind in "iub" else float(value)
+
+
+def _known(value: Any) -> Any:
+    """`/rl/episode` has -1 where no seed was given."""
+    if isinstance(value, str) and value.lstrip("-").isdigit():
+        value = int(value)
+    return None if value == -1 else value
