@@ -87,6 +87,8 @@ def _check_data_crc(reader: McapReader, report: Report) -> None:
             crc = end.data_section_crc
             if crc and zlib.crc32(reader.view[:offset]) != crc:
                 report("the data section does not match its CRC", f"bytes 0 to {offset}")
+            if reader.complete and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start:
+                report("the data section's end is damaged", f"byte {offset}")
             return
     if reader.complete:
         report("the data section has no end", "the records between header and summary")

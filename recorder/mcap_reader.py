@@ -56,12 +56,17 @@ _PARSERS: dict[int, Any] = {
 }
 
 
+_TOPICS = (Opcode.SCHEMA, Opcode.CHANNEL)
+
+
 class McapReader:
     """One MCAP file, open for reading.
 
     Attributes:
         path: of the file.
         complete: whether the file has its summary; if not, it was cut off or is being written.
+        summary_start: where it begins; 0 if there is none.
+        data_end: where the records that precede it end, as far as they were read.
         schemas: by id.
         channels: by id.
         chunks: indexes of all chunks, in file order.
@@ -87,8 +92,12 @@ class McapReader:
         self.data_end = 0
         footer = self._footer()
         self.complete = footer is not None
+        self.summary_start = footer.summary_start if footer is not None else 0
         if footer is not None:
             self._read_summary(footer)
+        # The summary has a CRC of its own and is believed; the data section's covers the whole
+        # file and is left to `check`.
+        self._topics_are_known = bool(self.channels)
         self._read_data_section(scan=footer is None)
 
     def channel_of(self, topic: str) -> Channel | None:
@@ -260,7 +269,7 @@ class McapReader:
                 pending.message_index_offsets[channel_id] = offset
             elif opcode == Opcode.DATA_END:
                 break
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+            elif opcode == Opcode.METADATA or (opcode in _TOPICS and not self._topics_are_known):
                 self._keep(self._parse(opcode, content, offset))
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
 

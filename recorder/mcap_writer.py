@@ -262,13 +262,11 @@ class McapWriter:
 
 
 def _create(path: Path, overwrite: bool) -> FileIO:
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         return FileIO(path, "w" if overwrite else "x")
-    except FileExistsError as error:
-        raise OutputExistsError(
-            f"{path} exists: choose another path, or overwrite it (--overwrite)"
-        ) from error
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror}") from error
 

@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
-from mcaprl.recorder.schema import image_dtype, message_dtype
+from mcaprl.recorder.schema import image_dtype, is_intact, message_dtype
 from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
 from mcaprl.recorder.transitions import Transitions
 
@@ -106,7 +106,12 @@ def describe(reader: McapReader) -> tuple[LogMetadata, Channel]:
         raise NoStepsError(
             f"{reader.path} has no topic {STEP_TOPIC}, so no transitions (topics: {topics})"
         )
-    strings = reader.metadata.setdefault(METADATA_NAME, dict(steps.metadata))
+    # The channel's copy stands in the summary, too, under its CRC.
+    strings = dict(steps.metadata) or reader.metadata.get(METADATA_NAME, {})
+    if reader.metadata.setdefault(METADATA_NAME, strings) != strings:
+        raise CorruptLogError(
+            f"{reader.path}: the metadata record and the metadata of {STEP_TOPIC} differ"
+        )
     try:
         return LogMetadata.from_strings(strings), steps
     except LogError as error:
@@ -115,7 +120,10 @@ def describe(reader: McapReader) -> tuple[LogMetadata, Channel]:
 
 def _step_columns(reader: McapReader, channel: Channel) -> dict[str, NDArray[Any]]:
     """All records of `/rl/step`, one array per field, and `log_time`."""
-    payload = message_dtype(reader.schema_of(channel).data.decode())
+    schema = reader.schema_of(channel)
+    if not is_intact(schema.name, schema.data):
+        raise CorruptLogError(f"{reader.path}: the schema of {channel.topic} is damaged")
+    payload = message_dtype(schema.data.decode(errors="replace"))
     if payload is None:
         raise LogError(f"{reader.path}: messages of {channel.topic} have no fixed length")
     missing = [name for name in REQUIRED_FIELDS if name not in (payload.names or ())]

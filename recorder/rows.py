@@ -43,11 +43,14 @@ class StepColumns:
             self._rows["payload"][0] = self._rows["payload"][self.row - 1]
             self.row = 1
 
-    def act(self, action: Any, reward: float, behavior_prob: float) -> None:
-        """Complete the present row with the action taken there and its reward."""
+    def act(self, action: Any, behavior_prob: float) -> None:
+        """Put the action that is taken at the present row, and its probability."""
         self._action.put(self.row, action)
-        self._reward[self.row] = reward
         self._prob[self.row] = behavior_prob
+
+    def reward(self, reward: float) -> None:
+        """Put what the action brought."""
+        self._reward[self.row] = reward
 
     def end(self, terminated: bool, truncated: bool) -> None:
         """Mark the last transition and the final row, and write all."""

@@ -119,6 +119,12 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
 
 
+def is_intact(name: str, text: bytes) -> bool:
+    """Whether a definition is the one that its name was made for; others' names tell nothing."""
+    match = re.fullmatch(r"mcaprl_msgs/msg/(?:Step|Telemetry)([0-9a-f]{8})", name)
+    return match is None or match[1] == _digest(text)
+
+
 def image_dtype(
     height: int, width: int, channels: int, encoding: str, frame_id: str, item_bytes: int = 1
 ) -> np.dtype[Any]:
@@ -190,8 +196,11 @@ def _named(prefix: str, fields: list[tuple[str, int, str]]) -> tuple[str, str]:
     text = "".join(
         f"{kind}{f'[{count}]' if count else ''} {name}\n" for kind, count, name in fields
     )
-    digest = hashlib.sha256(text.encode()).hexdigest()[:8]
-    return f"mcaprl_msgs/msg/{prefix}{digest}", text
+    return f"mcaprl_msgs/msg/{prefix}{_digest(text.encode())}", text
+
+
+def _digest(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()[:8]
 
 
 def _align(offset: int, alignment: int) -> int:

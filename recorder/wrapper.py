@@ -118,9 +118,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Step the environment and log the transition."""
         if not self._open:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
+        # Before the environment can change it.
+        self._columns.act(action, self.behavior_prob)
         observation, reward, terminated, truncated, info = super().step(action)
         reward_ = float(reward)
-        self._columns.act(action, reward_, self.behavior_prob)
+        self._columns.reward(reward_)
         self.behavior_prob = math.nan
         self._total_reward += reward_
         self._step += 1

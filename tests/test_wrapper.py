@@ -1,0 +1,233 @@
+"""RecordMcap: what is logged when, and what happens to episodes that are broken off."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.errors import LogError, OutputExistsError, SpaceError
+from mcaprl.recorder.mcap_reader import McapReader
+from tests.recordings import ScriptedEnv
+
+BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+
+def two(a: float, b: float) -> np.ndarray[Any, Any]:
+    return np.array([a, b], np.float32)
+
+
+def scripted(*episodes: list[tuple[Any, float, bool, bool]], **infos: Any) -> ScriptedEnv:
+    return ScriptedEnv(BOX, spaces.Discrete(3), episodes, infos)
+
+
+ONE = [
+    (two(0, 0), 0.0, False, False),
+    (two(1, 10), 0.5, False, False),
+    (two(2, 20), -1.5, True, False),
+]
+
+
+def test_columns_by_hand(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="me", epsilon=0.5)) as env:
+        env.reset(seed=7)
+        env.behavior_prob = 0.25
+        env.step(2)
+        env.step(np.int64(1))
+        env.reset()
+        env.step(0)
+        env.step(0)
+    data = mcaprl.open(log_path)
+    assert data.observations.tolist() == [[0, 0], [1, 10], [0, 0], [1, 10]]
+    assert data.next_observations.tolist() == [[1, 10], [2, 20], [1, 10], [2, 20]]
+    assert data.actions.tolist() == [2, 1, 0, 0]
+    assert data.rewards.tolist() == [0.5, -1.5, 0.5, -1.5]
+    assert data.terminated.tolist() == [False, True, False, True]
+    assert not data.truncated.any()
+    assert data.behavior_probs[0] == 0.25
+    assert np.isnan(data.behavior_probs[1:]).all(), "a probability holds for one step"
+    first, second = data.episodes
+    assert (first.seed, second.seed) == (7, None)
+    assert (first.total_reward, first.reason, first.policy, first.epsilon) == (
+        -1.0,
+        "terminated",
+        "me",
+        0.5,
+    )
+
+
+def test_reason_comes_from_info(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE, reason="off_lane"), log_path)) as env:
+        env.reset()
+        env.step(0)
+        env.step(0)
+    assert mcaprl.open(log_path).episodes[0].reason == "off_lane"
+
+
+def test_log_times(log_path: Path) -> None:
+    start = 1_700_000_000_123_456_789
+    recorder = mcaprl.RecordMcap(
+        scripted(ONE, ONE), log_path, start_time_ns=start, step_duration_s=0.25
+    )
+    with closing(recorder) as env:
+        for _ in range(2):
+            env.reset()
+            env.step(0)
+            env.step(0)
+    first, second = mcaprl.open(log_path).episodes
+    assert (first.log_time_ns - start).tolist() == [0, 250_000_000, 500_000_000]
+    assert (second.log_time_ns - start).tolist() == [750_000_000, 1_000_000_000, 1_250_000_000]
+
+
+@pytest.mark.parametrize("way", ["reset", "close"])
+def test_interrupted_episode_is_kept(log_path: Path, way: str) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path)
+    env.reset()
+    env.step(1)
+    if way == "reset":
+        env.reset()
+    env.close()
+    env.close()
+    data = mcaprl.open(log_path)
+    assert len(data.episodes) == 1, "an episode without a transition leaves no trace"
+    assert data.truncated.tolist() == [True]
+    assert data.terminated.tolist() == [False]
+    assert data.episodes[0].reason == "interrupted"
+    assert data.next_observations.tolist() == [[1, 10]]
+
+
+class ReusesBuffer(gym.Env[Any, Any]):
+    observation_space = spaces.Dict({"image": spaces.Box(0, 255, (8, 8), np.uint8), "x": BOX})
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self) -> None:
+        self.values = {"image": np.zeros((8, 8), np.uint8), "x": two(0, 0)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.values["image"][:] = 0
+        self.values["x"][:] = 0
+        return self.values, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.values["image"] += 1
+        self.values["x"] += 1
+        action[:] = 99  # spoils its argument, too
+        return self.values, 1.0, False, bool(self.values["x"][0] == 3), {}
+
+
+def test_reused_buffers_are_copied(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(ReusesBuffer(), log_path)) as env:
+        env.reset()
+        for _ in range(3):
+            env.step(np.zeros(2, np.float32))
+    data = mcaprl.open(log_path)
+    assert data.observations["x"][:, 0].tolist() == [0, 1, 2]
+    assert data.next_observations["image"][:, 0, 0].tolist() == [1, 2, 3]
+    assert data.actions.tolist() == [[0, 0], [0, 0], [0, 0]], "the action that was asked for"
+
+
+def test_wrong_shapes_are_refused(log_path: Path) -> None:
+    bad = [(np.zeros(3, np.float32), 0.0, False, False)]
+    with (
+        closing(mcaprl.RecordMcap(scripted(bad), log_path)) as env,
+        pytest.raises(SpaceError, match=r"observation has shape \(3,\); its space declares \(2,\)"),
+    ):
+        env.reset()
+
+
+def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
+    rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
+    env = mcaprl.RecordMcap(scripted(rows), log_path)
+    with pytest.warns(UserWarning, match="observation is float64, its space declares float32"):
+        env.reset()
+    env.step(0)
+    env.close()
+    assert mcaprl.open(log_path).observations.tolist() == [two(0.1, 0.2).tolist()]
+
+
+def test_step_needs_reset(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(0)
+        env.reset()
+
+
+def test_existing_file_is_kept(log_path: Path) -> None:
+    log_path.write_text("precious")
+    with pytest.raises(OutputExistsError, match="exists"):
+        mcaprl.RecordMcap(scripted(ONE), log_path)
+    assert log_path.read_text() == "precious"
+    mcaprl.RecordMcap(scripted(ONE), log_path, overwrite=True).close()
+
+
+def test_unwritable_place(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match="cannot write"):
+        mcaprl.RecordMcap(scripted(ONE), tmp_path / "file" / "log.mcap")
+
+
+def test_unsupported_spaces_make_no_file(log_path: Path) -> None:
+    env = ScriptedEnv(spaces.Text(5), spaces.Discrete(2), [])
+    with pytest.raises(SpaceError, match="observation is a Text space"):
+        mcaprl.RecordMcap(env, log_path)
+    env = ScriptedEnv(BOX, spaces.Dict({"a": spaces.Discrete(2)}), [])
+    with pytest.raises(SpaceError, match="action is a Dict space"):
+        mcaprl.RecordMcap(env, log_path)
+    assert not log_path.exists()
+
+
+def test_metadata_comes_first_and_is_repeated(log_path: Path) -> None:
+    env = gym.make("CartPole-v1", sutton_barto_reward=True)
+    mcaprl.RecordMcap(env, log_path, seed=3, policy="random", epsilon=1.0).close()
+    reader = McapReader(log_path)
+    kinds = [opcode for _, opcode, _ in reader.records(8)]
+    assert kinds[:2] == [0x01, 0x0C], "header, then metadata"
+    strings = reader.metadata["mcaprl.dataset"]
+    channel = reader.channel_of("/rl/step")
+    assert channel is not None
+    assert channel.metadata == strings
+    assert strings["env_id"] == "CartPole-v1"
+    assert strings["env_kwargs"] == '{"sutton_barto_reward": true}'
+    assert (strings["seed"], strings["policy"], strings["epsilon"]) == ("3", "random", "1.0")
+    assert strings["step_duration_ns"] == "20000000", "CartPole renders 50 frames a second"
+
+
+def _record_for_ever(path: Path) -> None:
+    env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+    while True:
+        env.reset(seed=0)
+        done = False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(0)
+            done = terminated or truncated
+        time.sleep(0.001)
+
+
+def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
+    process = multiprocessing.get_context("spawn").Process(
+        target=_record_for_ever, args=(log_path,)
+    )
+    process.start()
+    deadline = time.monotonic() + 60
+    while not (log_path.exists() and log_path.stat().st_size > 30_000):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with pytest.warns(UserWarning, match="cut off"):
+        data = mcaprl.open(log_path)
+    assert len(data.episodes) > 3
+    assert all(episode.terminated[-1] for episode in data.episodes)
+    assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
