@@ -87,7 +87,10 @@ def _check_data_crc(reader: McapReader, report: Report) -> None:
             crc = end.data_section_crc
             if crc and zlib.crc32(reader.view[:offset]) != crc:
                 report("the data section does not match its CRC", f"bytes 0 to {offset}")
-            if reader.complete and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start:
+            if (
+                reader.complete
+                and offset + RECORD_HEADER_BYTES + len(content) != reader.summary_start
+            ):
                 report("the data section's end is damaged", f"byte {offset}")
             return
     if reader.complete:

@@ -46,7 +46,8 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
         raise UnknownNameError("sim", name, [*SIMS, *gym.registry]) from error
     except (TypeError, gym.error.Error, ModuleNotFoundError) as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
-        raise UsageError(f"cannot make sim '{name}' with {given}: {error}") from error
+        reason = str(error).split(" was raised from the environment creator")[0]
+        raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 
 __all__ = ["SIMS", "make_sim"]

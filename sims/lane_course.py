@@ -8,7 +8,9 @@ other. Nothing here is random: the same course stands on every machine.
 
 from __future__ import annotations
 
+import functools
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +38,13 @@ RAIL_HEIGHT_M = 0.7
 RAIL_THICKNESS_M = 0.12
 GROUND_HALF_SIDE_M = 1000.0
 """The ground reaches beyond the last row of pixels under the horizon."""
+
+CAMERA_FORWARD_M = 0.4
+"""Of the middle of the wheelbase, on which the car's own frame stands."""
+CAMERA_HEIGHT_M = 1.4
+
+HOUSE_GAP_M = 1.0
+"""At least as much grass all around a house."""
 
 
 class Box(NamedTuple):
@@ -114,27 +123,50 @@ def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
     return bool(np.any(~(apart_x | apart_y)))
 
 
-def buildings() -> list[Box]:
+def _house(
+    index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
+) -> Box:
+    """Build the index-th house, its front beginning at `at` on the centre line.
+
+    Args:
+        index: picks its size and its distance from the street.
+        at: (2,) metres.
+        forward: (2,) unit vector along the street.
+        left: (2,) unit vector from the street to the house.
+    """
+    front_m, deep_m = _spread(index, 8.0, 18.0), _spread(3 * index, 8.0, 15.0)
+    garden_m = _spread(5 * index, 7.5, 11.5)
+    middle = at + forward * (front_m / 2) + left * (garden_m + deep_m / 2)
+    size = np.abs(forward) * front_m + np.abs(left) * deep_m
+    height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
+    return Box(float(middle[0]), float(middle[1]), float(size[0]), float(size[1]), height_m)
+
+
+def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, int]]:
+    """Give each side of each street: its start (2,), direction (2,), length in metres and side."""
+    for start, end in streets():
+        length_m = float(np.hypot(*(end - start)))
+        for side in (1, -1):
+            yield start, (end - start) / length_m, length_m, side
+
+
+@functools.cache
+def buildings() -> tuple[Box, ...]:
     """Give the houses along both sides of each street; none stands on a street or another."""
     taken = street_bounds(RAIL_OFFSET_M + 2.0)
     boxes: list[Box] = []
     index = 0
-    for start, end in streets():
-        length_m = float(np.hypot(*(end - start)))
-        forward = (end - start) / length_m
-        for left in (np.array([-forward[1], forward[0]]), np.array([forward[1], -forward[0]])):
-            along_m = -12.0
-            while along_m < length_m + 12.0:
-                index += 1
-                front_m, deep_m = _spread(index, 8.0, 18.0), _spread(3 * index, 8.0, 15.0)
-                off_m = _spread(5 * index, 7.5, 11.5) + deep_m / 2
-                middle = start + forward * (along_m + front_m / 2) + left * off_m
-                size = np.abs(forward) * front_m + np.abs(left) * deep_m
-                height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
-                box = Box(middle[0], middle[1], size[0], size[1], height_m)
-                if not _overlaps(box, taken):
-                    boxes.append(box)
-                    corner = [*(middle - size / 2 - 1.0), *(middle + size / 2 + 1.0)]
-                    taken = np.vstack([taken, corner])
-                along_m += front_m + _spread(13 * index, 2.0, 6.0)
-    return boxes
+    for start, forward, length_m, side in _street_sides():
+        left = side * np.array([-forward[1], forward[0]])
+        along_m = -12.0
+        while along_m < length_m + 12.0:
+            index += 1
+            box = _house(index, start + forward * along_m, forward, left)
+            if not _overlaps(box, taken):
+                boxes.append(box)
+                half = np.array([box.length_m, box.width_m]) / 2 + HOUSE_GAP_M
+                middle = np.array([box.x_m, box.y_m])
+                taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
+            front_m = abs(float(forward @ [box.length_m, box.width_m]))
+            along_m += front_m + _spread(13 * index, 2.0, 6.0)
+    return tuple(boxes)

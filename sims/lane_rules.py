@@ -185,7 +185,15 @@ def step_cars(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N cars in place: cars (N, 9), actions, rewards and ends (N,), observations (N, 12)."""
+    """Advance N cars by one decision each, in place.
+
+    Args:
+        cars: (N, 9) rows of `Car`.
+        actions: (N,) 0 to 5.
+        rewards: (N,) to be filled.
+        ends: (N,) to be filled with DRIVING, OFF_LANE or STALL.
+        observations: (N, 12) to be filled.
+    """
     for i in range(len(cars)):
         before = car_at(cars[i])
         after = drive(before, actions[i])

@@ -15,6 +15,8 @@ from mcaprl.sims.scene import Shape
 _INK, _PALE = "#1d2733", "#b9c2cc"
 _COLORS = ("#2f6fb7", "#d9622b", "#2a9d6f", "#8a63c9", "#b08d1e", "#c04a7c")
 _MAX_PATHS = 30
+# What is lower than this is ground, not something to drive around.
+_FLAT_M = 1.0
 
 
 def comparison_picture(
@@ -50,7 +52,9 @@ def comparison_picture(
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
-        axes.annotate(label, (max(high, 0.0), row), (6, 0), textcoords="offset points", va="center")
+        # Behind the longest of bar, interval and dots.
+        end = max(high, 0.0, float(means.max()))
+        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
     axes.set_yticks(range(len(scores)), [score.policy for score in scores])
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
@@ -106,7 +110,7 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
             continue
         if shape.kind == "line":
             axes.plot(shape.points[:, 0], shape.points[:, 1], color=_PALE, lw=1, zorder=0)
-        elif shape.kind == "box":
+        elif shape.kind == "box" and shape.size[2] > _FLAT_M:
             corners = _box_corners(shape)
             axes.fill(corners[:, 0], corners[:, 1], color=_PALE, alpha=0.6, lw=0, zorder=0)
 

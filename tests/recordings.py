@@ -104,10 +104,10 @@ def record(
                 action, probability = action_space.sample(), float(np.float32(random.random()))
                 recorder.behavior_prob = probability
                 truth.observations.append(observation)
-                observation, reward, terminated, truncated, _ = recorder.step(action)
+                observation, earned, terminated, truncated, _ = recorder.step(action)
                 truth.next_observations.append(observation)
                 truth.actions.append(action)
-                truth.rewards.append(float(reward))
+                truth.rewards.append(float(earned))
                 truth.terminated.append(terminated)
                 truth.truncated.append(truncated)
                 truth.behavior_probs.append(probability)

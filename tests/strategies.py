@@ -19,7 +19,8 @@ def boxes(draw: st.DrawFn) -> spaces.Box:
     shape = draw(st.sampled_from([(), (1,), (3,), (7,), (2, 2), (2, 3, 2), (8, 9, 3), (9, 8)]))
     if dtype.kind == "f":
         return spaces.Box(-np.inf, np.inf, shape, dtype.type)
-    low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
+    info = np.iinfo(str(dtype))
+    low, high = int(info.min), int(info.max)
     return spaces.Box(low, high, shape, dtype.type)
 
 

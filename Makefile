@@ -1,0 +1,64 @@
+# One verb per task; `make` alone lists them. Everything is installed into $(VENV).
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Whatever of these changes, the environments are set up anew.
+SETTINGS := pyproject.toml constraints.txt
+
+.PHONY: help demo test check bench docs wheel clean
+
+help:
+	@echo "make demo    record a car, learn from its log offline, evaluate, make the replay"
+	@echo "make test    run all tests"
+	@echo "make check   format, lint, types, and the direction of imports"
+	@echo "make bench   measure speed against other libraries, as ratios"
+	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
+	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
+	@echo "make clean   remove what these made"
+
+demo: $(VENV)/.demo
+	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
+
+test: $(VENV)/.dev tests/node/node_modules
+	OMP_NUM_THREADS=1 $(BIN)/pytest
+
+check: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
+
+docs: $(VENV)/.dev
+	$(BIN)/python docs/generate.py
+
+wheel: $(VENV)/.dev
+	PYTHON="$(BIN)/python" sh .ci/bare-wheel
+
+clean:
+	rm -rf $(VENV) build dist demo *.egg-info tests/node/node_modules
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "mcaprl needs Python 3.11 or later; set PYTHON=... to one"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
+
+$(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
+	@echo "installing into $(VENV)"
+	$(PIP) -e '.[sims,offline,report]'
+	@touch $@
+
+$(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
+	@echo "installing into $(VENV)"
+	$(PIP) -e '.[sims,offline,online,report,tables]' --group dev
+	@touch $@
+
+# Node's MCAP libraries judge our logs; without npm those tests are skipped.
+tests/node/node_modules: tests/node/package-lock.json
+	@if command -v npm >/dev/null; then cd tests/node && npm ci --silent --no-audit --no-fund; \
+	  else echo "npm is not installed: tests with Node's readers will be skipped"; fi
+	@if [ -d $@ ]; then touch $@; fi

@@ -1,0 +1,174 @@
+"""A depth camera: triangles in, distances out, on one CPU core and without a display.
+
+The picture is drawn with a z-buffer of inverse depths. On a plane, 1/z is linear in the picture, so
+one division per triangle does; and 0 is the natural value of a pixel that nothing hits.
+
+Camera axes are those of a ROS optical frame (REP 103): x right, y down, z into the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+_NEAR_M = 0.1
+"""What is nearer than this before the lens is not seen."""
+
+
+class Lens(NamedTuple):
+    """A pinhole camera with square pixels."""
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    """Distance of the image plane, in pixels: half the width over tan(half the field of view)."""
+
+
+def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
+    """Make a lens from its picture's size and its field of view.
+
+    >>> lens(256, 144, math.pi / 2).focal_px
+    128.00000000000003
+    """
+    return Lens(width_px, height_px, width_px / 2 / math.tan(horizontal_fov_rad / 2))
+
+
+def ray_lengths(view: Lens) -> Floats:
+    """Give (height, width) lengths of the rays from the eye to the plane z = 1."""
+    x = (np.arange(view.width_px) + 0.5 - view.width_px / 2) / view.focal_px
+    y = (np.arange(view.height_px) + 0.5 - view.height_px / 2) / view.focal_px
+    return np.sqrt(x**2 + y[:, None] ** 2 + 1.0)
+
+
+def level_axes(yaw_rad: float) -> Floats:
+    """Give the (3, 3) axes, as rows in the map, of a level camera that looks along a yaw."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
+
+
+@compiled
+def draw(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: Floats) -> None:
+    """Fill `inverse_z`, (height, width) 1/m, with what a camera sees; 0 where it sees nothing.
+
+    Args:
+        mesh: (T, 3, 3) triangles; only the side whose corners run counter-clockwise is seen.
+        eye_m: (3,) where the camera is.
+        axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
+        focal_px: of the lens; its axis meets the middle of the picture.
+        inverse_z: the picture to fill.
+    """
+    inverse_z[:] = 0.0
+    corners, polygon = np.empty((3, 3)), np.empty((4, 3))
+    for face in range(len(mesh)):
+        for i in range(3):
+            x = mesh[face, i, 0] - eye_m[0]
+            y = mesh[face, i, 1] - eye_m[1]
+            z = mesh[face, i, 2] - eye_m[2]
+            for k in range(3):
+                corners[i, k] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
+        plane = _plane(corners)
+        if plane.offset < 0.0:
+            count = _clip_near(corners, polygon)
+            _fill(polygon, count, plane, focal_px, inverse_z)
+
+
+class _Plane(NamedTuple):
+    """The points p with x p_x + y p_y + z p_z = offset; negative when the eye is at its front."""
+
+    x: float
+    y: float
+    z: float
+    offset: float
+
+
+@compiled
+def _plane(corners: Floats) -> _Plane:
+    """Give the plane through a triangle of camera coordinates."""
+    ux, uy, uz = _difference(corners, 1)
+    vx, vy, vz = _difference(corners, 2)
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return _Plane(x, y, z, x * corners[0, 0] + y * corners[0, 1] + z * corners[0, 2])
+
+
+@compiled
+def _difference(corners: Floats, i: int) -> tuple[float, float, float]:
+    """Give the vector from a triangle's first corner to another one."""
+    return (
+        corners[i, 0] - corners[0, 0],
+        corners[i, 1] - corners[0, 1],
+        corners[i, 2] - corners[0, 2],
+    )
+
+
+@compiled
+def _clip_near(corners: Floats, polygon: Floats) -> int:
+    """Copy the part of a triangle before the near plane into `polygon`; give its corner count."""
+    count = 0
+    for i in range(3):
+        j = (i + 1) % 3
+        here_z, there_z = corners[i, 2], corners[j, 2]
+        if here_z >= _NEAR_M:
+            for k in range(3):
+                polygon[count, k] = corners[i, k]
+            count += 1
+        if (here_z >= _NEAR_M) != (there_z >= _NEAR_M):
+            share = (_NEAR_M - here_z) / (there_z - here_z)
+            for k in range(3):
+                polygon[count, k] = corners[i, k] + share * (corners[j, k] - corners[i, k])
+            count += 1
+    return count
+
+
+@compiled
+def _fill(polygon: Floats, count: int, plane: _Plane, focal_px: float, inverse_z: Floats) -> None:
+    """Draw a convex polygon of camera coordinates that lies in a plane.
+
+    A pixel belongs to it if its middle does; a middle on a border belongs to the side at the right
+    or below, so that neighbours leave no gap. The points p = z (u/f, v/f, 1) of the plane have
+    1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the picture.
+    """
+    height, width = inverse_z.shape
+    middle_u, middle_v = 0.5 * width, 0.5 * height
+    top, bottom = float(height), 0.0
+    for i in range(count):
+        scale = focal_px / polygon[i, 2]
+        polygon[i, 0] = middle_u + scale * polygon[i, 0]
+        polygon[i, 1] = middle_v + scale * polygon[i, 1]
+        top, bottom = min(top, polygon[i, 1]), max(bottom, polygon[i, 1])
+    step = plane.x / (plane.offset * focal_px)
+    for row in range(max(0, math.ceil(top - 0.5)), math.ceil(min(float(height), bottom - 0.5))):
+        left_u, right_u = _span(polygon, count, row + 0.5)
+        start = math.ceil(max(0.0, left_u - 0.5))
+        end = math.ceil(min(float(width), right_u - 0.5))
+        at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
+        at_zero = at_v / plane.offset + step * (0.5 - middle_u)
+        for column in range(start, end):
+            value = at_zero + step * column
+            if value > inverse_z[row, column]:
+                inverse_z[row, column] = value
+
+
+@compiled
+def _span(polygon: Floats, count: int, v: float) -> tuple[float, float]:
+    """Give the leftmost and rightmost u of a convex polygon on one row of the picture.
+
+    Neighbours walk their common edge in opposite directions. Taken from above, it has the same u
+    for both to the last bit.
+    """
+    left_u, right_u = math.inf, -math.inf
+    for i in range(count):
+        j = (i + 1) % count
+        above, below = (i, j) if polygon[i, 1] <= polygon[j, 1] else (j, i)
+        if polygon[above, 1] <= v < polygon[below, 1]:
+            height = polygon[below, 1] - polygon[above, 1]
+            share = (v - polygon[above, 1]) / height
+            u = polygon[above, 0] + share * (polygon[below, 0] - polygon[above, 0])
+            left_u, right_u = min(left_u, u), max(right_u, u)
+    return left_u, right_u

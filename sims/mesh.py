@@ -1,0 +1,38 @@
+"""Solids as triangles, for the depth camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = tuple[float, float, float]
+
+# The corners of a unit cube are numbered 4 x + 2 y + z. Each face lists its corners
+# counter-clockwise as seen from outside; its diagonal makes two triangles of it.
+_FACES = (
+    (0, 1, 3, 2),
+    (4, 6, 7, 5),
+    (0, 4, 5, 1),
+    (2, 3, 7, 6),
+    (0, 2, 6, 4),
+    (1, 5, 7, 3),
+)
+_TRIANGLES = np.array([(a, b, c) for a, b, c, _ in _FACES] + [(a, c, d) for a, _, c, d in _FACES])
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+def box_mesh(middle_m: Vector, size_m: Vector) -> NDArray[np.float64]:
+    """Give a box, its edges along the axes, as (12, 3, 3) triangles: corner, then x, y, z; metres.
+
+    Seen from outside, the corners of each triangle run counter-clockwise.
+    """
+    corners: NDArray[np.float64] = np.array(middle_m) + _CORNERS * np.array(size_m)
+    triangles: NDArray[np.float64] = corners[_TRIANGLES]
+    return triangles
+
+
+def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
+    """Give a square of ground at z = 0 around the origin, (2, 3, 3) metres, seen from above."""
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    triangles: NDArray[np.float64] = half_side_m * corners[[[0, 1, 2], [0, 2, 3]]]
+    return triangles
