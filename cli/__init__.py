@@ -48,6 +48,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
     """Run the program and return its exit code; errors of the user's are told on stderr."""
     try:
         code = cli.main(arguments, prog_name="mcaprl", standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        return error.exit_code
     except click.UsageError as error:
         command = error.ctx.command_path if error.ctx else "mcaprl"
         return _fail(f"{error.format_message()} (see {command} --help)", error.exit_code)

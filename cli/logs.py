@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,13 +13,15 @@ from typing import Any
 import click
 import numpy as np
 
-from mcaprl.cli.show import print_json, print_table, size, write_json
+from mcaprl.cli.show import print_facts, print_json, size, write_json
 from mcaprl.errors import CorruptLogError, OutputExistsError
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.reader import describe, find_logs, open_logs
+from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.sims import SIMS, make_sim
 
 
 @click.command()
@@ -65,7 +69,8 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs that a sim will give."""
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
-    found = _layout_of_file(Path(source)) if Path(source).exists() else _layout_of_sim(source)
+    is_file = source not in SIMS and Path(source).is_file()
+    found = _layout_of_file(Path(source)) if is_file else _layout_of_sim(source)
     write_json(out, found)
     click.echo(f"{out}: in Foxglove, open the layout menu and import this file")
 
@@ -105,20 +110,25 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
 def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
     low, high = facts["return_range"]
     rows = [
-        ["environment", facts["env_id"] or "unknown"],
-        ["files", f"{files}, {size(facts['size_bytes'])}"],
-        ["episodes", str(facts["episodes"])],
-        ["steps", f"{facts['steps']}, {facts['mean_length']:.1f} an episode"],
-        ["simulated time", f"{facts['duration_s']:.1f} s"],
-        ["mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"],
-        ["observations", _short(facts["observations"])],
-        ["actions", _short(facts["actions"])],
-        ["taken", _counts(facts["action_counts"]) or "-"],
-        ["policies", ", ".join(facts["policies"]) or "unknown"],
-        ["ends", _counts(facts["ends"])],
-        ["problems", "; ".join(facts["problems"]) or "none"],
+        ("environment", facts["env_id"] or "unknown"),
+        ("files", f"{files}, {size(facts['size_bytes'])}"),
+        ("episodes", str(facts["episodes"])),
+        ("steps", f"{facts['steps']}, {facts['mean_length']:.1f} an episode"),
+        ("simulated time", f"{facts['duration_s']:.1f} s"),
+        ("mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"),
+        ("observations", _short(facts["observations"])),
+        ("actions", _short(facts["actions"])),
+        ("taken", _counts(facts["action_counts"]) or "-"),
+        ("policies", ", ".join(facts["policies"]) or "unknown"),
+        ("ends", _counts(facts["ends"])),
+        ("problems", "; ".join(facts["problems"]) or "none"),
     ]
-    print_table(", ".join(str(path) for path in dataset.sources[:3]), ["", ""], rows)
+    print_facts(_title(dataset.sources), rows)
+
+
+def _title(sources: Sequence[Path]) -> str:
+    more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
+    return f"{sources[0]}{more}"
 
 
 def _counts(counts: dict[str, int]) -> str:
@@ -147,11 +157,6 @@ def _layout_of_file(path: Path) -> dict[str, Any]:
 
 def _layout_of_sim(sim: str) -> dict[str, Any]:
     """The layout that a recording of the sim would carry: one is made and thrown away."""
-    import tempfile
-
-    from mcaprl.recorder.wrapper import RecordMcap
-    from mcaprl.sims import make_sim
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reset.mcap"
         env = RecordMcap(make_sim(sim), path, camera=True)

@@ -36,12 +36,22 @@ def write_json(path: Path, value: Any, *, indent: int | None = 2) -> None:
 
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
-    """A table on stdout, the first column to the left, the others to the right."""
+    """A table on stdout: the first column to the left, numbers to the right."""
     table = Table(title=title, title_justify="left", title_style="bold")
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
     for row in rows:
         table.add_row(*row)
+    Console().print(table)
+
+
+def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
+    """Names and what they stand for, one a line, on stdout."""
+    table = Table(title=title, title_justify="left", title_style="bold", show_header=False)
+    table.add_column(style="dim")
+    table.add_column(overflow="fold")
+    for fact in facts:
+        table.add_row(*fact)
     Console().print(table)
 
 

@@ -23,8 +23,23 @@ class _TrainCommand(click.Command):
 @click.argument("data", nargs=-1, required=True, metavar="DATA...")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to make.")
 @click.option("--algo", default="cql", show_default=True, help="dqn, double-dqn, cql or bc.")
-@click.option("--seeds", default=1, show_default=True, type=click.IntRange(1), help="How many.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="The first one.")
+@click.option(
+    "--seeds",
+    default=1,
+    show_default=True,
+    type=click.IntRange(1),
+    help="How many networks to train.",
+)
+@click.option(
+    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Of the first one."
+)
+@click.option(
+    "--threads",
+    default=1,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Of torch; more than one pays only with big batches on an idle machine.",
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 def train_offline(
     data: tuple[str, ...],
@@ -32,6 +47,7 @@ def train_offline(
     algo: str,
     seeds: int,
     seed: int,
+    threads: int,
     resume: bool,
     **settings: Any,
 ) -> None:
@@ -39,9 +55,12 @@ def train_offline(
 
     Settings that are not given have the algorithm's own defaults.
     """
+    import torch
+
     from mcaprl.offline.algorithms import choose_algorithm
     from mcaprl.offline.train import train
 
+    torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}
     _, defaults = choose_algorithm(algo)
     known = [field.name for field in fields(defaults)]

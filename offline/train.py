@@ -124,7 +124,11 @@ class _Run:
         if self.folder.is_file() or (self.folder.is_dir() and any(self.folder.iterdir())):
             raise OutputExistsError(
                 f"{self.folder} exists: choose another folder"
-                + ("; it holds no run to resume" if resume else ", or resume the run in it")
+                + (
+                    "; it holds no run to resume"
+                    if resume
+                    else ", or resume the run in it (--resume)"
+                )
             )
         self.folder.mkdir(parents=True, exist_ok=True)
         source = {"env_id": self.dataset.env_id, "transitions": len(self.dataset.rewards)}

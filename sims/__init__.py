@@ -44,7 +44,7 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
         return gym.make(env_id, **kwargs)
     except gym.error.UnregisteredEnv as error:
         raise UnknownNameError("sim", name, [*SIMS, *gym.registry]) from error
-    except (TypeError, gym.error.Error, ModuleNotFoundError) as error:
+    except (TypeError, ValueError, gym.error.Error, ModuleNotFoundError) as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         reason = str(error).split(" was raised from the environment creator")[0]
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error

@@ -99,7 +99,7 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
     | 10, 11 | path point 40 m ahead | 40 m | 4 |
 
     `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth in the log code of
-    `mcaprl.sims.camera.encode_depth`; 255 where there is nothing.
+    `mcaprl.sims.depth.encode_depth`; 255 where there is nothing.
 
     ## Rewards
 

@@ -25,10 +25,11 @@ from mcaprl.sims.lane_rules import (
 )
 
 
-class OurLength(Vehicle):  # type: ignore[misc]
-    """Made as long as our wheelbase: their equations call the distance of the axles so."""
-
-    LENGTH = WHEELBASE_M
+def their_car(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Vehicle:
+    """Make a car as long as our wheelbase: their equations call the distance of the axles so."""
+    car = Vehicle(None, np.array([x_m, y_m]), yaw_rad, speed_m_s)
+    car.LENGTH = WHEELBASE_M
+    return car
 
 
 COMMANDS = st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-8.0, 4.0)), min_size=1, max_size=60)
@@ -40,7 +41,7 @@ def test_each_step_of_a_trajectory_agrees(
     speed_m_s: float, yaw_rad: float, commands: list[tuple[float, float]]
 ) -> None:
     """Equal: wheelbase 2.7 m, time step .05 s, start; steering and acceleration at each step."""
-    theirs = OurLength(None, np.array([3.0, -2.0]), yaw_rad, speed_m_s)
+    theirs = their_car(3.0, -2.0, yaw_rad, speed_m_s)
     ours = Motion(3.0, -2.0, yaw_rad, speed_m_s)
     for steering_rad, acceleration_m_s2 in commands:
         theirs.act({"steering": steering_rad, "acceleration": acceleration_m_s2})
@@ -54,7 +55,7 @@ def test_each_step_of_a_trajectory_agrees(
 @settings(max_examples=50)
 def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -> None:
     """Equal besides: the wheel angle of `wheel_angle`, and throttle and brake as documented."""
-    theirs = OurLength(None, np.array([20.0, 1.0]), 0.0, speed_m_s)
+    theirs = their_car(20.0, 1.0, 0.0, speed_m_s)
     ours = located(Motion(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
     steering = 0.0
     for action in actions:

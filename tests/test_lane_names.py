@@ -45,6 +45,7 @@ def test_an_unknown_name_brings_the_nearest(name: str, words: str) -> None:
         ("lane", {"wheels": 3}, "cannot make sim 'lane' with wheels=3: .*argument 'wheels'$"),
         ("CartPole-v1", {"rules": "classic"}, "with rules='classic': .*argument 'rules'$"),
         ("no_such_module:Thing-v0", {}, "cannot make sim 'no_such_module:Thing-v0'"),
+        ("one:two:three", {}, "cannot make sim 'one:two:three'"),
     ],
 )
 def test_what_a_sim_refuses_is_one_clear_line(

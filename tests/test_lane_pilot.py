@@ -40,8 +40,8 @@ def test_it_laps_the_course_from_the_start_line() -> None:
 
 
 def test_it_thinks_ahead_where_pursuit_would_fail() -> None:
-    """3.4 m to the left of the street and pointing away from it, pursuit alone leaves the lane."""
-    car = located(Motion(50.0, 4.2, 0.18, 9.5), 0.5, 50.0, 0.0)
+    """8 m before a corner at 11.4 m/s it is too late to brake first and turn then."""
+    car = located(Motion(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
     assert worth(car) < HORIZON
     assert choose(car) != pursue(car)
     for _ in range(HORIZON):

@@ -1,0 +1,268 @@
+"""The commands as a user types them: what they print, what they write, how they exit."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.recorder.mcap_reader import McapReader
+
+GOLDEN = Path(__file__).parent / "golden" / "lane-1.mcap"
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def fails(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
+    """Run a command that must fail with one line on stderr; returns that line."""
+    assert run(arguments) == code
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1, f"not one line: {err!r}"
+    assert err.startswith("mcaprl: ")
+    assert "Traceback" not in out + err
+    return err
+
+
+def as_json(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> Any:
+    assert run(arguments) == code
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture
+def cartpole() -> Path:
+    path = Path("cartpole.mcap")
+    assert run(["record", "CartPole-v1", "--policy", "random", "--episodes", "4", "--out", str(path)]) == 0
+    return path
+
+
+def test_record_info_check(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    facts = as_json(capsys, "info", str(cartpole), "--json")
+    data = mcaprl.open(cartpole)
+    assert facts["env_id"] == "CartPole-v1"
+    assert (facts["episodes"], facts["steps"]) == (4, len(data))
+    assert facts["mean_return"] == data.statistics.mean_return
+    assert facts["size_bytes"] == cartpole.stat().st_size
+    assert facts["duration_s"] == pytest.approx(len(data) * 0.02)
+    assert facts["ends"] == {"terminated": 4}
+    assert facts["problems"] == []
+    assert {"observations", "actions"} <= set(facts)
+    assert as_json(capsys, "check", str(cartpole), "--json") == {"ok": True, "problems": []}
+    assert run(["info", str(cartpole)]) == 0
+    assert "CartPole-v1" in capsys.readouterr().out
+    assert (data.behavior_probs == 0.5).all()
+
+
+def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        arguments = ["--policy", "pilot", "--epsilon", "0.3", "--steps", "50", "--seed", "3"]
+        assert run(["record", "lane", *arguments, "--out", f"{name}.mcap"]) == 0
+    first, second = mcaprl.open("a.mcap"), mcaprl.open("b.mcap")
+    assert len(first) == 50
+    assert first.fingerprint == second.fingerprint
+    assert first.episodes[0].policy == "pilot"
+    assert first.episodes[0].epsilon == 0.3
+    assert set(first.behavior_probs.tolist()) <= {pytest.approx(0.05), pytest.approx(0.75)}
+
+
+def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["record", "CartPole-v1", "--policy", "random", "--episodes", "5", "--seed", "2"]
+    assert run([*common, "--out", "one.mcap"]) == 0
+    assert run([*common, "--out", "shards", "--envs", "2"]) == 0
+    assert sorted(path.name for path in Path("shards").iterdir()) == [
+        "shard-00.mcap",
+        "shard-01.mcap",
+    ]
+    assert mcaprl.open("shards").fingerprint == mcaprl.open("one.mcap").fingerprint
+    assert "exists" in fails_after(capsys, 2, *common, "--out", "shards", "--envs", "2")
+    assert run([*common, "--out", "shards", "--envs", "3", "--overwrite"]) == 0
+    assert len(mcaprl.open("shards").episodes) == 5
+
+
+def fails_after(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
+    capsys.readouterr()
+    return fails(capsys, code, *arguments)
+
+
+def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
+    """The main job at a small size: record, train, evaluate, record the trained one."""
+    common = ["record", "lane", "--no-scene", "--out"]
+    assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
+    assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
+    small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
+    assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
+    assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
+    capsys.readouterr()
+    result = as_json(
+        capsys, "evaluate", "run", "--sim", "lane", "--episodes", "3", "--behavior", "data",
+        "--report", "report", "--record", "episodes.mcap", "--json",
+    )  # fmt: skip
+    assert result["sim"] == "lane"
+    scores = {score["policy"]: score for score in result["policies"]}
+    assert list(scores) == ["run", "pilot", "random"], "what was asked for comes first"
+    assert scores["run"]["episodes"] == 6
+    assert len(scores["run"]["returns"]) == 6
+    assert len(scores["run"]["seed_means"]) == 2
+    low, high = scores["run"]["interval"]
+    assert low <= scores["run"]["mean_return"] <= high
+    assert scores["pilot"]["normalized_score"] == 1.0
+    assert scores["random"]["normalized_score"] == 0.0
+    assert result["behavior"]["episodes"] == len(mcaprl.open("data").episodes)
+    for name in ("comparison.png", "trajectories.png", "evaluation.json"):
+        assert (Path("report") / name).stat().st_size > 500
+    recorded = mcaprl.open("episodes.mcap")
+    assert [episode.total_reward for episode in recorded.episodes] == scores["run"]["returns"]
+    assert {episode.policy for episode in recorded.episodes} == {"run"}
+    replay = ["record", "lane", "--policy", "run/seed-1", "--steps", "5", "--camera", "--out", "r.mcap"]
+    assert run(replay) == 0
+    assert mcaprl.open("r.mcap").episodes[0].policy == "seed-1"
+    policy = mcaprl.load_policy("run")
+    assert policy.act(recorded.observations[:7]).shape == (7,)
+
+
+def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "lane", "--steps", "200", "--no-scene", "--out", "d.mcap"]) == 0
+    train = ["train-offline", "d.mcap", "--algo", "bc", "--out", "run", "--updates", "20", "--hidden", "8"]
+    assert run(train) == 0
+    assert "resume" in fails_after(capsys, 2, *train)
+    assert run([*train, "--resume"]) == 0
+    assert "0 updates" in capsys.readouterr().out
+
+
+def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["layout", str(GOLDEN), "--out", "a.json"]) == 0
+    attached = McapReader(GOLDEN).attachment("foxglove-layout.json")
+    assert attached is not None
+    assert json.loads(Path("a.json").read_text()) == json.loads(attached)
+    assert run(["layout", "lane", "--out", "b.json"]) == 0
+    assert "3D!scene" in json.loads(Path("b.json").read_text())["configById"]
+    assert run(["layout", "CartPole-v1", "--out", "c.json"]) == 0
+    assert "exists" in fails_after(capsys, 2, "layout", "lane", "--out", "c.json")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["record", "lan", "--steps", "5", "--out", "x"], 2, "did you mean lane?"),
+        (["record", "CartPol-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
+        (["record", "a:b:c", "--steps", "5", "--out", "x"], 2, "a:b:c"),
+        (["record", "lane", "--policy", "pilt", "--steps", "5", "--out", "x"], 2, "did you mean pilot"),
+        (["record", "CartPole-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
+        (["record", "lane", "--out", "x"], 2, "--episodes N or --steps N"),
+        (["record", "lane", "--steps", "5"], 2, "Missing option '--out'"),
+        (["record", "lane", "--steps", "-1", "--out", "x"], 2, "--steps"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "2"], 2, "--epsilon"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "known: default"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--observation", "smell"], 2, "depth, state"),
+        (["record", "lane", "--steps", "5", "--out", "taken/x.mcap"], 1, "cannot write taken/x.mcap"),
+        (["record", "lane", "--steps", "5", "--out", "taken"], 2, "taken exists"),
+        (["info", "nothing.mcap"], 1, "no such file"),
+        (["info", "taken"], 1, "no MCAP file"),
+        (["info", "empty.mcap"], 1, "it is empty"),
+        (["check", "nothing.mcap"], 1, "no such file"),
+        (["train-offline", "taken", "--out", "run"], 1, "no MCAP file"),
+        (["train-offline", str(GOLDEN), "--out", "taken"], 2, "taken exists"),
+        (["train-offline", str(GOLDEN), "--out", "r", "--algo", "cqk"], 2, "did you mean cql"),
+        (["train-offline", str(GOLDEN), "--out", "r", "--algo", "bc", "--alpha", "1"], 2, "no setting --alpha"),
+        (["train-offline", str(GOLDEN), "--out", "r", "--hidden", "a,b"], 2, "256,256"),
+        (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
+        (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
+        (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
+        (["evaluate", "pilot"], 2, "--sim"),
+        (["layout", "lane"], 2, "--out"),
+        (["recrod"], 2, "No such command 'recrod'"),
+        (["info", "--jsn", str(GOLDEN)], 2, "--json"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, told: str
+) -> None:
+    Path("taken").write_text("not a log")
+    Path("empty.mcap").touch()
+    assert told in fails(capsys, code, *arguments)
+    assert Path("taken").read_text() == "not a log"
+
+
+def test_spaces_that_differ(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    both = [str(cartpole), str(GOLDEN)]
+    assert "do not fit together" in fails_after(capsys, 1, "info", *both)
+    assert "do not fit together" in fails_after(capsys, 1, "train-offline", *both, "--out", "r")
+    small = ["--updates", "5", "--hidden", "8", "--algo", "bc"]
+    assert run(["train-offline", str(cartpole), "--out", "run", *small]) == 0
+    line = fails_after(capsys, 1, "evaluate", "run", "--sim", "lane")
+    assert "was trained on observation_space" in line
+    assert not Path("r").exists()
+
+
+def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    real_find = __import__("importlib").import_module
+
+    def without(name: str, *rest: Any) -> Any:
+        if name.split(".")[0] in ("matplotlib", "numba"):
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+        return real_find(name, *rest)
+
+    monkeypatch.setattr("mcaprl.errors.importlib.import_module", without)
+    line = fails(capsys, 2, "record", "lane", "--steps", "5", "--out", "x.mcap")
+    assert "numba is not installed: pip install 'mcaprl[sims]'" in line
+    assert builtins.open is not mcaprl.open
+
+
+def test_check_tells_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> None:
+    broken = bytearray(GOLDEN.read_bytes())
+    broken[len(broken) // 2] ^= 1
+    Path("broken.mcap").write_bytes(broken)
+    result = as_json(capsys, "check", "broken.mcap", str(GOLDEN), "--json", code=1)
+    assert result["ok"] is False
+    assert all(set(problem) == {"file", "what", "where", "next"} for problem in result["problems"])
+    assert {problem["file"] for problem in result["problems"]} == {"broken.mcap"}
+    assert run(["check", "broken.mcap"]) == 1
+    assert "broken.mcap" in capsys.readouterr().out
+
+
+def test_golden_log_reads_as_ever(capsys: pytest.CaptureFixture[str]) -> None:
+    data = mcaprl.open(GOLDEN)
+    assert (len(data), len(data.episodes)) == (60, 2)
+    assert data.fingerprint == (GOLDEN.with_suffix(".sha256").read_text().strip())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_recording_is_readable(number: signal.Signals) -> None:
+    command = [sys.executable, "-m", "mcaprl.cli", "record", "lane", "--episodes", "100000"]
+    process = subprocess.Popen(
+        [*command, "--out", "stopped.mcap"], stderr=subprocess.PIPE, text=True, env={**os.environ}
+    )
+    deadline = time.monotonic() + 120
+    path = Path("stopped.mcap")
+    while not (path.exists() and path.stat().st_size > 200_000):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err.strip() == "mcaprl: interrupted; what was finished is kept"
+    assert run(["check", "stopped.mcap"]) == 0
+    assert len(mcaprl.open(path).episodes) >= 1
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--help"]) == 0
+    listed = capsys.readouterr().out
+    for command in ("record", "train-offline", "evaluate", "info", "check", "layout"):
+        assert command in listed
+        assert run([command, "--help"]) == 0
+    assert "--alpha" in capsys.readouterr().out or run(["train-offline", "--help"]) == 0

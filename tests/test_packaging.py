@@ -1,0 +1,126 @@
+"""The folders, the links and the table of packages say the same; importing stays light."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import mcaprl
+
+ROOT = Path(__file__).parent.parent
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PACKAGES = SETTINGS["tool"]["setuptools"]["packages"]
+FOLDERS = SETTINGS["tool"]["setuptools"]["package-dir"]
+
+
+def modules() -> list[str]:
+    found = pkgutil.walk_packages(mcaprl.__path__, "mcaprl.")
+    return sorted(module.name for module in found if not module.name.endswith("__main__"))
+
+
+def test_every_folder_is_a_package() -> None:
+    roots = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests", "mcaprl"}
+    assert {f"mcaprl.{name}" for name in roots} | {"mcaprl"} == set(PACKAGES) == set(FOLDERS)
+    assert roots == {"recorder", "sims", "offline", "online", "cli"}
+
+
+def test_links_lead_to_the_folders() -> None:
+    links = [path for path in (ROOT / "mcaprl").iterdir() if path.is_symlink()]
+    if not links:
+        pytest.skip("a checkout without symbolic links")
+    assert {link.name: link.resolve() for link in links} == {
+        name.removeprefix("mcaprl."): ROOT / folder
+        for name, folder in FOLDERS.items()
+        if name != "mcaprl"
+    }
+
+
+def test_importing_loads_no_engine() -> None:
+    heavy = {"torch", "numba", "stable_baselines3", "pygame", "matplotlib", "pandas", "pyarrow"}
+    code = (
+        "import sys, mcaprl, mcaprl.cli, mcaprl.sims, mcaprl.recorder.wrapper\n"
+        f"print(sorted({heavy!r} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_all_is_what_can_be_used() -> None:
+    for name in mcaprl.__all__:
+        assert getattr(mcaprl, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = mcaprl.nothing
+
+
+def test_version_is_told_once() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "mcaprl.cli", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == f"mcaprl {mcaprl.__version__}"
+    assert f"## {mcaprl.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.parametrize("name", modules())
+def test_public_names_are_documented(name: str) -> None:
+    module = importlib.import_module(name)
+    assert inspect.getdoc(module), f"{name} has no docstring"
+    for member, value in vars(module).items():
+        if member.startswith("_") or getattr(value, "__module__", "") != name:
+            continue
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), f"{name}.{member} has no docstring"
+
+
+def test_layers_are_kept_by_the_imports_themselves() -> None:
+    """What import-linter checks over the whole graph, on the two rules that matter most."""
+    for path in (ROOT / "recorder").glob("*.py"):
+        assert not _imports(path) & {"torch", "mcaprl.sims", "mcaprl.offline", "numba"}, path.name
+    for path in (ROOT / "sims").glob("*.py"):
+        assert not _imports(path) & {"torch", "mcaprl.recorder", "mcaprl.offline"}, path.name
+
+
+def test_no_file_is_unwieldy() -> None:
+    for folder in ("recorder", "sims", "offline", "online", "cli", "mcaprl"):
+        for path in (ROOT / folder).glob("*.py"):
+            assert len(path.read_text().splitlines()) <= 400, path
+
+
+def test_the_project_pins_what_it_was_tested_with() -> None:
+    pinned = {
+        re.split(r"==", line)[0].lower()
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    }
+    wanted = [*SETTINGS["project"]["dependencies"]]
+    for extra in ("sims", "offline", "online", "report", "tables"):
+        wanted += SETTINGS["project"]["optional-dependencies"][extra]
+    for requirement in wanted:
+        name = re.split(r"[<>=\[]", requirement)[0].lower()
+        assert name in pinned, f"{name} is not in constraints.txt"
+
+
+def _imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+    return {".".join(name.split(".")[:depth]) for name in found for depth in (1, 2)}
+
+
+def test_imports_helper_sees_both_forms(tmp_path: Path) -> None:
+    path = tmp_path / "x.py"
+    path.write_text("import torch.nn\nfrom mcaprl.sims.lane import X\n")
+    assert _imports(path) >= {"torch", "mcaprl.sims"}
+    assert isinstance(mcaprl, ModuleType)
