@@ -64,7 +64,10 @@ def test_all_is_what_can_be_used() -> None:
 
 def test_version_is_told_once() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "mcaprl.cli", "--version"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "mcaprl.cli", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip() == f"mcaprl {mcaprl.__version__}"
     assert f"## {mcaprl.__version__}" in (ROOT / "CHANGELOG.md").read_text()
