@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from mcaprl.errors import LogError
+
+_PIPE_WIDTH = 120
 
 
 def print_json(value: Any) -> None:
@@ -42,7 +45,7 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
         table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
     for row in rows:
         table.add_row(*row)
-    Console().print(table)
+    _print(table)
 
 
 def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
@@ -52,7 +55,7 @@ def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
     table.add_column(overflow="fold")
     for fact in facts:
         table.add_row(*fact)
-    Console().print(table)
+    _print(table)
 
 
 @contextmanager
@@ -84,6 +87,11 @@ def size(count: float) -> str:
             return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
         count /= 1024
     raise AssertionError("unreachable")
+
+
+def _print(table: Table) -> None:
+    # A file or a pipe has no width of its own; the usual guess of 80 breaks lines for nothing.
+    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(table)
 
 
 def _finite(value: Any) -> Any:

@@ -46,7 +46,7 @@ Done. Under $out/ are now
   report/comparison.png     how they compare, with 95 % intervals
   report/trajectories.png   where they drove
   report/evaluation.json    the same in numbers
-  replay.mcap               three laps of the CQL driver: scene, depth camera, rewards
+  replay.mcap               three drives of the CQL policy: scene, depth camera, rewards
   foxglove-layout.json      the layout for it
 
 To watch: open app.foxglove.dev or Lichtblick, choose "Open local file", take $out/replay.mcap, then

@@ -54,7 +54,8 @@ def comparison_picture(
             label += f"   score {score.normalized_score:.2f}"
         # Behind the longest of bar, interval and dots.
         end = max(high, 0.0, float(means.max()))
-        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
+        box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1}
+        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center", bbox=box)
     axes.set_yticks(range(len(scores)), [score.policy for score in scores])
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
@@ -98,6 +99,7 @@ def trajectory_picture(path: Path, scores: Sequence[PolicyScore], world: Sequenc
         axes.set_title(f"{score.policy}\n{ends}", loc="left", fontsize=10, color=_INK)
         axes.set_aspect("equal")
         axes.set_xlabel("x, m")
+        axes.set_ylabel("y, m")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     _save(figure, path)

@@ -1,0 +1,79 @@
+"""The docs do what they say: code runs, commands exist, the reference is fresh."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from pathlib import Path
+from types import ModuleType
+
+import click
+import pytest
+
+from mcaprl.cli import cli, run
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+# Sizes at which the README's commands take seconds; what they do stays the same.
+SMALLER = {"--episodes": "2", "--updates": "30", "--hidden": "16,16"}
+
+
+def _generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_command_reference_is_fresh() -> None:
+    pytest.importorskip("matplotlib")
+    text = _generator().command_reference()
+    assert (ROOT / "docs" / "cli.md").read_text() == text, "stale: run `make docs`"
+
+
+def test_readme_code_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    exec(compile(code, "README.md", "exec"), {})
+    assert "Dataset(CartPole-v1: 10 episodes" in capsys.readouterr().out
+
+
+def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = [line for line in README.splitlines() if line.startswith("mcaprl ")]
+    assert len(lines) == 8
+    for line in lines:
+        arguments = shlex.split(line)[1:]
+        if arguments[0] == "train-offline":
+            arguments += ["--updates", "30", "--hidden", "16,16"]
+        for option, value in SMALLER.items():
+            if option in arguments:
+                arguments[arguments.index(option) + 1] = value
+        assert run(arguments) == 0, line
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "docs/architecture.md"])
+def test_links_and_files_exist(name: str) -> None:
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), f"{name} links to {target}"
+    for path in re.findall(
+        r"`((?:recorder|sims|offline|online|cli|tests|docs)/[\w./]+\.\w+)`", page.read_text()
+    ):
+        assert (ROOT / path).exists(), f"{name} names {path}"
+
+
+def test_every_option_has_help_or_a_plain_name() -> None:
+    plain = {"seed", "help", "episodes", "compression"}
+    with click.Context(cli, info_name="mcaprl") as top:
+        for name, command in cli.commands.items():
+            with click.Context(command, info_name=name, parent=top) as context:
+                for parameter in command.get_params(context):
+                    if isinstance(parameter, click.Option) and parameter.name not in plain:
+                        assert parameter.help, f"{name} --{parameter.name}"
