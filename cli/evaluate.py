@@ -154,7 +154,7 @@ def _print_scores(
         score = (logged["mean_return"] - random) / (pilot - random)
         rows.append(
             [
-                "behaviour, as logged",
+                "behavior, as logged",
                 f"{logged['mean_return']:.2f}",
                 _interval(logged["interval"]),
                 "" if math.isnan(score) else f"{score:.3f}",

@@ -26,9 +26,10 @@ from mcaprl.sims import SIMS, make_sim
 
 @click.command()
 @click.argument("data", nargs=-1, required=True)
+@click.option("--report", type=click.Path(path_type=Path), help="Folder for a picture and JSON.")
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-def info(data: tuple[str, ...], strict: bool, as_json: bool) -> int:
+def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
     """Tell what is in DATA: files, folders or globs of logs."""
     paths = find_logs(data)
     with warnings.catch_warnings(record=True) as caught:
@@ -37,6 +38,11 @@ def info(data: tuple[str, ...], strict: bool, as_json: bool) -> int:
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
     facts["problems"] = [str(warning.message) for warning in caught] + facts["problems"]
+    if report is not None:
+        from mcaprl.recorder.report import dataset_picture
+
+        write_json(report / "dataset.json", facts)
+        dataset_picture(report / "dataset.png", dataset, _title(dataset.sources))
     if as_json:
         print_json(facts)
     else:

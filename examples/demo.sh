@@ -19,7 +19,7 @@ mcaprl record lane --policy pilot --epsilon 0.3 --episodes 50 --seed 4 --out "$o
 mcaprl record lane --policy random --episodes 50 --seed 5 --out "$out/data/random.mcap"
 mcaprl info "$out/data"
 
-step "learn from these files alone, four seeds each: CQL, offline Double DQN, behaviour cloning"
+step "learn from these files alone, four seeds each: CQL, offline Double DQN, behavior cloning"
 mcaprl train-offline "$out/data" --algo cql --seeds 4 --out "$out/runs/cql" >"$out/cql.log" 2>&1 &
 first=$!
 mcaprl train-offline "$out/data" --algo double-dqn --seeds 4 --out "$out/runs/double-dqn" \
@@ -29,7 +29,7 @@ wait "$first" && cat "$out/cql.log" || { cat "$out/cql.log"; exit 1; }
 mcaprl train-offline "$out/data" --algo bc --seeds 4 --out "$out/runs/bc"
 wait "$second" && cat "$out/double-dqn.log" || { cat "$out/double-dqn.log"; exit 1; }
 
-step "evaluate them over the same 30 episodes, beside the data's own behaviour, random and pilot"
+step "evaluate them over the same 30 episodes, beside the data's own behavior, random and pilot"
 mcaprl evaluate "$out/runs/cql" "$out/runs/bc" "$out/runs/double-dqn" pilot random --sim lane \
   --episodes 30 --behavior "$out/data" --report "$out/report"
 

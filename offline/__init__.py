@@ -1,4 +1,4 @@
-"""Offline learning from logs: DQN, Double DQN, CQL and behaviour cloning for discrete actions.
+"""Offline learning from logs: DQN, Double DQN, CQL and behavior cloning for discrete actions.
 
 Importing this package loads no torch; its modules do.
 

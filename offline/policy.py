@@ -85,7 +85,7 @@ class Policy:
     def action_probabilities(self, observations: NDArray[Any]) -> NDArray[np.float32]:
         """The probabilities (B, A) of all actions.
 
-        Those of behaviour cloning estimate the policy in the log. A policy with Q-values is
+        Those of behavior cloning estimate the policy in the log. A policy with Q-values is
         greedy: the action of `act` has 1.
 
         Raises:

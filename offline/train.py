@@ -130,7 +130,10 @@ class _Run:
                     else ", or resume the run in it (--resume)"
                 )
             )
-        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrainingError(f"cannot write {self.folder}: {error.strerror}") from error
         source = {"env_id": self.dataset.env_id, "transitions": len(self.dataset.rewards)}
         write_json(path, {**self.identity.to_json(), **source})
 

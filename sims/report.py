@@ -40,7 +40,7 @@ def comparison_picture(
     if behavior is not None:
         mean, low, high = behavior
         axes.axvspan(low, high, color=_PALE, alpha=0.45, lw=0)
-        axes.axvline(mean, color=_INK, lw=1, ls="--", label=f"behaviour in the log {mean:.0f}")
+        axes.axvline(mean, color=_INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
     for row, score in enumerate(scores):
         low, high = score.interval
         color = _COLORS[row % len(_COLORS)]

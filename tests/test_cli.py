@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
+import importlib
 import json
 import os
 import signal
@@ -68,6 +68,17 @@ def test_record_info_check(cartpole: Path, capsys: pytest.CaptureFixture[str]) -
     assert run(["info", str(cartpole)]) == 0
     assert "CartPole-v1" in capsys.readouterr().out
     assert (data.behavior_probs == 0.5).all()
+
+
+def test_info_report_and_strict(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(cartpole), "--report", "report", "--strict"]) == 0
+    assert Path("report/dataset.png").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads(Path("report/dataset.json").read_text())["episodes"] == 4
+    cut = cartpole.read_bytes()
+    Path("cut.mcap").write_bytes(cut[: -len(cut) // 3])
+    capsys.readouterr()
+    facts = as_json(capsys, "info", "cut.mcap", "--strict", "--json", code=1)
+    assert "was cut off" in facts["problems"][0]
 
 
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
@@ -201,6 +212,9 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["check", "nothing.mcap"], 1, "no such file"),
         (["train-offline", "taken", "--out", "run"], 1, "no MCAP file"),
         (["train-offline", str(GOLDEN), "--out", "taken"], 2, "taken exists"),
+        (["train-offline", str(GOLDEN), "--out", "taken/r"], 1, "cannot write taken/r"),
+        (["evaluate", "pilot", "--sim", "lane", "--episodes=1", "--report", "taken"], 1, "cann"),
+        (["info", str(GOLDEN), "--report", "taken"], 1, "cannot write taken/"),
         (["train-offline", str(GOLDEN), "--out", "r", "--algo", "cqk"], 2, "did you mean cql"),
         (["train-offline", str(GOLDEN), "--out", "r", "--algo", "bc", "--alpha", "1"], 2, "has --"),
         (["train-offline", str(GOLDEN), "--out", "r", "--hidden", "a,b"], 2, "256,256"),
@@ -234,7 +248,7 @@ def test_spaces_that_differ(cartpole: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    real_find = __import__("importlib").import_module
+    real_find = importlib.import_module
 
     def without(name: str, *rest: Any) -> Any:
         if name.split(".")[0] in ("matplotlib", "numba"):
@@ -244,7 +258,6 @@ def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
     monkeypatch.setattr("mcaprl.errors.importlib.import_module", without)
     line = fails(capsys, 2, "record", "lane", "--steps", "5", "--out", "x.mcap")
     assert "numba is not installed: pip install 'mcaprl[sims]'" in line
-    assert builtins.open is not mcaprl.open
 
 
 def test_check_tells_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> None:
