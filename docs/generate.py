@@ -32,12 +32,12 @@ START = (110.0, 1.0, 0.0, 10.0)
 def command_reference() -> str:
     """The help of every command, as Markdown."""
     parts = ["# The commands\n\nWritten by `make docs` from the program's own help.\n"]
-    with click.Context(cli, info_name="mcaprl", max_content_width=100) as top:
+    with click.Context(cli, info_name="mcaprl", terminal_width=100, **cli.context_settings) as top:
         parts.append(_section("mcaprl", cli.get_help(top)))
         for name in cli.list_commands(top):
             command = cli.get_command(top, name)
             assert command is not None
-            with click.Context(command, info_name=name, parent=top, max_content_width=100) as inner:
+            with click.Context(command, info_name=name, parent=top) as inner:
                 parts.append(_section(f"mcaprl {name}", command.get_help(inner)))
     return "\n".join(parts)
 

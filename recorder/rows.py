@@ -43,6 +43,10 @@ class StepColumns:
             self._rows["payload"][0] = self._rows["payload"][self.row - 1]
             self.row = 1
 
+    def step_back(self) -> None:
+        """Leave the present row again; nothing was put there."""
+        self.row -= 1
+
     def act(self, action: Any, behavior_prob: float) -> None:
         """Put the action that is taken at the present row, and its probability."""
         self._action.put(self.row, action)
@@ -116,6 +120,10 @@ class ImageColumn:
             self.flush()
         self.row += 1
         self._rows["log_time"][self.row] = time_ns
+
+    def step_back(self) -> None:
+        """Leave the present row again; nothing was put there."""
+        self.row -= 1
 
     def flush(self) -> None:
         """Write all rows."""

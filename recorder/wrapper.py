@@ -17,6 +17,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 import numpy as np
 
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
@@ -88,11 +89,12 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._log_metadata = metadata
         self._next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns
         self._columns = StepColumns(self._log)
-        self._images = {
+        images = {
             leaf: ImageColumn(self._log, leaf.topic, leaf.shape, leaf.encoding)
             for leaf in self._log.image_leaves
         }
-        self._writers = leaf_writers(metadata.observation_space, self._columns, self._images)
+        self._images = list(images.values())
+        self._writers = leaf_writers(metadata.observation_space, self._columns, images)
         self._episode = -1
         self._open = self._has_layout = False
 
@@ -108,7 +110,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._seed = seed
         self._options = "" if options is None else json.dumps(options, default=_plain)
         self._columns.begin(self._episode, self._start_ns, self._step_ns)
-        self._observe(observation)
+        self._observe(observation, self._start_ns)
         self._display.begin(self._start_ns, self._episode, self.policy)
         if not self._has_layout:
             self._attach_layout()
@@ -120,14 +122,15 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         # Before the environment can change it.
         self._columns.act(action, self.behavior_prob)
-        observation, reward, terminated, truncated, info = super().step(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
         reward_ = float(reward)
         self._columns.reward(reward_)
         self.behavior_prob = math.nan
+        time_ns = self._start_ns + (self._step + 1) * self._step_ns
+        self._observe(observation, time_ns)
         self._total_reward += reward_
         self._step += 1
-        self._observe(observation)
-        self._display.observe(self._start_ns + self._step * self._step_ns)
+        self._display.observe(time_ns)
         if terminated or truncated:
             reason = str(info.get("reason") or ("terminated" if terminated else "time_limit"))
             self._end(bool(terminated), bool(truncated), reason)
@@ -140,13 +143,19 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             self._log.close()
         super().close()
 
-    def _observe(self, observation: Any) -> None:
+    def _observe(self, observation: Any, time_ns: int) -> None:
+        """Log an observation; one that does not fit leaves the rows as they were."""
         self._columns.next_row()
-        time_ns = self._start_ns + self._step * self._step_ns
-        for image in self._images.values():
+        for image in self._images:
             image.next_row(time_ns)
-        for write in self._writers:
-            write(observation)
+        try:
+            for write in self._writers:
+                write(observation)
+        except SpaceError:
+            self._columns.step_back()
+            for image in self._images:
+                image.step_back()
+            raise
 
     def _attach_layout(self) -> None:
         """Attach it once the first reset has shown which topics there are."""
@@ -165,7 +174,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             self._end(False, True, "interrupted")
         elif self._open:
             self._columns.clear()
-            for image in self._images.values():
+            for image in self._images:
                 image.clear()
             self._display.clear()
             self._episode -= 1
@@ -187,7 +196,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             seed=self._seed,
             options=self._options,
         )
-        for image in self._images.values():
+        for image in self._images:
             image.flush()
         self._display.end(summary)
         self._log.write_episodes([summary])

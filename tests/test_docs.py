@@ -71,7 +71,7 @@ def test_links_and_files_exist(name: str) -> None:
 
 def test_every_option_has_help_or_a_plain_name() -> None:
     plain = {"seed", "help", "episodes", "compression"}
-    with click.Context(cli, info_name="mcaprl") as top:
+    with click.Context(cli, info_name="mcaprl", **cli.context_settings) as top:
         for name, command in cli.commands.items():
             with click.Context(command, info_name=name, parent=top) as context:
                 for parameter in command.get_params(context):

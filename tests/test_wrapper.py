@@ -146,6 +146,40 @@ def test_wrong_shapes_are_refused(log_path: Path) -> None:
         env.reset()
 
 
+def test_episode_ends_before_a_wrong_observation(log_path: Path) -> None:
+    rows = [*ONE[:2], (np.zeros(3, np.float32), 9.0, False, False)]
+    env = mcaprl.RecordMcap(scripted(rows), log_path)
+    env.reset()
+    env.step(1)
+    with pytest.raises(SpaceError):
+        env.step(2)
+    env.close()
+    data = mcaprl.open(log_path)
+    assert data.rewards.tolist() == [0.5]
+    assert data.next_observations.tolist() == [[1, 10]]
+    assert data.episodes[0].total_reward == 0.5
+
+
+class Breaks(ScriptedEnv):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if action == 2:
+            raise RuntimeError("motor on fire")
+        return super().step(action)
+
+
+def test_episode_ends_before_an_exception(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(Breaks(BOX, spaces.Discrete(3), [ONE]), log_path)
+    env.reset()
+    env.step(1)
+    with pytest.raises(RuntimeError, match="motor on fire"):
+        env.step(2)
+    env.close()
+    data = mcaprl.open(log_path)
+    assert data.actions.tolist() == [1]
+    assert data.truncated.tolist() == [True]
+    assert data.next_observations.tolist() == [[1, 10]]
+
+
 def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
     rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
     env = mcaprl.RecordMcap(scripted(rows), log_path)
