@@ -58,6 +58,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _fail(error.format_message(), error.exit_code)
     except McaprlError as error:
         return _fail(str(error), error.exit_code)
+    except OSError as error:
+        return _fail(f"{error.filename or 'output'}: {error.strerror}", 1)
     except (click.Abort, KeyboardInterrupt):
         return _fail("interrupted; what was finished is kept", 1)
     return code if isinstance(code, int) else 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +50,11 @@ def evaluate(
     POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
     are given beside random = 0 and pilot = 1, where the sim has a pilot.
     """
+    logged = _behavior(behavior)
     env = make_sim(sim, **sim_arguments)
     with closing(env):
         world = list(getattr(env.unwrapped, "static_scene", list)())
         scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
-    logged = _behavior(behavior)
     result = {
         "sim": sim,
         "seed": seed,
@@ -78,7 +78,7 @@ def _score_all(
     overwrite: bool,
 ) -> list[PolicyScore]:
     """Score what was asked for, then what it is measured against; only the former is recorded."""
-    wanted = [(name, policies_of(name, env)) for name in names]
+    wanted = [(name, policies_of(name, env)) for name in dict.fromkeys(names)]
     baselines = [
         (name, found)
         for name in SCRIPTED
@@ -86,8 +86,11 @@ def _score_all(
     ]
     runs = sum(len(found) for _, found in wanted + baselines)
     scores = {}
-    with progress("evaluating", runs * episodes) as advance:
+    with ExitStack() as stack:
+        advance = stack.enter_context(progress("evaluating", runs * episodes))
         recorder = _recorder(env, record_path, seed, overwrite)
+        if recorder is not None:
+            stack.enter_context(closing(recorder))
         for name, found in wanted + baselines:
             acting = recorder if recorder is not None and name in names else env
             if isinstance(acting, RecordMcap):
@@ -100,8 +103,6 @@ def _score_all(
                 seed=seed,
                 on_episode=lambda result: advance(),
             )
-        if recorder is not None:
-            recorder.close()
     pilot = scores.get("pilot")
     return [normalize(score, scores["random"], pilot) for score in scores.values()]
 
@@ -151,7 +152,7 @@ def _print_scores(
     pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
     rows = []
     if logged is not None:
-        score = (logged["mean_return"] - random) / (pilot - random)
+        score = (logged["mean_return"] - random) / (pilot - random or math.nan)
         rows.append(
             [
                 "behavior, as logged",

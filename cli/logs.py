@@ -75,7 +75,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs that a sim will give."""
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
-    is_file = source not in SIMS and Path(source).is_file()
+    is_file = source not in SIMS and (Path(source).is_file() or source.endswith(".mcap"))
     found = _layout_of_file(Path(source)) if is_file else _layout_of_sim(source)
     write_json(out, found)
     click.echo(f"{out}: in Foxglove, open the layout menu and import this file")

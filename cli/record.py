@@ -126,7 +126,10 @@ def record(
         def on_episode(result: EpisodeResult) -> None:
             advance(1 if episodes else result.length)
 
-        results = run_recording(whole, on_episode) if envs == 1 else run_shards(whole, envs)
+        if envs == 1:
+            results = run_recording(whole, on_episode)
+        else:
+            results = run_shards(whole, envs, on_episode)
     returns = np.array([result.total_reward for result in results])
     length = sum(result.length for result in results)
     files = [out] if out.is_file() else sorted(out.glob("*.mcap"))
@@ -173,13 +176,21 @@ def run_recording(
             )
 
 
-def run_shards(whole: Recording, processes: int) -> list[EpisodeResult]:
+def run_shards(
+    whole: Recording, processes: int, on_episode: Callable[[EpisodeResult], None]
+) -> list[EpisodeResult]:
     """Record shards of a folder in as many processes; together the same episodes as one would.
 
     Raises:
-        OutputExistsError: the folder holds logs already, and they may not be replaced.
+        OutputExistsError: the folder holds logs already that may not be replaced.
     """
+    # What is wrong with the request is told before anything is touched.
+    with closing(make_sim(whole.sim, **whole.sim_options)) as env:
+        policies_of(whole.policy, env)
     old = sorted(whole.out.glob("*.mcap")) if whole.out.is_dir() else []
+    foreign = [path.name for path in old if not path.name.startswith("shard-")]
+    if foreign:
+        raise OutputExistsError(f"{whole.out} has other logs ({foreign[0]}): choose another folder")
     if (old and not whole.overwrite) or whole.out.is_file():
         raise OutputExistsError(f"{whole.out} exists: choose another folder, or pass --overwrite")
     for path in old:
@@ -199,8 +210,13 @@ def run_shards(whole: Recording, processes: int) -> list[EpisodeResult]:
         if end > start
     ]
     context = multiprocessing.get_context("spawn")
+    results = []
     with ProcessPoolExecutor(len(shards), mp_context=context) as pool:
-        return [result for results in pool.map(run_recording, shards) for result in results]
+        for shard_results in pool.map(run_recording, shards):
+            results += shard_results
+            for result in shard_results:
+                on_episode(result)
+    return results
 
 
 def _shares(total: int, parts: int) -> list[tuple[int, int]]:

@@ -45,6 +45,11 @@ class UnknownNameError(UsageError):
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         listed = ", ".join(names) if len(names) <= 12 else f"{', '.join(names[:12])}, ..."
         super().__init__(f"unknown {kind} '{name}': {hint}known: {listed}")
+        self._arguments = (kind, name, names)
+
+    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str]]]:
+        """Make it again in another process, which cannot be done from the message alone."""
+        return type(self), self._arguments
 
 
 class OutputExistsError(UsageError):

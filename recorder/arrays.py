@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.log_writer import EpisodeSummary
 from mcaprl.recorder.metadata import LogMetadata, installed_versions
+from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
 from mcaprl.recorder.transitions import Transitions
 
@@ -41,7 +42,7 @@ def columns_of_arrays(
         env_id=env_id,
         versions=installed_versions(),
     )
-    steps = len(np.asarray(rewards))
+    steps = len(np.atleast_1d(np.asarray(rewards)))
     if steps == 0:
         raise SpaceError("no transitions: the arrays are empty")
     leaves = observation_leaves(description.observation_space)
@@ -118,13 +119,15 @@ def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
     array = np.asarray(values)
     if array.shape != (steps,):
         raise SpaceError(f"{role} has shape {array.shape}, expected {(steps,)}")
+    if array.dtype.kind not in "biuf" or (dtype is np.bool_ and not np.isin(array, (0, 1)).all()):
+        raise SpaceError(f"{role} are not {'flags' if dtype is np.bool_ else 'numbers'}")
     return array.astype(dtype)
 
 
 def _exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Cast without losing anything."""
     if array.dtype == dtype:
-        return array
+        return array.copy()
     with np.errstate(all="ignore"):
         cast = array.astype(dtype)
     if not np.array_equal(cast, array, equal_nan=dtype.kind == "f" and array.dtype.kind == "f"):
@@ -166,7 +169,7 @@ def _assemble(
         EpisodeSummary(
             episode=number,
             length=int(last - start + 1),
-            total_reward=float(sum(columns["rewards"][start : last + 1].tolist())),
+            total_reward=add_up(columns["rewards"][start : last + 1]),
             terminated=bool(columns["terminated"][last]),
             truncated=bool(columns["truncated"][last]),
             start_time_ns=0,

@@ -18,6 +18,7 @@ from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, chunk_records, message_index
 from mcaprl.recorder.mcap_reader import McapReader, parse_record
 from mcaprl.recorder.reader import read_log
+from mcaprl.recorder.rows import add_up
 
 _REWRITE = "read what is left with mcaprl.open and save it anew"
 
@@ -83,7 +84,11 @@ def _check_data_crc(reader: McapReader, report: Report) -> None:
     """The data section's own CRC, which covers what stands outside the chunks as well."""
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
         if opcode == Opcode.DATA_END:
-            end: DataEnd = parse_record(opcode, content)
+            try:
+                end: DataEnd = parse_record(opcode, content)
+            except CorruptLogError as error:
+                report(str(error), f"byte {offset}")
+                return
             crc = end.data_section_crc
             if crc and zlib.crc32(reader.view[:offset]) != crc:
                 report("the data section does not match its CRC", f"bytes 0 to {offset}")
@@ -112,7 +117,8 @@ def _check_chunk(reader: McapReader, chunk: ChunkIndex, report: Report) -> None:
                 np.array_equal(told["offset"], offsets[mine])
                 and np.array_equal(told["log_time"], times[mine])
             ):
-                topic = reader.channels[channel_id].topic
+                known = reader.channels.get(channel_id)
+                topic = known.topic if known else f"channel {channel_id}"
                 report(f"the message index of {topic} is wrong", f"chunk at byte {offset}")
         unindexed = set(np.unique(channels).tolist()) - set(chunk.message_index_offsets)
         for channel_id in unindexed:
@@ -153,10 +159,7 @@ def _check_contents(path: Path, report: Report) -> None:
         report(_without_path(error, path), "/rl/step", "record it again, or open another file")
         return
     for episode in dataset.episodes:
-        if len(episode.rewards) and (episode.terminated[:-1] | episode.truncated[:-1]).any():
-            step = int(np.argmax(episode.terminated[:-1] | episode.truncated[:-1]))
-            report("an episode goes on after its end", f"episode {episode.index}, step {step}")
-        total = float(sum(episode.rewards.tolist()))
+        total = add_up(episode.rewards)
         if total != episode.total_reward and not np.isnan(total):
             report(
                 f"/rl/episode tells a return of {episode.total_reward}, its rewards give {total}",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError
+from mcaprl.errors import LogError, SpaceError, UnknownNameError
 from mcaprl.recorder.log_writer import EpisodeSummary
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.spaces import nest, observation_leaves, space_to_json
@@ -109,14 +109,13 @@ class Dataset:
         transitions: Transitions,
         description: LogMetadata,
         *,
-        strings: Mapping[str, str] | None = None,
         sources: tuple[Path, ...] = (),
     ) -> None:
         """Use `mcaprl.open` or `Dataset.from_arrays`."""
         self._transitions = transitions
         self._description = description
         self._leaves = observation_leaves(description.observation_space)
-        self.metadata = dict(description.to_strings() if strings is None else strings)
+        self.metadata = description.to_strings()
         self.sources = sources
 
     @classmethod
@@ -175,9 +174,14 @@ class Dataset:
     def concatenate(cls, parts: Sequence[Dataset]) -> Dataset:
         """Several datasets as one; their episodes follow each other.
 
+        Metadata on which they do not agree is left empty.
+
         Raises:
             SpaceError: their spaces differ.
+            LogError: there are none.
         """
+        if not parts:
+            raise LogError("no data: the list of datasets or files is empty")
         first = parts[0]
         for other in parts[1:]:
             for role in ("observation_space", "action_space"):
@@ -190,8 +194,7 @@ class Dataset:
             return first
         return cls(
             Transitions.concatenate([part._transitions for part in parts]),
-            first._description,
-            strings={key: first.metadata[key] for key in _common_keys(parts)},
+            LogMetadata.common([part._description for part in parts]),
             sources=tuple(path for part in parts for path in part.sources),
         )
 
@@ -323,9 +326,12 @@ class Dataset:
 
         Raises:
             MissingExtraError: pyarrow is not installed.
+            UnknownNameError: there is no such table.
         """
         from mcaprl.recorder.tables import episode_table, transition_table
 
+        if table not in ("transitions", "episodes"):
+            raise UnknownNameError("table", table, ["transitions", "episodes"])
         if table == "episodes":
             return episode_table(self._transitions)
         return transition_table(self._transitions, self._leaves, self._description)
@@ -355,7 +361,6 @@ class Dataset:
         return Dataset(
             self._transitions.take(chosen),
             self._description,
-            strings=self.metadata,
             sources=self.sources,
         )
 
@@ -382,12 +387,6 @@ class Dataset:
 
     def _name(self) -> str:
         return str(self.sources[0]) if self.sources else repr(self)
-
-
-def _common_keys(parts: Sequence[Dataset]) -> list[str]:
-    """Metadata on which all parts agree: a mixed dataset has no one policy or seed."""
-    first, *others = (part.metadata for part in parts)
-    return [key for key in first if all(o.get(key) == first[key] for o in others)]
 
 
 def _shapes(array: Any) -> str:

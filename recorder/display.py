@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 from mcaprl.recorder import messages
@@ -24,6 +25,7 @@ from mcaprl.recorder.scene import (
     transforms,
 )
 from mcaprl.recorder.schema import ENCAPSULATION, telemetry_schema
+from mcaprl.recorder.signals import HoldSignals
 
 ROSOUT, SCENE, SCENE_STATIC = "/rosout", "/scene", "/scene/static"
 TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
@@ -52,6 +54,7 @@ class Display:
         camera = camera or bool(log.image_leaves)
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
+        self._shows_steps = any((self._scene, self._telemetry, self._depth))
         self._channels: dict[str, int] = {}
         self.telemetry_names: tuple[str, ...] = ()
         self.follow_frame = ""
@@ -61,31 +64,49 @@ class Display:
         """The topics that are written; known once the first episode has begun."""
         return (*self._channels, *((DEPTH,) if self._depth_images else ()))
 
-    def begin(self, time_ns: int, episode: int, policy: str) -> None:
-        """Show an episode's start; the environment has just been reset."""
-        if not self._channels:
-            self._announce()
-        self._say(time_ns, f"episode {episode} begins" + (f", {policy} acts" if policy else ""))
-        if self._scene is not None:
-            self._emit(SCENE_STATIC, time_ns, marker_array(self._scene.static_scene(), time_ns))
-            self._emit(TF_STATIC, time_ns, transforms(self._scene.static_frames(), time_ns))
-        self.observe(time_ns)
+    def begin(self, start_ns: int, step_ns: int, episode: int, policy: str) -> bool:
+        """Show an episode's start; the environment has just been reset.
 
-    def observe(self, time_ns: int) -> None:
-        """Show the environment as it is at this moment."""
+        Args:
+            start_ns: log_time of the first observation.
+            step_ns: from one to the next.
+            episode: its number.
+            policy: who acts.
+
+        Returns:
+            Whether the topics were announced just now.
+        """
+        self._start_ns, self._step_ns = start_ns, step_ns
+        is_first = not self._channels
+        if is_first:
+            self._announce()
+        self._say(start_ns, f"episode {episode} begins" + (f", {policy} acts" if policy else ""))
+        if self._scene is not None:
+            self._emit(SCENE_STATIC, start_ns, marker_array(self._scene.static_scene(), start_ns))
+            self._emit(TF_STATIC, start_ns, transforms(self._scene.static_frames(), start_ns))
+        if self._depth_images is not None:
+            self._depth_images.begin(start_ns, step_ns)
+        return is_first
+
+    def observe(self, step: int) -> None:
+        """Show the environment as it is after `step` steps."""
+        if not self._shows_steps:
+            return
+        time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
             self._emit(SCENE, time_ns, marker_array(self._scene.scene(), time_ns))
             self._emit(TF, time_ns, transforms(self._scene.frames(), time_ns))
         if self._telemetry is not None:
             values = self._telemetry.telemetry()
-            numbers = struct.pack(
-                f"<I{len(values)}d", ENCAPSULATION, *(values[n] for n in self.telemetry_names)
-            )
-            self._emit(TELEMETRY, time_ns, numbers)
+            numbers = [values.get(name, math.nan) for name in self.telemetry_names]
+            data = struct.pack(f"<I{len(numbers)}d", ENCAPSULATION, *numbers)
+            self._emit(TELEMETRY, time_ns, data)
         if self._depth is not None and self._depth_images is not None:
-            self._depth_images.next_row(time_ns)
+            if self._depth_images.is_full(step):
+                with HoldSignals():
+                    self._depth_images.flush(step)
             millimetres = depth_millimetres(self._depth.depth_image_m())
-            self._depth_images.column[self._depth_images.row] = millimetres.view("u1").ravel()
+            self._depth_images.put(step, millimetres.view("u1"))
 
     def end(self, summary: EpisodeSummary) -> None:
         """Tell how an episode ended, and write what has gathered."""
@@ -94,13 +115,13 @@ class Display:
             f"episode {summary.episode} ends after {summary.length} steps:"
             f" {summary.reason}, return {summary.total_reward:.4g}",
         )
-        self._flush()
+        self._flush_messages()
+        if self._depth_images is not None:
+            self._depth_images.flush(summary.length + 1)
 
     def clear(self) -> None:
         """Forget what has gathered."""
         self._messages, self._bytes = [], 0
-        if self._depth_images is not None:
-            self._depth_images.clear()
 
     def _announce(self) -> None:
         types = {ROSOUT: "rcl_interfaces/msg/Log"}
@@ -137,11 +158,6 @@ class Display:
         self._bytes += len(data)
         if self._bytes > _CHUNK_BYTES:
             self._flush_messages()
-
-    def _flush(self) -> None:
-        self._flush_messages()
-        if self._depth_images is not None:
-            self._depth_images.flush()
 
     def _flush_messages(self) -> None:
         self._log.mcap.write_messages(self._messages)

@@ -34,9 +34,12 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
-# Rows of /rl/step in a chunk, and images in one of theirs.
+# Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
+BYTES_PER_CHUNK = 8 * 2**20
+# A transition that stays behind, one that is new, and one more to make way.
+MIN_ROWS = 3
 IMAGE_FRAME = "camera"
 
 
@@ -119,9 +122,10 @@ class LogWriter:
         """Announce a topic of a known ROS type; returns its channel id."""
         return self.mcap.add_channel(topic, type_name, messages.definition(type_name))
 
-    def step_rows(self, capacity: int) -> NDArray[Any]:
-        """Preallocate rows of `/rl/step`: `chunks.record_dtype` around its fields."""
-        rows = message_rows(capacity, self._step_dtype, self._step_channel)
+    def step_rows(self) -> NDArray[Any]:
+        """Preallocate a chunk's rows of `/rl/step`: `chunks.record_dtype` around its fields."""
+        count = _rows_per_chunk(STEPS_PER_CHUNK, self._step_dtype)
+        rows = message_rows(count, self._step_dtype, self._step_channel)
         rows["payload"]["encapsulation"] = ENCAPSULATION
         rows["payload"]["behavior_prob"] = np.nan
         return rows
@@ -135,13 +139,13 @@ class LogWriter:
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
 
         Returns:
-            IMAGES_PER_CHUNK rows of `chunks.record_dtype`; `payload.data` is the flat picture.
+            Rows of `chunks.record_dtype`; `payload.data` is the flat picture.
         """
         height, width, channels = (*shape, 1)[:3]
         item_bytes = 2 if encoding == "16UC1" else 1
         dtype = image_dtype(height, width, channels, encoding, IMAGE_FRAME, item_bytes)
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
-        rows = message_rows(IMAGES_PER_CHUNK, dtype, channel)
+        rows = message_rows(_rows_per_chunk(IMAGES_PER_CHUNK, dtype), dtype, channel)
         fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
         return rows
 
@@ -167,3 +171,7 @@ class LogWriter:
     def close(self) -> None:
         """Write the summary section and close the file. Closing twice is harmless."""
         self.mcap.close()
+
+
+def _rows_per_chunk(most: int, payload: np.dtype[Any]) -> int:
+    return max(MIN_ROWS, min(most, BYTES_PER_CHUNK // payload.itemsize))

@@ -7,6 +7,7 @@ stand outside the chunks, before what needs them, so that a cut file is still re
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from collections.abc import Sequence
 from io import FileIO
@@ -38,7 +39,8 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, OutputExistsError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, compress
+from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compress
+from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
 
@@ -178,6 +180,7 @@ class McapWriter:
         self._file.close()
 
     def _write_chunk(self, records: memoryview, indexes: dict[int, NDArray[Any]]) -> None:
+        assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
         start_time = min(int(index["log_time"].min()) for index in indexes.values())
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
         data = compress(records, self._compression)
@@ -197,20 +200,21 @@ class McapWriter:
             index_offsets[channel_id] = offset + builder.count
             _write_message_index(builder, channel_id, index)
         index_bytes = builder.count - chunk_bytes
-        self._write(builder.end())
-        self._chunk_indexes.append(
-            ChunkIndex(
-                chunk_start_offset=offset,
-                chunk_length=chunk_bytes,
-                compression=name,
-                compressed_size=len(data),
-                uncompressed_size=len(records),
-                message_start_time=start_time,
-                message_end_time=end_time,
-                message_index_offsets=index_offsets,
-                message_index_length=index_bytes,
+        with HoldSignals():
+            self._write(builder.end())
+            self._chunk_indexes.append(
+                ChunkIndex(
+                    chunk_start_offset=offset,
+                    chunk_length=chunk_bytes,
+                    compression=name,
+                    compressed_size=len(data),
+                    uncompressed_size=len(records),
+                    message_start_time=start_time,
+                    message_end_time=end_time,
+                    message_index_offsets=index_offsets,
+                    message_index_length=index_bytes,
+                )
             )
-        )
 
     def _next_sequences(self, channel_id: int, count: int) -> NDArray[np.uint32]:
         first = self._sequences[channel_id - 1]
@@ -248,17 +252,31 @@ class McapWriter:
         self._write(builder.end())
 
     def _write(self, data: bytes) -> None:
+        """Write all of it or none: what stands in the file stays a whole number of records."""
         try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[self._file.write(rest) :]
+            with HoldSignals():
+                rest = memoryview(data)
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+                self._crc = zlib.crc32(data, self._crc)
+                self._position += len(data)
         except OSError as error:
+            self._give_up()
             raise LogError(
                 f"cannot write {self.path}: {error.strerror};"
                 " the episodes finished before are in the file"
             ) from error
-        self._crc = zlib.crc32(data, self._crc)
-        self._position += len(data)
+
+    def abandon(self) -> None:
+        """Close a file that was not finished; a finished one is left alone."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _give_up(self) -> None:
+        """Leave a file that readers can scan: cut off behind the last whole record, and closed."""
+        with contextlib.suppress(OSError):
+            self._file.truncate(self._position)
+        self.abandon()
 
 
 def _create(path: Path, overwrite: bool) -> FileIO:

@@ -12,15 +12,15 @@ metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
     observation_names   JSON list, a name for each number of a vector observation; may be empty
     action_meanings     JSON list, a name for each discrete action; may be empty
     step_duration_ns    simulated time between two records
-    policy, epsilon, seed   of the recording, where one holds for all of it; else empty
+    policy, epsilon, seed   that the recording began with; empty if unknown
     versions            JSON object: package -> version
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -49,7 +49,7 @@ class LogMetadata:
         observation_names: one for each number of a vector observation, or empty.
         action_meanings: one for each discrete action, or empty.
         step_duration_ns: simulated time between two records.
-        policy: who acted, where it was one for the whole log; else empty.
+        policy: who acted at first; each episode tells its own.
         epsilon: its exploration, as text; empty if unknown.
         seed: of the recording, as text; empty if unknown.
         versions: of the packages that the recording ran with.
@@ -99,11 +99,13 @@ class LogMetadata:
         Raises:
             LogError: a later format version, or a value that does not parse.
         """
-        found = strings.get("format_version", "")
+        found = strings.get("format_version")
+        if found is None:
+            raise LogError(f"no metadata record '{METADATA_NAME}': the spaces are not known")
         if found != FORMAT_VERSION:
             raise LogError(
-                f"format version {found or 'missing'}; mcaprl {__version__} reads"
-                f" {FORMAT_VERSION}: pip install -U mcaprl"
+                f"format version {found}; mcaprl {__version__} reads {FORMAT_VERSION}:"
+                " pip install -U mcaprl"
             )
         try:
             return cls(
@@ -119,8 +121,20 @@ class LogMetadata:
                 seed=strings.get("seed", ""),
                 versions=json.loads(strings.get("versions", "{}")),
             )
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(f"metadata record '{METADATA_NAME}' does not parse: {error}") from error
+
+    @classmethod
+    def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
+        """What several descriptions agree on; the spaces must be the same."""
+        first, *others = parts
+        blank = cls(first.observation_space, first.action_space)
+        differing = {
+            field_.name: getattr(blank, field_.name)
+            for field_ in fields(cls)
+            if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
+        }
+        return replace(first, **differing)
 
     @classmethod
     def of_env(
@@ -149,14 +163,20 @@ class LogMetadata:
             action_space=env.action_space,
             env_id=env.spec.id if env.spec else "",
             env_kwargs=kwargs,
-            observation_names=tuple(getattr(inner, "observation_names", ())),
-            action_meanings=tuple(getattr(inner, "action_meanings", ())),
+            observation_names=_names(inner, "observation_names"),
+            action_meanings=_names(inner, "action_meanings"),
             step_duration_ns=round(step_duration_s * 1e9),
             policy=policy,
             epsilon=epsilon,
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _names(env: object, attribute: str) -> tuple[str, ...]:
+    """Names that an environment has for things; others mean methods by the same word."""
+    found = getattr(env, attribute, ())
+    return tuple(map(str, found)) if isinstance(found, list | tuple) else ()
 
 
 def installed_versions() -> dict[str, str]:

@@ -12,12 +12,13 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoStepsError
+from mcaprl.errors import CorruptLogError, LogError, NoStepsError, SpaceError
 from mcaprl.recorder import messages
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
+from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import image_dtype, is_intact, message_dtype
 from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
 from mcaprl.recorder.transitions import Transitions
@@ -58,7 +59,9 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         LogError: there are none.
     """
     if not isinstance(data, str | Path):
-        return [path for part in data for path in find_logs(part)]
+        every = [path for part in data for path in find_logs(part)]
+        # A file that is meant twice counts once.
+        return list({path.resolve(): path for path in every}.values())
     path = Path(data)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))
@@ -90,7 +93,7 @@ def read_log(path: Path) -> Dataset:
         )
     columns = {name: column[:frames] for name, column in columns.items()}
     transitions = _transitions(reader, metadata, columns, lengths)
-    return Dataset(transitions, metadata, strings=reader.metadata[METADATA_NAME], sources=(path,))
+    return Dataset(transitions, metadata, sources=(path,))
 
 
 def describe(reader: McapReader) -> tuple[LogMetadata, Channel]:
@@ -107,14 +110,15 @@ def describe(reader: McapReader) -> tuple[LogMetadata, Channel]:
             f"{reader.path} has no topic {STEP_TOPIC}, so no transitions (topics: {topics})"
         )
     # The channel's copy stands in the summary, too, under its CRC.
-    strings = dict(steps.metadata) or reader.metadata.get(METADATA_NAME, {})
-    if reader.metadata.setdefault(METADATA_NAME, strings) != strings:
+    copy = steps.metadata if "format_version" in steps.metadata else {}
+    strings = copy or reader.metadata.get(METADATA_NAME, {})
+    if reader.metadata.get(METADATA_NAME, strings) != strings:
         raise CorruptLogError(
             f"{reader.path}: the metadata record and the metadata of {STEP_TOPIC} differ"
         )
     try:
         return LogMetadata.from_strings(strings), steps
-    except LogError as error:
+    except (LogError, SpaceError) as error:
         raise LogError(f"{reader.path}: {error}") from error
 
 
@@ -160,11 +164,15 @@ def _episode_lengths(columns: dict[str, NDArray[Any]], path: Path) -> NDArray[np
     in_order = columns["step"][:read] == np.arange(read) - np.repeat(starts, frames)
     in_order &= columns["episode"][:read] == np.repeat(columns["episode"][starts], frames)
     in_order[1:] &= np.diff(columns["log_time"][:read]) > 0
+    # An end is the last transition's, which stands before the final record.
+    ends = (columns["terminated"][:read] | columns["truncated"][:read]).astype(bool)
+    in_order[:-1] &= ~ends[:-1] | columns["final"][1:read].astype(bool)
     if not in_order.all():
         row = int(np.argmin(in_order))
         raise CorruptLogError(
             f"{path}: record {row} of {STEP_TOPIC} (episode {columns['episode'][row]}, step"
-            f" {columns['step'][row]}) is out of order: records are missing or doubled"
+            f" {columns['step'][row]}) is out of order:"
+            " records are missing or doubled, or an episode goes on after its end"
         )
     return frames - 1
 
@@ -248,17 +256,18 @@ def _episodes(
     reader: McapReader, columns: dict[str, NDArray[Any]], lengths: NDArray[np.int64]
 ) -> tuple[EpisodeSummary, ...]:
     """What is told of each episode; one that `/rl/episode` leaves out is told by its records."""
+    # By the time of their last record: appended recordings count from 0 again.
     told: dict[int, EpisodeSummary] = {}
     channel = reader.channel_of(EPISODE_TOPIC)
     if channel is not None:
         for _, data in reader.messages(channel):
             summary = EpisodeSummary.from_message(messages.decode(data, messages.EPISODE_TYPE))
-            told[summary.episode] = summary
+            told[summary.end_time_ns] = summary
     finals = np.flatnonzero(columns["final"])
     episodes = []
     for final, length in zip(finals.tolist(), lengths.tolist(), strict=True):
         number = int(columns["episode"][final])
-        found = told.get(number)
+        found = told.get(int(columns["log_time"][final]))
         if found is None:
             found = _summary_of_records(columns, final, length)
         elif found.length != length:
@@ -278,7 +287,7 @@ def _summary_of_records(
     return EpisodeSummary(
         episode=int(columns["episode"][final]),
         length=length,
-        total_reward=float(sum(columns["reward"][first:final].tolist())),
+        total_reward=add_up(columns["reward"][first:final]),
         terminated=bool(columns["terminated"][last]),
         truncated=bool(columns["truncated"][last]),
         start_time_ns=int(columns["log_time"][first]),

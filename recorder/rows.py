@@ -1,4 +1,8 @@
-"""Rows that wait to be written: what the environment gives, copied into preallocated columns."""
+"""Rows that wait to be written: what the environment gives, copied into preallocated columns.
+
+The columns know no "present row" of their own: a row is found by the step it belongs to. So there
+is one counter, the wrapper's, and a step counts only when all of it is in place.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +16,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.log_writer import STEPS_PER_CHUNK, LogWriter
+from mcaprl.recorder.log_writer import LogWriter
 from mcaprl.recorder.spaces import Leaf, observation_leaves
+
+Writer = Callable[[int, NDArray[Any]], None]
+"""Puts a leaf's value at a step."""
+Converter = Callable[[Any], NDArray[Any]]
+"""Takes a leaf's value out of an observation, in the dtype and shape that its space declares."""
 
 
 class StepColumns:
@@ -22,54 +31,76 @@ class StepColumns:
     def __init__(self, log: LogWriter) -> None:
         """Preallocate a chunk of them."""
         self._log = log
-        self._rows = log.step_rows(STEPS_PER_CHUNK)
+        self._rows = log.step_rows()
         payload = self._rows["payload"]
         self.fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._reward, self._prob = self.fields["reward"], self.fields["behavior_prob"]
-        self._action = _ActionColumn(log.action, self.fields["action"])
-        self.row = -1
+        self._action, self._action_leaf = self.fields["action"], log.action
 
     def begin(self, episode: int, start_ns: int, step_ns: int) -> None:
         """Begin an episode: `start_ns` is the log_time of its first row."""
         self._episode, self._start_ns, self._step_ns = episode, start_ns, step_ns
-        self._first_step, self.row = 0, -1
+        self._first_step, self._total_reward = 0, 0.0
 
-    def next_row(self) -> None:
-        """Go to the next row; write the others when the last one is reached."""
-        self.row += 1
-        if self.row == len(self._rows):
-            # One whole transition stays behind, for its episode may end here and be marked so.
-            self._write(self.row - 1)
-            self._rows["payload"][0] = self._rows["payload"][self.row - 1]
-            self.row = 1
+    def is_full(self, step: int) -> bool:
+        """Whether there is no row for the observation at `step`."""
+        return step - self._first_step >= len(self._rows)
 
-    def step_back(self) -> None:
-        """Leave the present row again; nothing was put there."""
-        self.row -= 1
+    def make_room(self, step: int) -> None:
+        """Write all rows before the transition that leads to `step`.
 
-    def act(self, action: Any, behavior_prob: float) -> None:
-        """Put the action that is taken at the present row, and its probability."""
-        self._action.put(self.row, action)
-        self._prob[self.row] = behavior_prob
+        That one stays behind, for its episode may end there and be marked so.
+        """
+        keep = step - self._first_step - 1
+        self._write(keep)
+        self._rows["payload"][0] = self._rows["payload"][keep]
 
-    def reward(self, reward: float) -> None:
-        """Put what the action brought."""
-        self._reward[self.row] = reward
+    def act(self, step: int, action: Any, behavior_prob: float) -> None:
+        """Put the action that is taken at `step`, and its probability.
 
-    def end(self, terminated: bool, truncated: bool) -> None:
-        """Mark the last transition and the final row, and write all."""
-        final, fields = self.row, self.fields
+        Raises:
+            SpaceError: the action is not one of the action space's.
+        """
+        row = step - self._first_step
+        if type(action) in (int, np.int64) and not self._action_leaf.shape:
+            self._action[row] = action
+        else:
+            self._action[row] = _flat(as_declared(action, self._action_leaf))
+        self._prob[row] = behavior_prob
+
+    def reward(self, step: int, reward: float) -> None:
+        """Put what the action at `step` brought."""
+        self._reward[step - self._first_step] = reward
+
+    def writer(self, leaf: Leaf) -> Writer:
+        """A function that puts observations of a leaf."""
+        column = self.fields[leaf.name]
+
+        def write(step: int, value: NDArray[Any]) -> None:
+            column[step - self._first_step] = _flat(value)
+
+        return write
+
+    def end(self, steps: int, terminated: bool, truncated: bool) -> None:
+        """Mark the last transition and the final row, and write all.
+
+        Args:
+            steps: transitions of the episode, 1 or more.
+            terminated: of the last one.
+            truncated: likewise.
+        """
+        final, fields = steps - self._first_step, self.fields
+        assert final >= 1, "the last transition stays in memory"
         fields["terminated"][final - 1], fields["truncated"][final - 1] = terminated, truncated
         fields["action"][final], fields["reward"][final] = 0, 0.0
         fields["behavior_prob"][final], fields["final"][final] = math.nan, True
         self._write(final + 1)
         for name in ("terminated", "truncated", "final"):
             fields[name][: final + 1] = False
-        self.clear()
 
-    def clear(self) -> None:
-        """Forget the rows."""
-        self.row = -1
+    def total_reward(self, steps: int) -> float:
+        """What the first `steps` transitions brought, added up in order."""
+        return add_up(self._reward[: steps - self._first_step], self._total_reward)
 
     def _write(self, count: int) -> None:
         rows = self._rows[:count]
@@ -77,28 +108,9 @@ class StepColumns:
         rows["log_time"] = self._start_ns + steps * self._step_ns
         self.fields["episode"][:count] = self._episode
         self.fields["step"][:count] = steps
+        self._total_reward = self.total_reward(self._first_step + count)
         self._log.write_steps(rows)
         self._first_step += count
-
-
-class _ActionColumn:
-    """Stores actions, whichever of an int, a NumPy scalar or an array an agent gives."""
-
-    def __init__(self, leaf: Leaf, column: NDArray[Any]) -> None:
-        self._leaf, self._column = leaf, column
-
-    def put(self, row: int, action: Any) -> None:
-        if not self._leaf.shape:
-            self._column[row] = (
-                action if isinstance(action, int) else int(np.asarray(action).item())
-            )
-            return
-        values = np.asarray(action)
-        if values.shape != self._leaf.shape:
-            raise SpaceError(
-                f"action of shape {values.shape}; the action space has {self._leaf.shape}"
-            )
-        self._column[row] = values.reshape(-1)
 
 
 class ImageColumn:
@@ -111,75 +123,106 @@ class ImageColumn:
         assert encoding is not None, f"{topic} has no images"
         self._log = log
         self._rows = log.add_image_topic(topic, shape, encoding)
-        self.column = self._rows["payload"]["data"]
-        self.row = -1
+        self._column = self._rows["payload"]["data"]
+        self._first_step = 0
 
-    def next_row(self, time_ns: int) -> None:
-        """Go to the next row, whose log_time is `time_ns`; write those that fill a chunk."""
-        if self.row + 1 == len(self._rows):
-            self.flush()
-        self.row += 1
-        self._rows["log_time"][self.row] = time_ns
+    def begin(self, start_ns: int, step_ns: int) -> None:
+        """Begin an episode: `start_ns` is the log_time of its first picture."""
+        self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
 
-    def step_back(self) -> None:
-        """Leave the present row again; nothing was put there."""
-        self.row -= 1
+    def is_full(self, step: int) -> bool:
+        """Whether there is no row for the picture at `step`."""
+        return step - self._first_step >= len(self._rows)
 
-    def flush(self) -> None:
-        """Write all rows."""
-        self._log.write_images(self._rows[: self.row + 1])
-        self.clear()
+    def put(self, step: int, picture: NDArray[Any]) -> None:
+        """Put the picture at `step`, of any shape with as many bytes."""
+        self._column[step - self._first_step] = picture.reshape(-1)
 
-    def clear(self) -> None:
-        """Forget the rows."""
-        self.row = -1
+    def flush(self, stop: int) -> None:
+        """Write all pictures before step `stop`."""
+        rows = self._rows[: stop - self._first_step]
+        steps = np.arange(self._first_step, stop)
+        rows["log_time"] = self._start_ns + steps * self._step_ns
+        self._log.write_images(rows)
+        self._first_step = stop
 
 
-def leaf_writers(
+def converters(space: spaces.Space[Any]) -> list[Converter]:
+    """For each leaf, the function that takes its value out of an observation."""
+    return [_converter(leaf) for leaf in observation_leaves(space)]
+
+
+def writers(
     space: spaces.Space[Any], columns: StepColumns, images: Mapping[Leaf, ImageColumn]
-) -> list[Callable[[Any], None]]:
-    """A function for each leaf that copies its part of an observation into the present row."""
-    writers = []
-    for leaf in observation_leaves(space):
-        image = images.get(leaf)
-        if image is not None:
-            writers.append(_leaf_writer(leaf, image, image.column))
-        else:
-            writers.append(_leaf_writer(leaf, columns, columns.fields[leaf.name]))
-    return writers
+) -> list[Writer]:
+    """For each leaf, the function that puts its value at a step."""
+    return [
+        images[leaf].put if leaf in images else columns.writer(leaf)
+        for leaf in observation_leaves(space)
+    ]
 
 
-def _leaf_writer(
-    leaf: Leaf, cursor: StepColumns | ImageColumn, column: NDArray[Any]
-) -> Callable[[Any], None]:
-    shape, dtype, path = leaf.shape, leaf.dtype, leaf.path
-    flat = len(shape) == 1
+def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
+    """A value in the dtype and shape that its space declares.
 
-    def write(observation: Any) -> None:
-        value = leaf.of(observation) if path else observation
-        if type(value) is not np.ndarray or value.dtype is not dtype or value.shape != shape:
-            value = _as_declared(value, leaf)
-        column[cursor.row] = value if flat else value.reshape(column.shape[1:])
-
-    return write
-
-
-def _as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
-    """An observation in the form that its space declares.
+    Floats may lose digits, with a warning; any other change is refused.
 
     Raises:
-        SpaceError: it has another shape.
+        SpaceError: it has another shape, or does not fit.
     """
-    array = np.asarray(value)
-    where = "".join(f"['{key}']" for key in leaf.path)
+    where = _where(leaf)
+    try:
+        array = np.asarray(value)
+        with np.errstate(all="ignore"):
+            cast = array.astype(leaf.dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SpaceError(f"{where} is {value!r:.60}; its space declares {leaf.dtype}") from error
+    if not leaf.shape and array.size == 1:
+        cast, array = cast.reshape(()), array.reshape(())
     if array.shape != leaf.shape:
-        raise SpaceError(
-            f"observation{where} has shape {array.shape}; its space declares {leaf.shape}"
-        )
-    if array.dtype != leaf.dtype and leaf.shape:
-        warnings.warn(
-            f"observation{where} is {array.dtype}, its space declares {leaf.dtype}: logged as"
-            f" {leaf.dtype}",
-            stacklevel=2,
-        )
-    return array.astype(leaf.dtype)
+        raise SpaceError(f"{where} has shape {array.shape}; its space declares {leaf.shape}")
+    if array.dtype == leaf.dtype:
+        return cast
+    if array.dtype.kind == leaf.dtype.kind == "f":
+        if array.ndim:
+            warnings.warn(
+                f"{where} is {array.dtype}, its space declares {leaf.dtype}: logged as such",
+                stacklevel=2,
+            )
+    elif not np.array_equal(cast, array):
+        raise SpaceError(f"{where} is {value!r:.60}, which its space's {leaf.dtype} cannot hold")
+    return cast
+
+
+def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
+    """The sum in order, the same on every machine; `sum` and `np.sum` add in other ways."""
+    if not len(rewards):
+        return start
+    with np.errstate(all="ignore"):
+        return float(np.add.accumulate(np.concatenate([[start], rewards]))[-1])
+
+
+def _converter(leaf: Leaf) -> Converter:
+    shape, dtype, path = leaf.shape, leaf.dtype, leaf.path
+
+    def convert(observation: Any) -> NDArray[Any]:
+        value = observation
+        if path:
+            try:
+                value = leaf.of(observation)
+            except (KeyError, IndexError, TypeError) as error:
+                raise SpaceError(f"{_where(leaf)} is missing") from error
+        if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
+            return value
+        return as_declared(value, leaf)
+
+    return convert
+
+
+def _where(leaf: Leaf) -> str:
+    role = "action" if leaf.name == "action" else "observation"
+    return role + "".join(f"['{key}']" for key in leaf.path)
+
+
+def _flat(value: NDArray[Any]) -> NDArray[Any]:
+    return value if value.ndim <= 1 else value.reshape(-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, OutputExistsError
 from mcaprl.recorder.arrays import with_fresh_times
-from mcaprl.recorder.log_writer import IMAGES_PER_CHUNK, STEPS_PER_CHUNK, LogWriter
+from mcaprl.recorder.log_writer import LogWriter
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.spaces import observation_leaves
 from mcaprl.recorder.transitions import Transitions
@@ -40,13 +41,23 @@ def save_log(
     # Arrays that never were in a log have times from 0 on.
     if columns.log_time_ns[0] == 0 or (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
-    log = LogWriter(path, metadata, compression=compression, overwrite=overwrite)
-    _write_images(log, columns)
-    log.write_episodes(
-        [dataclasses.replace(episode, episode=k) for k, episode in enumerate(columns.episodes)]
-    )
-    _write_steps(log, columns)
-    log.close()
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass overwrite=True")
+    # Beside it first: the log that is replaced may be the one that is being saved.
+    unfinished = path.with_name(f"{path.name}.part")
+    log = LogWriter(unfinished, metadata, compression=compression, overwrite=True)
+    try:
+        _write_images(log, columns)
+        log.write_episodes(
+            [dataclasses.replace(episode, episode=k) for k, episode in enumerate(columns.episodes)]
+        )
+        _write_steps(log, columns)
+        log.close()
+        os.replace(unfinished, path)
+    finally:
+        log.mcap.abandon()
+        unfinished.unlink(missing_ok=True)
 
 
 def _write_images(log: LogWriter, columns: Transitions) -> None:
@@ -55,8 +66,8 @@ def _write_images(log: LogWriter, columns: Transitions) -> None:
         if leaf.encoding is None:
             continue
         rows = log.add_image_topic(leaf.topic, leaf.shape, leaf.encoding)
-        for start in range(0, len(frames), IMAGES_PER_CHUNK):
-            part = slice(start, min(start + IMAGES_PER_CHUNK, len(frames)))
+        for start in range(0, len(frames), len(rows)):
+            part = slice(start, min(start + len(rows), len(frames)))
             chunk = rows[: part.stop - start]
             chunk["log_time"] = columns.log_time_ns[part]
             chunk["payload"]["data"] = frames[part].reshape(len(chunk), -1)
@@ -67,9 +78,9 @@ def _write_steps(log: LogWriter, columns: Transitions) -> None:
     """Fill the rows of a chunk by fields: frames in order, and transitions where they belong."""
     fields = _frame_columns(log, columns)
     frames = len(columns.log_time_ns)
-    rows = log.step_rows(min(STEPS_PER_CHUNK, frames))
-    for start in range(0, frames, STEPS_PER_CHUNK):
-        part = slice(start, min(start + STEPS_PER_CHUNK, frames))
+    rows = log.step_rows()
+    for start in range(0, frames, len(rows)):
+        part = slice(start, min(start + len(rows), frames))
         chunk = rows[: part.stop - start]
         chunk["log_time"] = columns.log_time_ns[part]
         for name, column in fields.items():

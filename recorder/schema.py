@@ -28,6 +28,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from mcaprl.errors import SpaceError
+from mcaprl.recorder.chunks import MAX_CHUNK_BYTES
 from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
 
 # The CDR encapsulation header "little endian, plain CDR": bytes 00 01 00 00.
@@ -85,7 +87,18 @@ def step_schema(
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
-    """Name and definition text of a message of float64 scalars, one per name."""
+    """Name and definition text of a message of float64 scalars, one per name.
+
+    Raises:
+        SpaceError: a name is no ROS field name.
+    """
+    names = list(names)
+    for name in names:
+        if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
+            raise SpaceError(
+                f"telemetry '{name}' is no ROS field name: lower case letters, digits and single"
+                " underscores"
+            )
     return _named("Telemetry", [("float64", 0, name) for name in names])
 
 
@@ -111,12 +124,19 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
             return None
         scalar = np.dtype(ROS_TO_NUMPY[match[1]])
         start = _align(end, scalar.itemsize)
-        field = scalar if match[2] is None else np.dtype((scalar, (int(match[2]),)))
+        count = 1 if match[2] is None else int(match[2])
+        if count > MAX_CHUNK_BYTES:
+            return None
+        field = scalar if match[2] is None else np.dtype((scalar, (count,)))
         names.append(match[3])
         formats.append(field)
         offsets.append(start)
         end = start + field.itemsize
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
+    try:
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
+    except (ValueError, OverflowError):
+        # A field twice, or of a size that no memory holds.
+        return None
 
 
 def is_intact(name: str, text: bytes) -> bool:

@@ -68,13 +68,15 @@ def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
         SpaceError: a part of it is of a kind that a log cannot hold.
     """
     taken: set[str] = set()
-    found = []
+    found: list[Leaf] = []
     for path, part in _walk(space, ()):
         shape, dtype = _shape_and_dtype(part, "observation", path)
         encoding = _image_encoding(part)
         words = path or (("image",) if encoding else ())
         name = _field_name(words if encoding else ("observation", *words), taken)
         found.append(Leaf(name, path, shape, dtype, encoding))
+    if not found:
+        raise SpaceError("the observation is an empty Dict space; a log needs something to hold")
     return tuple(found)
 
 
@@ -162,7 +164,7 @@ def _image_encoding(space: spaces.Space[Any]) -> str | None:
 
 def _field_name(words: tuple[str, ...], taken: set[str]) -> str:
     """A ROS field name: lower case letters, digits and single underscores."""
-    plain = [re.sub(r"[^a-z0-9]+", "_", word.lower()).strip("_") or "x" for word in words]
+    plain = [re.sub(r"[^a-z0-9]+", "_", str(word).lower()).strip("_") or "x" for word in words]
     name = candidate = "_".join(plain)
     if not name[0].isalpha():
         name = candidate = f"key_{name}"
@@ -184,7 +186,8 @@ def _to_plain(space: spaces.Space[Any]) -> dict[str, Any]:
                 "dtype": str(space.dtype),
             }
         case spaces.Discrete():
-            return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+            plain = {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+            return plain if space.dtype == np.int64 else {**plain, "dtype": str(space.dtype)}
         case spaces.MultiDiscrete():
             return {
                 "type": "MultiDiscrete",
@@ -209,7 +212,8 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
             high = _bounds(plain["high"], shape, dtype)
             return spaces.Box(low, high, shape, dtype.type)
         case "Discrete":
-            return spaces.Discrete(plain["n"], start=plain["start"])
+            kind = {"dtype": np.dtype(plain["dtype"]).type} if "dtype" in plain else {}
+            return spaces.Discrete(plain["n"], start=plain["start"], **kind)
         case "MultiDiscrete":
             dtype = np.dtype(plain["dtype"])
             return spaces.MultiDiscrete(plain["nvec"], dtype=dtype.type, start=plain["start"])
@@ -233,7 +237,7 @@ def _number(value: float) -> float | str:
 
 def _bounds(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     flat = plain if isinstance(plain, list) else [plain]
-    values = np.array([float(v) if isinstance(v, str) else v for v in flat]).astype(dtype)
+    values = np.array([float(v) if isinstance(v, str) else v for v in flat], dtype)
     return np.broadcast_to(values if len(flat) > 1 else values[0], (math.prod(shape),)).reshape(
         shape
     )

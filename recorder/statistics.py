@@ -45,7 +45,7 @@ class Statistics:
         ends: episodes by the reason they ended.
         duration_s: simulated time of all episodes.
         observations: ranges by leaf name.
-        action_counts: how often each action of a Discrete space was taken; empty for others.
+        action_counts: how often each was taken, where actions are single integers; else empty.
     """
 
     episodes: int
@@ -89,17 +89,20 @@ def describe_columns(columns: Transitions, leaves: Sequence[Leaf]) -> Statistics
 def _describe(leaf: Leaf, frames: NDArray[Any]) -> Column:
     if leaf.encoding is not None:
         return _describe_image(frames)
-    values = frames.reshape(len(frames), -1).astype(np.float64)
+    values = frames.reshape(len(frames), leaf.size).astype(np.float64)
     finite = np.isfinite(values)
-    counts = np.maximum(finite.sum(axis=0), 1)
     kept = np.where(finite, values, 0.0)
-    mean = kept.sum(axis=0) / counts
-    squares = np.where(finite, (values - mean) ** 2, 0.0)
+    # 0 / 0 is NaN: of no finite value there is no mean.
+    with np.errstate(all="ignore"):
+        counts = finite.sum(axis=0)
+        mean = kept.sum(axis=0) / counts
+        squares = np.where(finite, (values - mean) ** 2, 0.0)
+        std = np.sqrt(squares.sum(axis=0) / counts)
     return Column(
         mean=mean,
-        std=np.sqrt(squares.sum(axis=0) / counts),
-        low=np.fmin.reduce(values, axis=0),
-        high=np.fmax.reduce(values, axis=0),
+        std=std,
+        low=np.fmin.reduce(values, axis=0, initial=np.nan),
+        high=np.fmax.reduce(values, axis=0, initial=np.nan),
         not_finite=int((~finite).sum()),
     )
 
@@ -108,7 +111,9 @@ def _describe_image(frames: NDArray[Any]) -> Column:
     """From the histogram of the pixels, since copies of images as floats would not fit."""
     counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
     codes = np.arange(256.0)
-    seen = codes[counts > 0]
+    seen = codes[counts > 0] if len(frames) else np.full(1, np.nan)
+    if not len(frames):
+        return Column(mean=seen, std=seen, low=seen, high=seen, not_finite=0)
     mean = float((codes * counts).sum() / counts.sum())
     variance = float(((codes - mean) ** 2 * counts).sum() / counts.sum())
     return Column(

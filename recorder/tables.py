@@ -40,8 +40,9 @@ def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: 
     parts: list[tuple[str, NDArray[Any], tuple[str, ...]]] = [("action", columns.actions, ())]
     for leaf, frames in zip(leaves, columns.frames, strict=True):
         named = description.observation_names if leaf.path == () else ()
-        parts.append((leaf.name, frames[step_frames], named))
-        parts.append((f"next_{leaf.name}", frames[step_frames + 1], named))
+        name = leaf.name if leaf.name.startswith("observation") else f"observation_{leaf.name}"
+        parts.append((name, frames[step_frames], named))
+        parts.append((f"next_{name}", frames[step_frames + 1], named))
     for name, values, element_names in parts:
         for column_name, column in _columns(pyarrow, name, values, element_names):
             names.append(column_name)

@@ -57,7 +57,7 @@ class Transitions:
     @property
     def first_steps(self) -> NDArray[np.int64]:
         """(E,) the first transition of each episode."""
-        return np.concatenate([[0], np.cumsum(self.lengths)[:-1]]).astype(np.int64)
+        return np.cumsum(self.lengths) - self.lengths
 
     @property
     def first_frames(self) -> NDArray[np.int64]:

@@ -11,25 +11,29 @@ from __future__ import annotations
 import json
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError
+from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
 from mcaprl.recorder.metadata import LogMetadata
-from mcaprl.recorder.rows import ImageColumn, StepColumns, leaf_writers
+from mcaprl.recorder.rows import ImageColumn, StepColumns, converters, writers
+from mcaprl.recorder.signals import HoldSignals
 
 
 class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     """Records every transition of an environment to an MCAP file.
 
     Each finished episode is on disk when `step` returns its end. An episode that is broken off by
-    `reset` or `close` is kept and marked truncated, with the reason `interrupted`.
+    `reset`, `close` or an error is kept and marked truncated, with the reason `interrupted`. Wrap
+    last: what other wrappers outside of this one do (a TimeLimit, say) is not seen here.
 
     Attributes:
         behavior_prob: set it before `step` to the probability of the action under the policy that
@@ -72,137 +76,210 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             SpaceError: a log cannot hold the environment's spaces.
+            UsageError: the times would not rise.
             OutputExistsError, LogError: the file cannot be created.
         """
         super().__init__(env)
         self.policy, self.epsilon, self.behavior_prob = policy, epsilon, math.nan
-        metadata = LogMetadata.of_env(
+        self._next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns
+        self._description = LogMetadata.of_env(
             env,
             step_duration_s=step_duration_s,
             policy=policy,
             epsilon="" if math.isnan(epsilon) else repr(epsilon),
             seed="" if seed is None else str(seed),
         )
-        self._step_ns = metadata.step_duration_ns
-        self._log = LogWriter(path, metadata, compression=compression, overwrite=overwrite)
+        self._step_ns = self._description.step_duration_ns
+        if self._step_ns < 1 or self._next_start_ns < 0:
+            raise UsageError(
+                f"a step of {self._step_ns} ns from {self._next_start_ns} ns on: times must rise"
+                " from 0 or later; give step_duration_s and start_time_ns"
+            )
+        self._log = LogWriter(path, self._description, compression=compression, overwrite=overwrite)
         self._display = Display(self._log, env.unwrapped, scene=scene, camera=camera)
-        self._log_metadata = metadata
-        self._next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns
         self._columns = StepColumns(self._log)
         images = {
             leaf: ImageColumn(self._log, leaf.topic, leaf.shape, leaf.encoding)
             for leaf in self._log.image_leaves
         }
         self._images = list(images.values())
-        self._writers = leaf_writers(metadata.observation_space, self._columns, images)
-        self._episode = -1
-        self._open = self._has_layout = False
+        self._converters = converters(env.observation_space)
+        self._writers = writers(env.observation_space, self._columns, images)
+        self._episodes = 0
+        self._open: _OpenEpisode | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and begin an episode in the log."""
+        """Reset the environment and begin an episode in the log.
+
+        Raises:
+            SpaceError: the observation does not fit its space.
+            UsageError: the recording is closed, or the seed does not fit 63 bits.
+        """
+        self._check_can_begin(seed)
         self._interrupt()
-        observation, info = super().reset(seed=seed, options=options)
-        self._episode += 1
-        self._step, self._total_reward, self._open = 0, 0.0, True
-        self._start_ns = self._next_start_ns
-        self._seed = seed
-        self._options = "" if options is None else json.dumps(options, default=_plain)
-        self._columns.begin(self._episode, self._start_ns, self._step_ns)
-        self._observe(observation, self._start_ns)
-        self._display.begin(self._start_ns, self._episode, self.policy)
-        if not self._has_layout:
-            self._attach_layout()
+        observation, info = self.env.reset(seed=seed, options=options)
+        values = [convert(observation) for convert in self._converters]
+        with HoldSignals():
+            self._begin(_OpenEpisode(self._next_start_ns, self.policy, self.epsilon, seed, options))
+            self._observe(0, values)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step the environment and log the transition."""
-        if not self._open:
+        """Step the environment and log the transition.
+
+        Raises:
+            ResetNeeded: no episode is open.
+            SpaceError: action or observation does not fit its space. The episode is over then, and
+                kept up to the transition before.
+        """
+        episode = self._open
+        if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
+        step = episode.steps
         # Before the environment can change it.
-        self._columns.act(action, self.behavior_prob)
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        reward_ = float(reward)
-        self._columns.reward(reward_)
+        self._columns.act(step, action, self.behavior_prob)
         self.behavior_prob = math.nan
-        time_ns = self._start_ns + (self._step + 1) * self._step_ns
-        self._observe(observation, time_ns)
-        self._total_reward += reward_
-        self._step += 1
-        self._display.observe(time_ns)
-        if terminated or truncated:
-            reason = str(info.get("reason") or ("terminated" if terminated else "time_limit"))
-            self._end(bool(terminated), bool(truncated), reason)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        try:
+            values = [convert(observation) for convert in self._converters]
+        except SpaceError:
+            self._interrupt()
+            raise
+        self._columns.reward(step, float(reward))
+        if terminated or truncated or self._is_full(step + 1):
+            # Nothing may come between the writes, nor between them and what counts the steps.
+            with HoldSignals():
+                self._make_room(step + 1)
+                self._observe(step + 1, values)
+                if terminated or truncated:
+                    self._end(bool(terminated), bool(truncated), _reason(info, bool(terminated)))
+        else:
+            self._observe(step + 1, values)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
         """Finish the log and close the environment. Closing twice is harmless."""
-        if not self._log.mcap.closed:
-            self._interrupt()
-            self._log.close()
-        super().close()
-
-    def _observe(self, observation: Any, time_ns: int) -> None:
-        """Log an observation; one that does not fit leaves the rows as they were."""
-        self._columns.next_row()
-        for image in self._images:
-            image.next_row(time_ns)
         try:
-            for write in self._writers:
-                write(observation)
-        except SpaceError:
-            self._columns.step_back()
-            for image in self._images:
-                image.step_back()
-            raise
+            with HoldSignals():
+                if not self._log.mcap.closed:
+                    self._interrupt()
+                    self._log.close()
+        finally:
+            super().close()
 
-    def _attach_layout(self) -> None:
-        """Attach it once the first reset has shown which topics there are."""
+    def _check_can_begin(self, seed: int | None) -> None:
+        if self._log.mcap.closed:
+            raise UsageError(f"{self._log.mcap.path} is closed; record another episode elsewhere")
+        if seed is not None and not 0 <= seed < 2**63:
+            raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
+
+    def _begin(self, episode: _OpenEpisode) -> None:
+        start_ns = episode.start_ns
+        self._columns.begin(self._episodes, start_ns, self._step_ns)
+        for image in self._images:
+            image.begin(start_ns, self._step_ns)
+        if self._display.begin(start_ns, self._step_ns, self._episodes, episode.policy):
+            self._attach_layout(start_ns)
+        self._open = episode
+
+    def _is_full(self, step: int) -> bool:
+        return self._columns.is_full(step) or any(image.is_full(step) for image in self._images)
+
+    def _make_room(self, step: int) -> None:
+        if self._columns.is_full(step):
+            self._columns.make_room(step)
+        for image in self._images:
+            if image.is_full(step):
+                image.flush(step)
+
+    def _observe(self, step: int, values: list[NDArray[Any]]) -> None:
+        for write, value in zip(self._writers, values, strict=True):
+            write(step, value)
+        self._display.observe(step)
+        assert self._open is not None
+        # From here on the step counts.
+        self._open.steps = step
+
+    def _attach_layout(self, time_ns: int) -> None:
         display = self._display
         layout = layout_of(
-            self._log_metadata, display.topics, display.telemetry_names, display.follow_frame
+            self._description, display.topics, display.telemetry_names, display.follow_frame
         )
         self._log.mcap.add_attachment(
-            LAYOUT_NAME, "application/json", json.dumps(layout).encode(), self._start_ns
+            LAYOUT_NAME, "application/json", json.dumps(layout).encode(), time_ns
         )
-        self._has_layout = True
 
     def _interrupt(self) -> None:
         """Keep an episode that is broken off; one without a transition leaves no trace."""
-        if self._open and self._step > 0:
-            self._end(False, True, "interrupted")
-        elif self._open:
-            self._columns.clear()
-            for image in self._images:
-                image.clear()
-            self._display.clear()
-            self._episode -= 1
-        self._open = False
+        if self._open is not None and self._open.steps > 0:
+            with HoldSignals():
+                self._end(False, True, "interrupted")
+        self._display.clear()
+        self._open = None
 
     def _end(self, terminated: bool, truncated: bool, reason: str) -> None:
-        end_ns = self._start_ns + self._step * self._step_ns
+        episode = self._open
+        assert episode is not None
+        # Whatever goes wrong now, this episode is not written a second time.
+        self._open = None
+        end_ns = episode.start_ns + episode.steps * self._step_ns
         summary = EpisodeSummary(
-            episode=self._episode,
-            length=self._step,
-            total_reward=self._total_reward,
+            episode=self._episodes,
+            length=episode.steps,
+            total_reward=self._columns.total_reward(episode.steps),
             terminated=terminated,
             truncated=truncated,
-            start_time_ns=self._start_ns,
+            start_time_ns=episode.start_ns,
             end_time_ns=end_ns,
             reason=reason,
-            policy=self.policy,
-            epsilon=self.epsilon,
-            seed=self._seed,
-            options=self._options,
+            policy=episode.policy,
+            epsilon=episode.epsilon,
+            seed=episode.seed,
+            options="" if episode.options is None else _json(episode.options),
         )
         for image in self._images:
-            image.flush()
+            image.flush(episode.steps + 1)
         self._display.end(summary)
         self._log.write_episodes([summary])
-        self._columns.end(terminated, truncated)
+        self._columns.end(episode.steps, terminated, truncated)
         self._next_start_ns = end_ns + self._step_ns
-        self._open = False
+        self._episodes += 1
+
+
+@dataclass
+class _OpenEpisode:
+    """The episode that is being recorded.
+
+    Attributes:
+        start_ns: log_time of its first record.
+        policy: who acts.
+        epsilon: its exploration.
+        seed: given to reset().
+        options: given to reset().
+        steps: transitions that are wholly in the columns.
+    """
+
+    start_ns: int
+    policy: str
+    epsilon: float
+    seed: int | None
+    options: dict[str, Any] | None
+    steps: int = 0
+
+
+def _reason(info: dict[str, Any], terminated: bool) -> str:
+    """Why an episode ended, in the environment's words if it has any."""
+    told = info.get("reason")
+    return told if isinstance(told, str) and told else "terminated" if terminated else "time_limit"
+
+
+def _json(options: dict[str, Any]) -> str:
+    try:
+        return json.dumps(options, default=_plain)
+    except (TypeError, ValueError):
+        return json.dumps(repr(options))
 
 
 def _plain(value: Any) -> Any:

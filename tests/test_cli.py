@@ -108,6 +108,26 @@ def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> No
     assert len(mcaprl.open("shards").episodes) == 5
 
 
+def test_shards_touch_nothing_when_the_request_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["--policy", "random", "--episodes", "2", "--envs", "2", "--overwrite", "--out", "d"]
+    Path("d").mkdir()
+    Path("d/shard-00.mcap").write_text("old")
+    assert "CartPole-v1" in fails_after(capsys, 2, "record", "CartPol-v1", *common)
+    common[1] = "nobody"
+    assert "unknown policy" in fails_after(capsys, 2, "record", "CartPole-v1", *common)
+    assert Path("d/shard-00.mcap").read_text() == "old"
+    Path("d/precious.mcap").write_text("mine")
+    common[1] = "random"
+    assert "precious.mcap" in fails_after(capsys, 2, "record", "CartPole-v1", *common)
+
+
+def test_names_are_no_markup(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cartpole.rename("run[red].mcap")
+    capsys.readouterr()
+    assert run(["info", "run[red].mcap"]) == 0
+    assert "run[red].mcap" in capsys.readouterr().out
+
+
 def fails_after(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
     capsys.readouterr()
     return fails(capsys, code, *arguments)
@@ -223,6 +243,9 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
         (["evaluate", "pilot"], 2, "--sim"),
         (["layout", "lane"], 2, "--out"),
+        (["layout", "nothing.mcap", "--out", "x.json"], 1, "cannot read nothing.mcap"),
+        (["info", "x" * 300], 1, "name too long"),
+        (["evaluate", "pilot", "--sim", "lane", "--behavior", "nothing"], 1, "no such file"),
         (["recrod"], 2, "No such command 'recrod'"),
         (["info", "--jsn", str(GOLDEN)], 2, "--json"),
     ],

@@ -151,6 +151,53 @@ def test_logs_of_other_spaces_are_refused(tmp_path: Path) -> None:
         mcaprl.open(tmp_path)
 
 
+def test_a_mixture_claims_no_one_policy(tmp_path: Path) -> None:
+    box = spaces.Box(-1, 1, (2,), np.float32)
+    for name in ("a", "b"):
+        record(tmp_path / f"{name}.mcap", box, spaces.Discrete(2), [2], policy=name, epsilon=0.5)
+    mixed = mcaprl.open([tmp_path / "a.mcap", tmp_path / "b.mcap"])
+    mixed.save(tmp_path / "mixed.mcap")
+    again = mcaprl.open(tmp_path / "mixed.mcap")
+    for data in (mixed, again):
+        assert (data.metadata["policy"], data.metadata["epsilon"]) == ("", "0.5")
+    assert again.metadata == mixed.metadata
+    assert [episode.policy for episode in again.episodes] == ["a", "b"]
+
+
+def test_a_file_meant_twice_counts_once(tmp_path: Path) -> None:
+    record(tmp_path / "a.mcap", spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), [3])
+    path = tmp_path / "a.mcap"
+    assert len(mcaprl.open([path, str(path), tmp_path, str(tmp_path / "*.mcap")])) == 3
+
+
+def test_save_over_its_own_source(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    record(path, MIXED_SPACE, spaces.Discrete(2), [3, 4])
+    data = mcaprl.open(path)
+    data.filter(lambda episode: episode.length == 4).save(path, overwrite=True)
+    assert len(mcaprl.open(path)) == 4
+    assert [found.name for found in tmp_path.iterdir()] == ["a.mcap"]
+    with pytest.raises(mcaprl.McaprlError, match="exists"):
+        data.save(path)
+
+
+def test_an_empty_selection(tmp_path: Path) -> None:
+    none = small().filter(lambda episode: False)
+    assert (len(none), none.episodes) == (0, ())
+    assert none.observations.shape == (0, 1)
+    assert np.isnan(none.statistics.mean_return)
+    assert none.to_arrow().num_rows == 0
+    with pytest.raises(LogError, match="no episodes"):
+        none.save(tmp_path / "none.mcap")
+    with pytest.raises(LogError, match="no data"):
+        mcaprl.open([])
+
+
+def test_unknown_table() -> None:
+    with pytest.raises(mcaprl.McaprlError, match="did you mean episodes"):
+        small().to_arrow("episode")  # type: ignore[arg-type]
+
+
 def test_missing_data(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="no such file, folder or match"):
         mcaprl.open(tmp_path / "nothing.mcap")
@@ -184,5 +231,5 @@ def test_image_table(log_path: Path) -> None:
     data = mcaprl.open(log_path)
     table = data.to_arrow()
     assert table.column("action.1").to_pylist() == data.actions[:, 1].tolist()
-    flat = table.column("camera").to_pylist()
+    flat = table.column("observation_camera").to_pylist()
     assert flat == data.observations["camera"].reshape(3, -1).tolist()

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.schema import image_dtype, is_intact, message_dtype, step_schema
+from mcaprl.recorder.schema import (
+    image_dtype,
+    is_intact,
+    message_dtype,
+    step_schema,
+    telemetry_schema,
+)
 from mcaprl.recorder.spaces import observation_leaves
 from tests.recordings import MIXED_SPACE
 
@@ -136,12 +142,26 @@ def test_image_layout_is_that_of_rosbags(height: int, width: int, frame: str) ->
     assert ours.tobytes() == messages.encode(image)
 
 
+@pytest.mark.parametrize("name", ["Speed m/s", "2nd", "a__b", "a_", "größe"])
+def test_telemetry_needs_ros_names(name: str) -> None:
+    with pytest.raises(SpaceError, match="no ROS field name"):
+        telemetry_schema(["speed_m_s", name])
+
+
+@pytest.mark.parametrize(
+    "text", ["float32 x\nfloat32 x\n", "float32[99999999999999999999] x\n", "uint8 encapsulation\n"]
+)
+def test_impossible_definitions(text: str) -> None:
+    assert message_dtype(text) is None
+
+
 def test_what_a_log_cannot_hold() -> None:
     discrete = spaces.Discrete(2)
     cases = [
         (spaces.Tuple([discrete]), "observation is a Tuple space"),
         (spaces.Dict({"x": spaces.Graph(discrete, None)}), r"observation\['x'\] is a Graph space"),
         (spaces.Box(-1, 1, (0,)), "no numbers at all"),
+        (spaces.Dict({}), "empty Dict"),
     ]
     for space, message in cases:
         with pytest.raises(SpaceError, match=message):

@@ -6,6 +6,7 @@ import math
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +18,8 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.errors import LogError, OutputExistsError, SpaceError
+from mcaprl.errors import LogError, NoStepsError, OutputExistsError, SpaceError, UsageError
+from mcaprl.recorder.check import check_log
 from mcaprl.recorder.mcap_reader import McapReader
 from tests.recordings import ScriptedEnv
 
@@ -188,6 +190,140 @@ def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
     env.step(0)
     env.close()
     assert mcaprl.open(log_path).observations.tolist() == [two(0.1, 0.2).tolist()]
+
+
+def test_what_a_space_cannot_hold_is_refused(log_path: Path) -> None:
+    scalar = spaces.Dict({"a": spaces.Box(0, 255, (), np.uint8), "b": spaces.Discrete(5)})
+    for number, bad in enumerate([{"a": 300, "b": 1}, {"a": 3, "b": 2.7}, {"a": 3}, None]):
+        rows = [({"a": 1, "b": 2}, 0.0, False, False), (bad, 1.0, False, False)]
+        path = log_path.with_name(f"{number}.mcap")
+        env = mcaprl.RecordMcap(ScriptedEnv(scalar, spaces.Discrete(3), [rows]), path)
+        env.reset()
+        with pytest.raises(SpaceError, match=r"observation\['[ab]'\]"):
+            env.step(0)
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(0)
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "kept"),
+    [
+        (spaces.Discrete(5), 1.7, None),
+        (spaces.Discrete(5), np.array([1, 2]), None),
+        (spaces.Discrete(5), np.array([3]), 3),
+        (spaces.Discrete(5), True, 1),
+        (spaces.MultiDiscrete([3, 3]), [1.5, 2], None),
+        (spaces.MultiDiscrete([3, 3]), [1, 2], [1, 2]),
+        (spaces.Box(-1, 1, (), np.float32), 0.25, 0.25),
+        (spaces.Box(-1, 1, (2,), np.float32), [0.5, -0.5], [0.5, -0.5]),
+    ],
+)
+def test_actions_are_kept_or_refused(log_path: Path, space: Any, action: Any, kept: Any) -> None:
+    env = mcaprl.RecordMcap(ScriptedEnv(BOX, space, [ONE]), log_path)
+    env.reset()
+    if kept is None:
+        with pytest.raises(SpaceError, match="action"):
+            env.step(action)
+        env.close()
+        return
+    env.step(action)
+    env.close()
+    assert mcaprl.open(log_path).actions.tolist() == [kept]
+
+
+def test_large_observations_make_small_chunks(log_path: Path) -> None:
+    """Chunks are bounded in bytes, too: no reader takes one of any size."""
+    image = spaces.Box(0, 255, (720, 1280, 3), np.uint8)
+    rows = [(np.full(image.shape, k, np.uint8), 0.0, False, k == 9) for k in range(10)]
+    env = mcaprl.RecordMcap(ScriptedEnv(image, spaces.Discrete(3), [rows]), log_path)
+    env.reset()
+    for _ in range(9):
+        env.step(0)
+    env.close()
+    assert max(chunk.uncompressed_size for chunk in McapReader(log_path).chunks) < 16 * 2**20
+    assert mcaprl.open(log_path).observations[:, 5, 7, 1].tolist() == list(range(9))
+
+
+def test_policy_is_that_of_the_episodes_start(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="a")
+    env.reset()
+    env.step(0)
+    env.policy = "b"
+    env.reset()
+    env.step(0)
+    env.close()
+    assert [episode.policy for episode in mcaprl.open(log_path).episodes] == ["a", "b"]
+
+
+@pytest.mark.parametrize("options", [{"step_duration_s": 0.0}, {"start_time_ns": -5}])
+def test_times_must_rise(log_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="times must rise"):
+        mcaprl.RecordMcap(scripted(ONE), log_path, **options)
+    assert not log_path.exists()
+
+
+def test_what_reset_refuses(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE), log_path)
+    with pytest.raises(UsageError, match="2\\*\\*63"):
+        env.reset(seed=2**64)
+    env.close()
+    with pytest.raises(UsageError, match="closed"):
+        env.reset()
+
+
+def test_disk_full_leaves_the_finished_episodes(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path)
+    env.reset()
+    env.step(0)
+    env.step(0)
+    env.reset()
+    env.step(0)
+
+    class Full:
+        def __init__(self, file: Any) -> None:
+            self._file = file
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._file, name)
+
+        def write(self, data: Any) -> int:
+            if len(data) > 40:
+                return int(self._file.write(data[:40]))
+            raise OSError(28, "No space left on device")
+
+    writer = env._log.mcap
+    monkeypatch.setattr(writer, "_file", Full(writer._file))
+    with pytest.raises(LogError, match="No space left on device; the episodes finished before"):
+        env.step(0)
+    env.close()
+    with pytest.warns(UserWarning, match="cut off"):
+        assert len(mcaprl.open(log_path).episodes) == 1
+
+
+def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
+    """Ctrl-C a hundred times, each at another moment of a recording."""
+    main = threading.get_ident()
+    for trial in range(100):
+        path = log_path.with_name(f"{trial}.mcap")
+        env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+        timer = threading.Timer(0.001 + trial * 0.0003, signal.pthread_kill, (main, signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            timer.start()
+            while True:
+                env.reset(seed=trial)
+                while not any(env.step(0)[2:4]):
+                    pass
+        env.close()
+        assert check_log(path) == []
+        try:
+            data = mcaprl.open(path)
+        except NoStepsError:
+            continue
+        assert all(episode.reason == "terminated" for episode in data.episodes[:-1])
+        assert all(episode.terminated[-1] for episode in data.episodes[:-1])
 
 
 def test_step_needs_reset(log_path: Path) -> None:

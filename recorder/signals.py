@@ -1,0 +1,56 @@
+"""Keeps Ctrl-C and SIGTERM from falling between two writes that belong together."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+_HELD = (signal.SIGINT, signal.SIGTERM)
+
+
+class HoldSignals:
+    """A `with` block that lets signals wait; they are handled as usual when it ends.
+
+    Only the main thread can hold them; in any other thread no handler runs anyway.
+    """
+
+    def __enter__(self) -> None:
+        """Begin to hold."""
+        self._handlers: dict[int, Any] = {}
+        self._waiting: list[tuple[int, FrameType | None]] = []
+        if threading.current_thread() is not threading.main_thread():
+            return
+        try:
+            for number in _HELD:
+                handler = signal.getsignal(number)
+                # None: not installed from Python, so it cannot be put back.
+                if handler is not None:
+                    self._handlers[number] = handler
+                    signal.signal(number, self._note)
+        except BaseException:
+            self._restore()
+            raise
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Handle what came in the meantime."""
+        self._restore()
+        for number, frame in self._waiting:
+            handler = self._handlers[number]
+            if callable(handler):
+                handler(number, frame)
+            elif handler is signal.SIG_DFL:
+                signal.raise_signal(number)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._waiting.append((number, frame))
+
+    def _restore(self) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
