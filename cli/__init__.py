@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments: without the program's name; default: the process's own.
     """
     # A terminated recording closes its file on the way out, as an interrupted one does.
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     warnings.showwarning = _print_warning
     sys.exit(run(arguments))
 
@@ -69,10 +69,6 @@ def _fail(message: str, code: int) -> int:
     line = " ".join(message.split())
     click.echo(f"mcaprl: {line}", err=True)
     return code
-
-
-def _terminate(number: int, frame: Any) -> None:
-    raise KeyboardInterrupt
 
 
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,16 @@ import click
 import gymnasium as gym
 
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.policies import SCRIPTED, policies_of, policy_name
+from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.show import print_json, print_table, progress, write_json
-from mcaprl.errors import UnknownNameError
-from mcaprl.recorder.reader import open_logs
+from mcaprl.errors import UsageError, import_extra
+from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluate import PolicyScore, bootstrap_interval, normalize
 from mcaprl.sims.evaluate import evaluate as evaluate_policy
+
+RESULT_NAME = "evaluation.json"
 
 
 @click.command()
@@ -50,23 +53,29 @@ def evaluate(
     POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
     are given beside random = 0 and pilot = 1, where the sim has a pilot.
     """
-    logged = _behavior(behavior)
     env = make_sim(sim, **sim_arguments)
     with closing(env):
+        # What can be wrong is looked for first: episodes may take minutes.
+        logged = _behavior(behavior, env, record_path)
+        if report is not None:
+            import_extra("matplotlib", "report")
+            write_json(report / RESULT_NAME, {})
         world = list(getattr(env.unwrapped, "static_scene", list)())
         scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
+    if logged is not None:
+        logged = _scaled(logged, scores)
     result = {
         "sim": sim,
         "seed": seed,
-        "behavior": logged and {"data": behavior, **logged},
+        "behavior": logged,
         "policies": [score.to_json() for score in scores],
     }
-    if report is not None:
-        _write_report(report, result, scores, world)
     if as_json:
         print_json(result)
     else:
         _print_scores(sim, episodes, scores, logged)
+    if report is not None:
+        _write_report(report, result, scores, world)
 
 
 def _score_all(
@@ -84,53 +93,73 @@ def _score_all(
         for name in SCRIPTED
         if name not in names and (found := _baseline(name, env)) is not None
     ]
+    shown = policy_names([name for name, _ in wanted + baselines])
     runs = sum(len(found) for _, found in wanted + baselines)
     scores = {}
     with ExitStack() as stack:
         advance = stack.enter_context(progress("evaluating", runs * episodes))
-        recorder = _recorder(env, record_path, seed, overwrite)
-        if recorder is not None:
+        recorder = None
+        if record_path is not None:
+            recorder = RecordMcap(env, record_path, seed=seed, overwrite=overwrite, epsilon=0.0)
             stack.enter_context(closing(recorder))
         for name, found in wanted + baselines:
-            acting = recorder if recorder is not None and name in names else env
-            if isinstance(acting, RecordMcap):
-                acting.policy, acting.epsilon = policy_name(name), 0.0
+            recorded = recorder if name in names else None
             scores[name] = evaluate_policy(
-                acting,
+                recorded or env,
                 found,
-                name=policy_name(name),
+                name=shown[name],
                 episodes=episodes,
                 seed=seed,
+                on_policy=partial(_tell_policy, recorded),
                 on_episode=lambda result: advance(),
             )
     pilot = scores.get("pilot")
     return [normalize(score, scores["random"], pilot) for score in scores.values()]
 
 
+def _tell_policy(recorder: RecordMcap | None, name: str) -> None:
+    if recorder is not None:
+        recorder.policy = name
+
+
 def _baseline(name: str, env: gym.Env[Any, Any]) -> Any:
     try:
         return policies_of(name, env)
-    except UnknownNameError:
+    except UsageError:
         return None
 
 
-def _recorder(
-    env: gym.Env[Any, Any], path: Path | None, seed: int, overwrite: bool
-) -> RecordMcap | None:
-    return None if path is None else RecordMcap(env, path, seed=seed, overwrite=overwrite)
+def _behavior(
+    data: str | None, env: gym.Env[Any, Any], record_path: Path | None
+) -> dict[str, Any] | None:
+    """The logged episodes' mean return and its interval.
 
-
-def _behavior(data: str | None) -> dict[str, Any] | None:
-    """The logged episodes' mean return and its interval."""
+    Raises:
+        UsageError: the logs are of another environment, or about to be overwritten.
+    """
     if data is None:
         return None
-    returns = open_logs(data).statistics.returns
-    low, high = bootstrap_interval(returns[None])
+    if record_path is not None and record_path.resolve() in [p.resolve() for p in find_logs(data)]:
+        raise UsageError(f"{record_path} is in --behavior {data}: record the episodes elsewhere")
+    dataset = open_logs(data)
+    env_id = env.spec.id if env.spec else ""
+    if dataset.env_id != env_id:
+        raise UsageError(f"--behavior {data} is of {dataset.env_id or 'unknown'}, not of {env_id}")
+    returns = dataset.statistics.returns
     return {
+        "data": data,
         "episodes": len(returns),
         "mean_return": float(returns.mean()),
-        "interval": [low, high],
+        "interval": list(bootstrap_interval(returns[None])),
     }
+
+
+def _scaled(logged: dict[str, Any], scores: list[PolicyScore]) -> dict[str, Any]:
+    """The logged behavior with its place between random and pilot."""
+    random = next((s.mean_return for s in scores if s.policy == "random"), math.nan)
+    pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
+    score = (logged["mean_return"] - random) / (pilot - random or math.nan)
+    return {**logged, "normalized_score": None if math.isnan(score) else score}
 
 
 def _write_report(
@@ -138,7 +167,7 @@ def _write_report(
 ) -> None:
     from mcaprl.sims.report import comparison_picture, trajectory_picture
 
-    write_json(folder / "evaluation.json", result)
+    write_json(folder / RESULT_NAME, result)
     logged = result["behavior"]
     band = None if logged is None else (logged["mean_return"], *logged["interval"])
     comparison_picture(folder / "comparison.png", scores, f"{result['sim']}: mean return", band)
@@ -148,17 +177,14 @@ def _write_report(
 def _print_scores(
     sim: str, episodes: int, scores: list[PolicyScore], logged: dict[str, Any] | None
 ) -> None:
-    random = next((s.mean_return for s in scores if s.policy == "random"), math.nan)
-    pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
     rows = []
     if logged is not None:
-        score = (logged["mean_return"] - random) / (pilot - random or math.nan)
         rows.append(
             [
                 "behavior, as logged",
                 f"{logged['mean_return']:.2f}",
                 _interval(logged["interval"]),
-                "" if math.isnan(score) else f"{score:.3f}",
+                _score(logged["normalized_score"]),
                 f"{logged['episodes']} episodes",
             ]
         )
@@ -167,7 +193,7 @@ def _print_scores(
             score.policy,
             f"{score.mean_return:.2f}",
             _interval(score.interval),
-            "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
+            _score(score.normalized_score),
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
         ]
         for score in scores
@@ -181,3 +207,7 @@ def _print_scores(
 
 def _interval(interval: Sequence[float]) -> str:
     return f"{interval[0]:.2f} to {interval[1]:.2f}"
+
+
+def _score(score: float | None) -> str:
+    return "" if score is None else f"{score:.3f}"

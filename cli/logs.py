@@ -14,12 +14,13 @@ import click
 import numpy as np
 
 from mcaprl.cli.show import print_facts, print_json, size, write_json
-from mcaprl.errors import CorruptLogError, OutputExistsError
-from mcaprl.recorder.check import check_log
+from mcaprl.errors import CorruptLogError, LogError, OutputExistsError, UsageError, import_extra
+from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.reader import describe, find_logs, open_logs
+from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim
 
@@ -32,6 +33,8 @@ from mcaprl.sims import SIMS, make_sim
 def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
     """Tell what is in DATA: files, folders or globs of logs."""
     paths = find_logs(data)
+    if report is not None:
+        import_extra("matplotlib", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         dataset = open_logs(paths)
@@ -55,13 +58,24 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def check(files: tuple[str, ...], as_json: bool) -> int:
     """Read every byte of FILE... and tell what is wrong. Exits with 1 if anything is."""
-    paths = find_logs(files)
-    problems = [problem for path in paths for problem in check_log(path)]
+    paths, problems = [], []
+    for name in files:
+        try:
+            found = find_logs(name)
+        except LogError as error:
+            # The other files are worth checking all the same.
+            problems.append(Problem(name, str(error), "looking for it", "check the path"))
+            if not as_json:
+                click.echo(f"mcaprl: {error}", err=True)
+            continue
+        paths += found
+        problems += [problem for path in found for problem in check_log(path)]
     if as_json:
         print_json({"ok": not problems, "problems": [asdict(problem) for problem in problems]})
     else:
         for problem in problems:
-            click.echo(str(problem))
+            if problem.file in map(str, paths):
+                click.echo(str(problem))
         if not problems:
             click.echo(f"{len(paths)} file{'s' * (len(paths) > 1)} checked, nothing wrong")
     return int(bool(problems))
@@ -73,6 +87,8 @@ def check(files: tuple[str, ...], as_json: bool) -> int:
 @click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs that a sim will give."""
+    if out.suffix == ".mcap":
+        raise UsageError(f"{out}: a layout is JSON, and must not take the place of a log")
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
     is_file = source not in SIMS and (Path(source).is_file() or source.endswith(".mcap"))
@@ -165,7 +181,9 @@ def _layout_of_sim(sim: str) -> dict[str, Any]:
     """The layout that a recording of the sim would carry: one is made and thrown away."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reset.mcap"
-        env = RecordMcap(make_sim(sim), path, camera=True)
+        sim_env = make_sim(sim)
+        camera = isinstance(sim_env.unwrapped, DepthSource)
+        env = RecordMcap(sim_env, path, camera=camera)
         env.reset(seed=0)
         env.close()
         return _layout_of_file(path)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
-from mcaprl.errors import UnknownNameError
+from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims.rollout import Policy, check_fit
 
 SCRIPTED = ("pilot", "random")
@@ -21,7 +22,8 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
         env: that they are to act in.
 
     Raises:
-        UnknownNameError: no such policy, or the sim has no pilot.
+        UnknownNameError: no such policy.
+        UsageError: the sim has no pilot.
         PolicyError: the path holds none that fits.
     """
     if name == "random":
@@ -29,7 +31,13 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     if name == "pilot":
         from mcaprl.sims.pilots import make_pilot
 
-        return [make_pilot(env)]
+        try:
+            return [make_pilot(env)]
+        except UnknownNameError as error:
+            sim = env.spec.id if env.spec else "the environment"
+            raise UsageError(
+                f"{sim} has no pilot: pass --policy random, or the path of a trained run"
+            ) from error
     path = Path(name)
     if not path.exists():
         raise UnknownNameError("policy", name, [*SCRIPTED, *_neighbours(path)])
@@ -40,9 +48,13 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     return loaded
 
 
-def policy_name(name: str) -> str:
-    """How tables call it: a path by its last part."""
-    return name if name in SCRIPTED else Path(name).name
+def policy_names(names: Sequence[str]) -> dict[str, str]:
+    """How tables call policies: a path by its last part, or whole where that is another's too."""
+    short = {name: name if name in SCRIPTED else Path(name).name for name in names}
+    return {
+        name: last if list(short.values()).count(last) == 1 else name
+        for name, last in short.items()
+    }
 
 
 def _load(path: Path) -> list[Policy]:

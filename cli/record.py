@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
+import signal
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
@@ -15,7 +17,7 @@ import click
 import numpy as np
 
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.policies import policies_of, policy_name
+from mcaprl.cli.policies import policies_of, policy_names
 from mcaprl.cli.show import progress, size
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.recorder.mcap_writer import COMPRESSIONS
@@ -106,6 +108,12 @@ def record(
     """
     if (episodes is None) == (steps is None):
         raise UsageError("record needs --episodes N or --steps N, one of the two")
+    if math.isnan(epsilon):
+        raise UsageError("--epsilon nan: give a probability from 0 to 1")
+    if envs > 1 and out.suffix == ".mcap":
+        raise UsageError(
+            f"--envs {envs} writes a file of each into a folder; {out} is no name for one"
+        )
     whole = Recording(
         sim=sim,
         sim_options=sim_arguments,
@@ -151,7 +159,7 @@ def run_recording(
         recorder = RecordMcap(
             env,
             recording.out,
-            policy=policy_name(recording.policy),
+            policy=policy_names([recording.policy])[recording.policy],
             epsilon=behavior.epsilon,
             seed=recording.seed,
             compression=recording.compression,
@@ -211,12 +219,17 @@ def run_shards(
     ]
     context = multiprocessing.get_context("spawn")
     results = []
-    with ProcessPoolExecutor(len(shards), mp_context=context) as pool:
+    with ProcessPoolExecutor(len(shards), context, initializer=_end_as_interrupted) as pool:
         for shard_results in pool.map(run_recording, shards):
             results += shard_results
             for result in shard_results:
                 on_episode(result)
     return results
+
+
+def _end_as_interrupted() -> None:
+    """Let SIGTERM end a shard as Ctrl-C does: with its file closed."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _shares(total: int, parts: int) -> list[tuple[int, int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +35,9 @@ def write_json(path: Path, value: Any, *, indent: int | None = 2) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(_finite(value), indent=indent) + "\n")
+        unfinished = path.with_name(f"{path.name}.part")
+        unfinished.write_text(json.dumps(_finite(value), indent=indent) + "\n")
+        os.replace(unfinished, path)
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror}") from error
 
@@ -92,7 +95,8 @@ def size(count: float) -> str:
 
 def _print(table: Table) -> None:
     # A file or a pipe has no width of its own; the usual guess of 80 breaks lines for nothing.
-    Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH).print(table)
+    is_terminal = sys.stdout is not None and sys.stdout.isatty()
+    Console(width=None if is_terminal else _PIPE_WIDTH).print(table)
 
 
 def _finite(value: Any) -> Any:

@@ -22,7 +22,7 @@ class _TrainCommand(click.Command):
 @click.command(cls=_TrainCommand)
 @click.argument("data", nargs=-1, required=True, metavar="DATA...")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to make.")
-@click.option("--algo", default="cql", show_default=True, help="dqn, double-dqn, cql or bc.")
+@click.option("--algo", help="dqn, double-dqn, cql or bc.  [default: cql]")
 @click.option(
     "--seeds",
     default=1,
@@ -44,7 +44,7 @@ class _TrainCommand(click.Command):
 def train_offline(
     data: tuple[str, ...],
     out: Path,
-    algo: str,
+    algo: str | None,
     seeds: int,
     seed: int,
     threads: int,
@@ -53,33 +53,44 @@ def train_offline(
 ) -> None:
     """Learn a policy from DATA: files, folders or globs of logs, which all count the same.
 
-    Settings that are not given have the algorithm's own defaults.
+    Settings that are not given have the algorithm's own defaults; with --resume, the run's.
     """
     import torch
 
     from mcaprl.offline.algorithms import choose_algorithm
-    from mcaprl.offline.train import train
+    from mcaprl.offline.train import CONFIG_NAME, read_config, train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}
+    if resume and (out / CONFIG_NAME).exists():
+        earlier = read_config(out / CONFIG_NAME)
+        algo = algo or earlier.get("algo")
+        given = {**_plain_settings(earlier.get("config")), **given}
+    algo = algo or "cql"
     _, defaults = choose_algorithm(algo)
     known = [field.name for field in fields(defaults)]
     for name in given:
         if name not in known:
             options = ", ".join(_flag(field) for field in known)
             raise UsageError(f"{algo} has no setting {_flag(name)}; it has {options}")
+    config = type(defaults)(**given)
     dataset = open_logs(list(data))
     click.echo(
         f"{algo} learns from {len(dataset.episodes)} episodes, {len(dataset)} transitions,"
         f" mean return {dataset.statistics.mean_return:.2f}"
     )
-    config = type(defaults)(**given)
     for summary in train(dataset, config, out, seeds=seeds, seed=seed, resume=resume):
         done = summary.updates - summary.resumed_at
         rate = done / summary.seconds if summary.seconds else 0.0
         terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
         click.echo(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
     click.echo(f"curves: tensorboard --logdir {out}")
+
+
+def _plain_settings(found: object) -> dict[str, Any]:
+    """The settings of an earlier session, as its config.json has them."""
+    settings = found if isinstance(found, dict) else {}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
 
 
 def _setting_options() -> list[click.Option]:

@@ -1,11 +1,13 @@
 #!/usr/bin/env sh
 # The main job from end to end. Every line is a command that you can type yourself.
 #
-#   sh examples/demo.sh FOLDER       writes everything below FOLDER, which it empties first
+#   sh examples/demo.sh FOLDER       writes everything below FOLDER, over what an earlier run left
 set -eu
 out=${1:-demo}
-rm -rf "$out"
 mkdir -p "$out"
+for made in data runs report cql.log double-dqn.log replay.mcap foxglove-layout.json; do
+  rm -rf "${out:?}/$made"
+done
 # One thread for each training; two trainings run side by side.
 export OMP_NUM_THREADS=1
 
@@ -20,11 +22,15 @@ mcaprl record lane --policy random --episodes 50 --seed 5 --out "$out/data/rando
 mcaprl info "$out/data"
 
 step "learn from these files alone, four seeds each: CQL, offline Double DQN, behavior cloning"
+echo "this takes two minutes; CQL and Double DQN run side by side: tail -f $out/*.log"
 mcaprl train-offline "$out/data" --algo cql --seeds 4 --out "$out/runs/cql" >"$out/cql.log" 2>&1 &
 first=$!
 mcaprl train-offline "$out/data" --algo double-dqn --seeds 4 --out "$out/runs/double-dqn" \
   >"$out/double-dqn.log" 2>&1 &
 second=$!
+# Background jobs do not hear Ctrl-C; end them when this script ends early.
+trap 'kill "$first" "$second" 2>/dev/null || true' EXIT
+trap 'exit 130' INT TERM
 wait "$first" && cat "$out/cql.log" || { cat "$out/cql.log"; exit 1; }
 mcaprl train-offline "$out/data" --algo bc --seeds 4 --out "$out/runs/bc"
 wait "$second" && cat "$out/double-dqn.log" || { cat "$out/double-dqn.log"; exit 1; }

@@ -11,7 +11,8 @@
     │   └── CorruptLogError     the file's bytes contradict each other
     ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
     ├── PolicyError           a saved policy cannot be used                (exit code 1)
-    └── TrainingError         learning cannot go on                        (exit code 1)
+    ├── TrainingError         learning cannot go on                        (exit code 1)
+    └── ReportError           a picture or report cannot be written        (exit code 1)
 """
 
 from __future__ import annotations
@@ -38,16 +39,24 @@ class UsageError(McaprlError):
 class UnknownNameError(UsageError):
     """No such name; the message lists the nearest ones, or all when there are few."""
 
-    def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        """Say which `kind` of thing `name` was meant to be, and which names are `known`."""
-        names = sorted(known)
-        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(near)}? " if near else ""
-        listed = ", ".join(names) if len(names) <= 12 else f"{', '.join(names[:12])}, ..."
-        super().__init__(f"unknown {kind} '{name}': {hint}known: {listed}")
-        self._arguments = (kind, name, names)
+    def __init__(
+        self, kind: str, name: str, known: Iterable[str], others: Iterable[str] = ()
+    ) -> None:
+        """Say which `kind` of thing `name` was meant to be.
 
-    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str]]]:
+        Args:
+            kind: such as `policy`.
+            name: that is not known.
+            known: names that are, to be listed.
+            others: more of them, too many to list.
+        """
+        names, more = sorted(known), sorted(others)
+        near = difflib.get_close_matches(name, [*names, *more], n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        super().__init__(f"unknown {kind} '{name}': {hint}known: {', '.join(names)}")
+        self._arguments = (kind, name, names, more)
+
+    def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
         """Make it again in another process, which cannot be done from the message alone."""
         return type(self), self._arguments
 
@@ -88,6 +97,10 @@ class TrainingError(McaprlError):
     """Learning cannot go on."""
 
 
+class ReportError(McaprlError):
+    """A picture or report cannot be written."""
+
+
 def import_extra(module: str, extra: str) -> ModuleType:
     """Import an optional dependency.
 
@@ -104,5 +117,5 @@ def import_extra(module: str, extra: str) -> ModuleType:
         if error.name is None or error.name.split(".")[0] != module.split(".")[0]:
             raise
         raise MissingExtraError(
-            f"{module} is not installed: pip install 'mcaprl[{extra}]'"
+            f"{module.split('.')[0]} is not installed: pip install 'mcaprl[{extra}]'"
         ) from error

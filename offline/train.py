@@ -14,7 +14,7 @@ import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -191,11 +191,22 @@ class _Run:
             return values
 
     def _check_same_run(self, path: Path) -> None:
-        try:
-            found = json.loads(path.read_text())
-        except ValueError as error:
-            raise TrainingError(f"cannot resume: {path} is no JSON: {error}") from error
-        self.identity.check_same(found, path)
+        self.identity.check_same(read_config(path), path)
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """What RUN/config.json says: `algo`, `config`, `data` and where the data came from.
+
+    Raises:
+        TrainingError: it cannot be read, or is no JSON object.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
+    if not isinstance(found, dict):
+        raise TrainingError(f"cannot resume: {path} is no JSON object")
+    return found
 
 
 def _update(folder: Path, learner: Learner) -> dict[str, torch.Tensor]:

@@ -78,6 +78,11 @@ def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Trans
     return dataclasses.replace(columns, log_time_ns=times, episodes=episodes)
 
 
+def _reason(terminated: bool, truncated: bool) -> str:
+    """Why an episode ended, as far as its flags tell."""
+    return "terminated" if terminated else "truncated" if truncated else ""
+
+
 def _space_of(observations: Any) -> spaces.Space[Any]:
     if isinstance(observations, Mapping):
         return spaces.Dict([(key, _space_of(part)) for key, part in observations.items()])
@@ -174,6 +179,7 @@ def _assemble(
             truncated=bool(columns["truncated"][last]),
             start_time_ns=0,
             end_time_ns=0,
+            reason=_reason(columns["terminated"][last], columns["truncated"][last]),
         )
         for number, (start, last) in enumerate(zip(starts, lasts, strict=True))
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import struct
+import warnings
 
 from mcaprl.recorder import messages
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
@@ -51,6 +52,8 @@ class Display:
         self._bytes = 0
         self._scene = source if scene and isinstance(source, SceneSource) else None
         self._telemetry = source if scene and isinstance(source, TelemetrySource) else None
+        if camera and not isinstance(source, DepthSource):
+            warnings.warn("the environment has no depth camera to record", stacklevel=3)
         camera = camera or bool(log.image_leaves)
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import ReportError, import_extra
 from mcaprl.recorder.dataset import Dataset
 
 _INK, _BAR = "#1d2733", "#2f6fb7"
@@ -25,7 +25,7 @@ def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        LogError: the file cannot be written.
+        ReportError: the file cannot be written.
     """
     figure = import_extra("matplotlib.figure", "report").Figure(figsize=(9, 6.5), dpi=130)
     (returns, lengths), (actions, ends) = figure.subplots(2, 2)
@@ -42,7 +42,7 @@ def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, facecolor="white")
     except OSError as error:
-        raise LogError(f"cannot write {path}: {error.strerror}") from error
+        raise ReportError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _named(counts: Mapping[int, int], meanings: Sequence[str], start: int) -> dict[str, int]:
@@ -55,6 +55,7 @@ def _histogram(axes: Any, values: np.ndarray[Any, Any], label: str) -> None:
     axes.hist(values[np.isfinite(values)], bins=_BINS, color=_BAR)
     axes.set_xlabel(label)
     axes.set_ylabel("episodes")
+    axes.yaxis.get_major_locator().set_params(integer=True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
@@ -63,7 +64,8 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
         axes.set_axis_off()
         axes.text(0.5, 0.5, f"{label}: continuous", ha="center", color=_INK)
         return
-    axes.barh(list(counts), list(counts.values()), color=_BAR)
-    axes.invert_yaxis()
+    axes.barh(list(counts), list(counts.values()), color=_BAR, height=0.7)
+    axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel(label)
     axes.spines[["top", "right"]].set_visible(False)

@@ -184,7 +184,8 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     if array.dtype == leaf.dtype:
         return cast
     if array.dtype.kind == leaf.dtype.kind == "f":
-        if array.ndim:
+        # A list of floats claims no dtype of its own.
+        if array.ndim and isinstance(value, np.ndarray):
             warnings.warn(
                 f"{where} is {array.dtype}, its space declares {leaf.dtype}: logged as such",
                 stacklevel=2,

@@ -6,6 +6,7 @@ than MAX_COLUMNS numbers, images among them, one column of flat lists.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -63,7 +64,7 @@ def _columns(
     if values.ndim == 1:
         yield name, pyarrow.array(values)
         return
-    flat = np.ascontiguousarray(values.reshape(len(values), -1))
+    flat = np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])))
     if flat.shape[1] > MAX_COLUMNS:
         yield (
             name,

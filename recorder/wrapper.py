@@ -79,6 +79,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             UsageError: the times would not rise.
             OutputExistsError, LogError: the file cannot be created.
         """
+        if isinstance(env, gym.vector.VectorEnv):
+            raise UsageError("RecordMcap wraps single environments: record each of a vector's own")
         super().__init__(env)
         self.policy, self.epsilon, self.behavior_prob = policy, epsilon, math.nan
         self._next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns

@@ -43,7 +43,8 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     try:
         return gym.make(env_id, **kwargs)
     except gym.error.UnregisteredEnv as error:
-        raise UnknownNameError("sim", name, [*SIMS, *gym.registry]) from error
+        known = [*SIMS, "any Gymnasium id"]
+        raise UnknownNameError("sim", name, known, gym.registry) from error
     except (TypeError, ValueError, gym.error.Error, ModuleNotFoundError) as error:
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         reason = str(error).split(" was raised from the environment creator")[0]

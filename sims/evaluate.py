@@ -71,6 +71,7 @@ def evaluate(
     name: str,
     episodes: int,
     seed: int,
+    on_policy: Callable[[str], None] = lambda name: None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> PolicyScore:
     """Run one policy, or one per training seed, greedily through the same episodes.
@@ -81,22 +82,18 @@ def evaluate(
         name: for tables.
         episodes: for each of `policies`; the same starts for all.
         seed: of the episodes.
-        on_episode: called after each one.
+        on_policy: called with each policy's own name before its first episode.
+        on_episode: called after each episode.
     """
-    results = tuple(
-        tuple(
-            rollout(
-                env,
-                EpsilonGreedy(policy, 0.0, env.action_space),
-                seed=seed,
-                episodes=episodes,
-                on_episode=on_episode,
-            )
+    results = []
+    for policy in policies:
+        on_policy(name if policy is None or len(policies) == 1 else policy.name)
+        behavior = EpsilonGreedy(policy, 0.0, env.action_space)
+        results.append(
+            tuple(rollout(env, behavior, seed=seed, episodes=episodes, on_episode=on_episode))
         )
-        for policy in policies
-    )
     returns = np.array([[episode.total_reward for episode in one] for one in results])
-    return PolicyScore(name, results, float(returns.mean()), bootstrap_interval(returns))
+    return PolicyScore(name, tuple(results), float(returns.mean()), bootstrap_interval(returns))
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.errors import import_extra
+from mcaprl.errors import ReportError, import_extra
 from mcaprl.sims.evaluate import PolicyScore
 from mcaprl.sims.scene import Shape
 
@@ -62,7 +62,7 @@ def comparison_picture(
     axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
     axes.set_title(title, loc="left", color=_INK)
     if behavior is not None:
-        axes.legend(frameon=False, loc="lower right")
+        axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     axes.spines[["top", "right"]].set_visible(False)
     _save(figure, path)
 
@@ -131,5 +131,8 @@ def _axes(*, figsize: tuple[float, float], rows: int = 1, columns: int = 1) -> t
 
 
 def _save(figure: Any, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, bbox_inches="tight", facecolor="white")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, bbox_inches="tight", facecolor="white")
+    except OSError as error:
+        raise ReportError(f"cannot write {path}: {error.strerror}") from error

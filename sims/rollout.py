@@ -188,7 +188,11 @@ def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
         trained, actual = getattr(policy, role, None), getattr(env, role)
         if trained is not None and trained != actual:
             name = env.spec.id if env.spec else "the environment"
-            raise PolicyError(f"{policy.name} was trained on {role} {trained}; {name} has {actual}")
+            kind = getattr(policy, "env_kwargs", {}).get("observation")
+            hint = f"; try --observation {kind}" if kind and role == "observation_space" else ""
+            raise PolicyError(
+                f"{policy.name} was trained on {role} {trained}; {name} has {actual}{hint}"
+            )
 
 
 def _batch(observation: Any) -> Any:

@@ -161,7 +161,7 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
         assert (Path("report") / name).stat().st_size > 500
     recorded = mcaprl.open("episodes.mcap")
     assert [episode.total_reward for episode in recorded.episodes] == scores["run"]["returns"]
-    assert {episode.policy for episode in recorded.episodes} == {"run"}
+    assert {episode.policy for episode in recorded.episodes} == {"run/seed-0", "run/seed-1"}
     replay = [
         "record",
         "lane",
@@ -195,8 +195,53 @@ def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
     ]
     assert run(train) == 0
     assert "resume" in fails_after(capsys, 2, *train)
-    assert run([*train, "--resume"]) == 0
+    capsys.readouterr()
+    assert run(["train-offline", "d.mcap", "--out", "run", "--resume"]) == 0, (
+        "settings are the run's"
+    )
     assert "0 updates" in capsys.readouterr().out
+    more = ["--resume", "--updates", "30"]
+    assert "has updates 20" in fails_after(capsys, 1, *train, *more)
+    Path("run/config.json").write_text("[]")
+    assert "no JSON object" in fails_after(capsys, 1, *train, "--resume")
+
+
+def test_check_goes_on_behind_a_missing_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", "missing.mcap", str(GOLDEN)]) == 1
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    result = as_json(capsys, "check", "missing.mcap", str(GOLDEN), "--json", code=1)
+    assert [problem["file"] for problem in result["problems"]] == ["missing.mcap"]
+
+
+def test_logs_are_not_overwritten_by_what_is_no_log(
+    cartpole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = cartpole.read_bytes()
+    for source in ("lane", str(cartpole)):
+        line = fails_after(capsys, 2, "layout", source, "--out", str(cartpole), "--overwrite")
+        assert "a layout is JSON" in line
+    evaluate = ["evaluate", "random", "--sim", "CartPole-v1", "--episodes", "1", "--overwrite"]
+    both = ["--behavior", str(cartpole), "--record", str(cartpole)]
+    assert "record the episodes elsewhere" in fails_after(capsys, 2, *evaluate, *both)
+    assert cartpole.read_bytes() == before
+    line = fails_after(capsys, 2, "evaluate", "pilot", "--sim", "lane", "--behavior", str(cartpole))
+    assert "is of CartPole-v1, not of mcaprl/LaneKeeping-v0" in line
+
+
+def test_policies_of_one_name_keep_their_paths(capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        run(["record", "CartPole-v1", "--policy", "random", "--steps", "60", "--out", "d.mcap"])
+        == 0
+    )
+    for folder in ("a/bc", "b/bc"):
+        small = ["--algo", "bc", "--updates", "3", "--hidden", "4", "--out", folder]
+        assert run(["train-offline", "d.mcap", *small]) == 0
+    capsys.readouterr()
+    evaluate = ["evaluate", "a/bc", "b/bc", "a/bc", "--sim", "CartPole-v1", "--episodes", "1"]
+    result = as_json(capsys, *evaluate, "--json")
+    assert [score["policy"] for score in result["policies"]] == ["a/bc", "b/bc", "random"]
+    assert result["policies"][0]["normalized_score"] is None, "CartPole has no pilot"
 
 
 def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
@@ -243,6 +288,8 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
         (["evaluate", "pilot"], 2, "--sim"),
         (["layout", "lane"], 2, "--out"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "nan"], 2, "0 to 1"),
+        (["record", "lane", "--steps", "5", "--out", "x.mcap", "--envs", "2"], 2, "into a folder"),
         (["layout", "nothing.mcap", "--out", "x.json"], 1, "cannot read nothing.mcap"),
         (["info", "x" * 300], 1, "name too long"),
         (["evaluate", "pilot", "--sim", "lane", "--behavior", "nothing"], 1, "no such file"),
