@@ -100,8 +100,6 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """The facts that `info --json` gives, but for the files' size."""
     statistics = dataset.statistics
-    meanings = dict(enumerate(dataset.action_meanings))
-    start = int(getattr(dataset.action_space, "start", 0))
     not_finite = {k: c.not_finite for k, c in statistics.observations.items() if c.not_finite}
     problems = [
         f"{count} values of {name} are NaN or infinite" for name, count in not_finite.items()
@@ -120,7 +118,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         "observations": str(dataset.observation_space),
         "actions": str(dataset.action_space),
         "action_counts": {
-            meanings.get(action - start, str(action)): count
+            dataset.action_names.get(action, str(action)): count
             for action, count in statistics.action_counts.items()
         },
         "policies": sorted({episode.policy for episode in dataset.episodes if episode.policy}),

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
 from mcaprl.errors import McaprlError
-from mcaprl.recorder.dataset import Dataset, Episode
+from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.reader import open_logs as open
 from mcaprl.recorder.wrapper import RecordMcap
 

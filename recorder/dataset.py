@@ -1,10 +1,9 @@
-"""Transitions as arrays, episodes, and what one does with them before learning."""
+"""Transitions as arrays, and what one does with them before learning."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError
-from mcaprl.recorder.log_writer import EpisodeSummary
+from mcaprl.recorder.episode import Episode, shapes
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.spaces import nest, observation_leaves, space_to_json
 from mcaprl.recorder.statistics import Statistics, describe_columns
@@ -23,77 +22,6 @@ from mcaprl.recorder.transitions import Transitions
 if TYPE_CHECKING:
     import pandas
     import pyarrow
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Episode:
-    """One episode of T transitions. Arrays are views into its Dataset.
-
-    Attributes:
-        index: in its Dataset, from 0.
-        observations: (T, *shape), or nested dicts of such arrays.
-        actions: (T,) int64, or (T, *shape).
-        rewards: (T,) float64.
-        terminated: (T,) bool; only the last can be set.
-        truncated: (T,) bool; only the last can be set.
-        next_observations: like `observations`, one step on; the last is the episode's last.
-        behavior_probs: (T,) float32; NaN where unknown.
-        log_time_ns: (T + 1,) when each observation was made, nanoseconds.
-        summary: what the log tells of the episode: seed, reason, policy, ...
-    """
-
-    index: int
-    observations: Any
-    actions: NDArray[Any]
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    next_observations: Any
-    behavior_probs: NDArray[np.float32]
-    log_time_ns: NDArray[np.int64]
-    summary: EpisodeSummary
-
-    @property
-    def length(self) -> int:
-        """Transitions."""
-        return len(self.rewards)
-
-    @property
-    def total_reward(self) -> float:
-        """The undiscounted return."""
-        return self.summary.total_reward
-
-    @property
-    def reason(self) -> str:
-        """Why it ended, in the simulator's words."""
-        return self.summary.reason
-
-    @property
-    def seed(self) -> int | None:
-        """Given to reset(); None if none was."""
-        return self.summary.seed
-
-    @property
-    def policy(self) -> str:
-        """Who acted."""
-        return self.summary.policy
-
-    @property
-    def epsilon(self) -> float:
-        """Its exploration; NaN if unknown."""
-        return self.summary.epsilon
-
-    def __len__(self) -> int:
-        """Transitions."""
-        return self.length
-
-    def __repr__(self) -> str:
-        """Shapes, not arrays."""
-        return (
-            f"Episode(index={self.index}, length={self.length},"
-            f" total_reward={self.total_reward:.6g}, reason={self.reason!r}, seed={self.seed},"
-            f" observations={_shapes(self.observations)}, actions={_shapes(self.actions)})"
-        )
 
 
 class Dataset:
@@ -263,6 +191,11 @@ class Dataset:
         """A name for each discrete action, or empty."""
         return self._description.action_meanings
 
+    @property
+    def action_names(self) -> dict[int, str]:
+        """A name for each discrete action, by its value; empty for other actions."""
+        return self._description.action_names()
+
     @cached_property
     def episodes(self) -> tuple[Episode, ...]:
         """All episodes, in order."""
@@ -349,7 +282,7 @@ class Dataset:
     def __repr__(self) -> str:
         """Shapes, not arrays."""
         shapes = ", ".join(
-            f"{leaf.name}={_shapes(frames)[1:-1]}"
+            f"{leaf.name}={shapes(frames)[1:-1]}"
             for leaf, frames in zip(self._leaves, self._transitions.frames, strict=True)
         )
         return (
@@ -387,9 +320,3 @@ class Dataset:
 
     def _name(self) -> str:
         return str(self.sources[0]) if self.sources else repr(self)
-
-
-def _shapes(array: Any) -> str:
-    if isinstance(array, dict):
-        return "{" + ", ".join(f"{key}: {_shapes(part)}" for key, part in array.items()) + "}"
-    return f"<{'x'.join(map(str, array.shape))} {array.dtype}>"

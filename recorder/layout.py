@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gymnasium import spaces
-
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.spaces import observation_leaves
 
@@ -92,21 +90,21 @@ def _plots(
     """One plot of the rewards, one for each unit of the telemetry, one of observations."""
     series = {"reward": {"reward": "/rl/step.reward"}}
     if VALUES_TOPIC in topics:
-        actions = _action_names(metadata)
+        names = metadata.action_names().values()
         series["q_values"] = {
-            f"Q {name}": f"{VALUES_TOPIC}.q[{index}]" for index, name in enumerate(actions)
+            f"Q {name}": f"{VALUES_TOPIC}.q[{index}]" for index, name in enumerate(names)
         }
     shown = [name for name in telemetry_names if name in ("speed_m_s", "lateral_offset_m")]
     for name in shown:
         series[name] = {name: f"/telemetry.{name}"}
     if not shown:
         series["observation"] = _observation_series(metadata)
-    names: list[Node] = []
+    nodes: list[Node] = []
     for title, paths in series.items():
         if paths:
             panels[f"Plot!{title}"] = _plot(title.replace("_", " "), paths)
-            names.append(f"Plot!{title}")
-    return names
+            nodes.append(f"Plot!{title}")
+    return nodes
 
 
 def _observation_series(metadata: LogMetadata) -> dict[str, str]:
@@ -123,18 +121,11 @@ def _observation_series(metadata: LogMetadata) -> dict[str, str]:
     return dict(list(paths.items())[:MAX_SERIES])
 
 
-def _action_names(metadata: LogMetadata) -> list[str]:
-    space = metadata.action_space
-    count = int(space.n) if isinstance(space, spaces.Discrete) else 0
-    meanings = metadata.action_meanings
-    return list(meanings) if len(meanings) == count else [str(index) for index in range(count)]
-
-
 def _state_transitions(metadata: LogMetadata) -> dict[str, Any]:
     paths = [_state("/rl/step.episode", "episode")]
-    if isinstance(metadata.action_space, spaces.Discrete):
-        names = enumerate(_action_names(metadata), start=int(metadata.action_space.start))
-        legend = ", ".join(f"{value} {name}" for value, name in names)
+    names = metadata.action_names()
+    if names:
+        legend = ", ".join(f"{value} {name}" for value, name in names.items())
         paths.insert(0, _state("/rl/step.action", f"action ({legend})"))
     return {"foxglovePanelTitle": "Action and episode", "isSynced": True, "paths": paths}
 

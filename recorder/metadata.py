@@ -8,7 +8,8 @@ metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
     env_kwargs          JSON object: arguments to gymnasium.make
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
-    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": where it is}
+    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": place}; follows
+                        from the space (`spaces.observation_leaves`), told for other readers
     observation_names   JSON list, a name for each number of a vector observation; may be empty
     action_meanings     JSON list, a name for each discrete action; may be empty
     step_duration_ns    simulated time between two records
@@ -66,6 +67,20 @@ class LogMetadata:
     epsilon: str = ""
     seed: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
+
+    def action_names(self) -> dict[int, str]:
+        """A name for each discrete action: its meaning if each has another one, else its number.
+
+        Empty for spaces of another kind.
+        """
+        space = self.action_space
+        if not isinstance(space, spaces.Discrete):
+            return {}
+        values = range(int(space.start), int(space.start + space.n))
+        meanings = self.action_meanings
+        if len(meanings) != len(values) or len(set(meanings)) != len(meanings):
+            return {value: str(value) for value in values}
+        return dict(zip(values, meanings, strict=True))
 
     def to_strings(self) -> dict[str, str]:
         """The map that is written to the file."""

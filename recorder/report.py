@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,9 @@ def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
     mean = statistics.mean_return
     _histogram(returns, statistics.returns, f"return of an episode (mean {mean:.4g})")
     _histogram(lengths, statistics.lengths, "steps of an episode")
-    start = int(getattr(dataset.action_space, "start", 0))
-    _bars(actions, _named(statistics.action_counts, dataset.action_meanings, start), "actions")
+    names = dataset.action_names
+    taken = {names.get(value, str(value)): n for value, n in statistics.action_counts.items()}
+    _bars(actions, taken, "actions")
     _bars(ends, statistics.ends, "ends of episodes")
     figure.suptitle(title, x=0.02, ha="left", color=_INK)
     figure.tight_layout()
@@ -43,12 +44,6 @@ def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
         figure.savefig(path, facecolor="white")
     except OSError as error:
         raise ReportError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _named(counts: Mapping[int, int], meanings: Sequence[str], start: int) -> dict[str, int]:
-    """Counts by the actions' meanings, where they have any."""
-    names = dict(enumerate(meanings, start=start))
-    return {names.get(action, str(action)): count for action, count in counts.items()}
 
 
 def _histogram(axes: Any, values: np.ndarray[Any, Any], label: str) -> None:

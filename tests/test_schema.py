@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import SpaceError
+from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.schema import (
     image_dtype,
     is_intact,
@@ -166,3 +167,15 @@ def test_what_a_log_cannot_hold() -> None:
     for space, message in cases:
         with pytest.raises(SpaceError, match=message):
             step_schema(space, discrete)
+
+
+def test_action_names_are_one_for_each() -> None:
+    box = spaces.Box(-1, 1, (2,), np.float32)
+
+    def names(space: spaces.Space[Any], *meanings: str) -> dict[int, str]:
+        return LogMetadata(box, space, action_meanings=meanings).action_names()
+
+    assert names(spaces.Discrete(2, start=5), "left", "right") == {5: "left", 6: "right"}
+    assert names(spaces.Discrete(2), "left", "left") == {0: "0", 1: "1"}
+    assert names(spaces.Discrete(2), "left") == {0: "0", 1: "1"}
+    assert names(box, "left") == {}
