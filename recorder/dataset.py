@@ -281,13 +281,13 @@ class Dataset:
 
     def __repr__(self) -> str:
         """Shapes, not arrays."""
-        shapes = ", ".join(
+        columns = ", ".join(
             f"{leaf.name}={shapes(frames)[1:-1]}"
             for leaf, frames in zip(self._leaves, self._transitions.frames, strict=True)
         )
         return (
             f"Dataset({self.env_id or 'unknown environment'}: {len(self._transitions.episodes)}"
-            f" episodes, {len(self)} transitions, {shapes}, actions={self.action_space})"
+            f" episodes, {len(self)} transitions, {columns}, actions={self.action_space})"
         )
 
     def _take(self, chosen: Sequence[int]) -> Dataset:

@@ -8,8 +8,8 @@ metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
     env_kwargs          JSON object: arguments to gymnasium.make
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
-    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": place}; follows
-                        from the space (`spaces.observation_leaves`), told for other readers
+    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": place};
+                        follows from the space (`spaces.observation_leaves`)
     observation_names   JSON list, a name for each number of a vector observation; may be empty
     action_meanings     JSON list, a name for each discrete action; may be empty
     step_duration_ns    simulated time between two records
