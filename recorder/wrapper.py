@@ -133,7 +133,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             ResetNeeded: no episode is open.
-            SpaceError: action or observation does not fit its space. The episode is over then, and
+            SpaceError: the action does not fit its space, and is not taken; or the observation
+                does not fit. As after any error behind the action, the episode is over then, and
                 kept up to the transition before.
         """
         episode = self._open
@@ -143,22 +144,25 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         # Before the environment can change it.
         self._columns.act(step, action, self.behavior_prob)
         self.behavior_prob = math.nan
-        observation, reward, terminated, truncated, info = self.env.step(action)
         try:
+            observation, reward, terminated, truncated, info = self.env.step(action)
             values = [convert(observation) for convert in self._converters]
-        except SpaceError:
+            self._columns.reward(step, float(reward))
+            if terminated or truncated or self._is_full(step + 1):
+                # Nothing may come between the writes, nor between them and what counts the steps.
+                with HoldSignals():
+                    self._make_room(step + 1)
+                    self._observe(step + 1, values)
+                    if terminated or truncated:
+                        self._end(
+                            bool(terminated), bool(truncated), _reason(info, bool(terminated))
+                        )
+            else:
+                self._observe(step + 1, values)
+        except BaseException:
+            # The environment may be a step ahead of the log: nothing may be joined to it.
             self._interrupt()
             raise
-        self._columns.reward(step, float(reward))
-        if terminated or truncated or self._is_full(step + 1):
-            # Nothing may come between the writes, nor between them and what counts the steps.
-            with HoldSignals():
-                self._make_room(step + 1)
-                self._observe(step + 1, values)
-                if terminated or truncated:
-                    self._end(bool(terminated), bool(truncated), _reason(info, bool(terminated)))
-        else:
-            self._observe(step + 1, values)
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:

@@ -175,6 +175,8 @@ def test_episode_ends_before_an_exception(log_path: Path) -> None:
     env.step(1)
     with pytest.raises(RuntimeError, match="motor on fire"):
         env.step(2)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(1)
     env.close()
     data = mcaprl.open(log_path)
     assert data.actions.tolist() == [1]
