@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError, UsageError
+from mcaprl.errors import UsageError
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
