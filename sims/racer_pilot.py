@@ -1,4 +1,4 @@
-"""The scripted driver of the racer sim: steer to where there is room, slow down where there is none."""
+"""The scripted driver of the racer sim: steer to where there is room, slow down where not."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.compiled import compiled
+from mcaprl.sims.racer import RacerEnv
 from mcaprl.sims.racer_car import Racer
 from mcaprl.sims.racer_rays import CENTRE_RAYS, CENTRE_RAYS_RAD, RAYS, measure
 from mcaprl.sims.racer_rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN
@@ -50,3 +51,26 @@ def choose(track: Track, car: Racer, allowed: NDArray[np.int64], classic: bool) 
         if misses < least:
             best, least = action, misses
     return int(best)
+
+
+class RacerPilot:
+    """Drives the car of one environment, whose state it reads."""
+
+    name: ClassVar[str] = "pilot"
+
+    def __init__(self, sim: RacerEnv) -> None:
+        """Take the wheel of `sim`."""
+        self._sim = sim
+        self._allowed = np.array(sim.actions, dtype=np.int64)
+
+    def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
+        """Give the action, shape (1,), for the car as it is now.
+
+        Raises:
+            ValueError: there are observations of more than one environment.
+        """
+        if len(observations) != 1:
+            raise ValueError(f"one pilot drives one environment, not {len(observations)}")
+        sim = self._sim
+        chosen = choose(sim.track, sim.car, self._allowed, sim.classic)
+        return np.array([sim.actions.index(chosen)], dtype=np.int64)

@@ -66,20 +66,16 @@ def crossing(
 
 
 @compiled
-def ray_length(
-    walls: NDArray[np.float64], x_px: float, y_px: float, angle_rad: float
-) -> tuple[float, int]:
-    """Give the distance from a point to the nearest wall in a direction, at most 1000 pixels.
-
-    The second result is the wall that is met there, -1 if none.
-    """
+def ray_length(walls: NDArray[np.float64], x_px: float, y_px: float, angle_rad: float) -> float:
+    """Give the distance from a point to the nearest wall in a direction, at most 1000 pixels."""
     dx, dy = FAR_PX * math.cos(angle_rad), FAR_PX * math.sin(angle_rad)
-    nearest, met = 1.0, -1
-    for i in range(len(walls)):
-        share, along_wall = crossing(x_px, y_px, dx, dy, walls[i])
-        if 0.0 < share < nearest and 0.0 < along_wall < 1.0:
-            nearest, met = share, i
-    return nearest * FAR_PX, met
+    nearest = 1.0
+    for wall in walls:
+        share, along_wall = crossing(x_px, y_px, dx, dy, wall)
+        # With its ends: a ray into the joint of two walls must not slip through.
+        if 0.0 < share < nearest and 0.0 <= along_wall <= 1.0:
+            nearest = share
+    return nearest * FAR_PX
 
 
 @compiled
@@ -108,28 +104,43 @@ def floored_ray_length(
 
 
 @compiled
+def ray_start(car: Racer, ray: int, classic: bool) -> tuple[float, float, float]:
+    """Give where a ray starts, x and y in pixels, and its direction, radians clockwise from x.
+
+    The left corner's sideways ray looks to the left; in the classic rules across the car's nose.
+    """
+    if ray < CENTRE_RAYS:
+        return car.x_px, car.y_px, car.heading_rad + CENTRE_RAYS_RAD[ray]
+    right = 1.0 if (ray - CENTRE_RAYS) % 2 else -1.0
+    x_px, y_px = corner_at(car, 1.0, right)
+    if ray >= CENTRE_RAYS + 2:
+        return x_px, y_px, car.heading_rad
+    side = -right if classic else right
+    return x_px, y_px, car.heading_rad + 0.5 * math.pi * side
+
+
+@compiled
 def measure(
     walls: NDArray[np.float64], car: Racer, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays.
-
-    The corners' rays of the classic rules run across the car's nose, and are measured from its
-    centre; else the left corner looks to the left.
-    """
-    heading_rad = car.heading_rad
-    for i in range(RAYS):
-        x_px, y_px, turn_rad = car.x_px, car.y_px, 0.0
-        if i < CENTRE_RAYS:
-            turn_rad = CENTRE_RAYS_RAD[i]
-        else:
-            right = 1.0 if (i - CENTRE_RAYS) % 2 else -1.0
-            x_px, y_px = corner_at(car, 1.0, right)
-            if i < CENTRE_RAYS + 2:
-                turn_rad = 0.5 * math.pi * (-right if classic else right)
+    """Write the lengths (18,) of the car's rays; the classic ones are all from its centre."""
+    for ray in range(RAYS):
+        x_px, y_px, angle_rad = ray_start(car, ray, classic)
         if classic:
-            lengths_px[i] = floored_ray_length(walls, car, x_px, y_px, heading_rad + turn_rad)
+            lengths_px[ray] = floored_ray_length(walls, car, x_px, y_px, angle_rad)
         else:
-            lengths_px[i] = ray_length(walls, x_px, y_px, heading_rad + turn_rad)[0]
+            lengths_px[ray] = ray_length(walls, x_px, y_px, angle_rad)
+
+
+def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
+    """Give the rays as lines (18, 2, 2) from their start to the wall, x and y in pixels."""
+    ends = []
+    for ray in range(RAYS):
+        x_px, y_px, angle_rad = ray_start(car, ray, False)
+        length_px = ray_length(walls, x_px, y_px, angle_rad)
+        hit = (x_px + length_px * math.cos(angle_rad), y_px + length_px * math.sin(angle_rad))
+        ends.append(((x_px, y_px), hit))
+    return np.array(ends)
 
 
 @compiled

@@ -65,11 +65,12 @@ class Track(NamedTuple):
     walls_px: Floats
     """(W, 4) x1, y1, x2, y2 of each wall."""
     gates_px: Floats
-    """(G, 4) likewise, from the left wall to the right one, in the order of travel."""
-    gates_along_m: Floats
-    """(G,) distance of each gate along the path, rising."""
+    """(G, 4) likewise, from the left wall to the right one; gate i of G stands (i + 1/2) / G of a
+    lap behind the start line."""
     path: Path
     """The centre line in the map, in the direction of travel, from the start line on."""
+    start_px: tuple[float, float, float]
+    """x, y and heading (radians, clockwise from x) on the start line."""
 
 
 def to_map(points_px: Floats) -> Floats:
@@ -81,6 +82,25 @@ def to_map(points_px: Floats) -> Floats:
         ],
         axis=-1,
     )
+
+
+def asphalt(track: Track) -> Floats:
+    """Cover the track between its walls with one triangle a wall: corners (3 walls, 2), pixels."""
+    left, right = track.walls_px[:WALLS_PER_SIDE, :2], track.walls_px[WALLS_PER_SIDE:, :2]
+    i = j = 0
+    corners: list[Floats] = []
+    while i < len(left) or j < len(right):
+        here_left, here_right = left[i % len(left)], right[j % len(right)]
+        next_left, next_right = left[(i + 1) % len(left)], right[(j + 1) % len(right)]
+        # The shorter diagonal keeps the triangles between the walls.
+        step_left = math.dist(next_left, here_right) < math.dist(here_left, next_right)
+        if j == len(right) or (i < len(left) and step_left):
+            corners += [here_left, next_left, here_right]
+            i += 1
+        else:
+            corners += [here_right, here_left, next_right]
+            j += 1
+    return np.array(corners)
 
 
 @functools.cache
@@ -108,7 +128,9 @@ def track_through(controls_px: Floats) -> Track:
     corners = _at(centre, along, np.linspace(0.0, along[-1], PATH_LEGS + 1))
     corners[-1] = corners[0]
     path = closed_path(to_map(corners))
-    return Track(walls, gates, (np.arange(GATES) + 0.5) / GATES * path.length_m, path)
+    toward = controls_px[1] - controls_px[-1]
+    start_px = (*map(float, controls_px[0]), math.atan2(toward[1], toward[0]))
+    return Track(walls, gates, path, start_px)
 
 
 def _spline(controls: Floats) -> Floats:
