@@ -100,7 +100,7 @@ def placed(
 def is_beyond(x_px: float, y_px: float, gate: NDArray[np.float64]) -> bool:
     """Say whether a point is ahead of the line through a gate (4,), in the direction of travel."""
     across_x, across_y = gate[2] - gate[0], gate[3] - gate[1]
-    return across_x * (y_px - gate[1]) - across_y * (x_px - gate[0]) < 0.0
+    return bool(across_x * (y_px - gate[1]) - across_y * (x_px - gate[0]) < 0.0)
 
 
 @compiled

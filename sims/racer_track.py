@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry import Path, closed_path
+from mcaprl.sims.geometry import Path, closed_path, project
 
 Floats = NDArray[np.float64]
 
@@ -24,11 +24,11 @@ METRES_PER_PX = 0.1
 HALF_WIDTH_PX = 41.5
 GATES = 37
 WALLS_PER_SIDE = 24
-PATH_LEGS = 4 * GATES
+PATH_LEGS = 12 * GATES
 
 CONTROL_POINTS_PX = (
     (50.0, 300.0),
-    (62.0, 425.0),
+    (58.0, 415.0),
     (115.0, 520.0),
     (225.0, 538.0),
     (308.0, 475.0),
@@ -45,9 +45,10 @@ CONTROL_POINTS_PX = (
     (640.0, 130.0),
     (520.0, 65.0),
     (395.0, 90.0),
-    (300.0, 165.0),
-    (195.0, 165.0),
-    (62.0, 195.0),
+    (310.0, 160.0),
+    (240.0, 165.0),
+    (125.0, 150.0),
+    (58.0, 205.0),
 )
 """Of the track that all know; counter-clockwise on the picture, from the start line on."""
 
@@ -87,20 +88,24 @@ def to_map(points_px: Floats) -> Floats:
 def asphalt(track: Track) -> Floats:
     """Cover the track between its walls with one triangle a wall: corners (3 walls, 2), pixels."""
     left, right = track.walls_px[:WALLS_PER_SIDE, :2], track.walls_px[WALLS_PER_SIDE:, :2]
+    left_m, right_m = _progress(track.path, left), _progress(track.path, right)
     i = j = 0
     corners: list[Floats] = []
-    while i < len(left) or j < len(right):
-        here_left, here_right = left[i % len(left)], right[j % len(right)]
-        next_left, next_right = left[(i + 1) % len(left)], right[(j + 1) % len(right)]
-        # The shorter diagonal keeps the triangles between the walls.
-        step_left = math.dist(next_left, here_right) < math.dist(here_left, next_right)
-        if j == len(right) or (i < len(left) and step_left):
-            corners += [here_left, next_left, here_right]
+    while i < WALLS_PER_SIDE or j < WALLS_PER_SIDE:
+        here_left, here_right = left[i % WALLS_PER_SIDE], right[j % WALLS_PER_SIDE]
+        if j == WALLS_PER_SIDE or (i < WALLS_PER_SIDE and left_m[i + 1] <= right_m[j + 1]):
             i += 1
+            corners += [here_left, here_right, left[i % WALLS_PER_SIDE]]
         else:
-            corners += [here_right, here_left, next_right]
             j += 1
+            corners += [here_left, here_right, right[j % WALLS_PER_SIDE]]
     return np.array(corners)
+
+
+def _progress(path: Path, corners_px: Floats) -> list[float]:
+    """Give how far along the path a wall's corners are, and the first one again a lap later."""
+    rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
+    return [0.0, *rest, path.length_m]
 
 
 @functools.cache
@@ -129,8 +134,8 @@ def track_through(controls_px: Floats) -> Track:
     corners[-1] = corners[0]
     path = closed_path(to_map(corners))
     toward = controls_px[1] - controls_px[-1]
-    start_px = (*map(float, controls_px[0]), math.atan2(toward[1], toward[0]))
-    return Track(walls, gates, path, start_px)
+    start_x, start_y = controls_px[0].tolist()
+    return Track(walls, gates, path, (start_x, start_y, math.atan2(toward[1], toward[0])))
 
 
 def _spline(controls: Floats) -> Floats:
@@ -215,7 +220,8 @@ def _random_controls(random: np.random.Generator) -> Floats:
     radii = random.uniform(0.45, 1.0, count)
     half = np.array([PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX]) / 2
     room = half - HALF_WIDTH_PX - _MARGIN_PX
-    return half + radii[:, None] * room * np.column_stack([np.cos(angles), np.sin(angles)])
+    away: Floats = radii[:, None] * room * np.column_stack([np.cos(angles), np.sin(angles)])
+    return half + away
 
 
 def _drivable(controls: Floats) -> bool:
