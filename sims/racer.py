@@ -98,7 +98,7 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
 
     A ray of d pixels to the nearest wall is observed as ln(1 + d / 10) / ln(101), which spreads out
     the lengths that matter: a twentieth of the scale (1000 - d) / 1000 holds the nearest 50 pixels,
-    but almost two fifths of this one. With it the first good laps come several times sooner.
+    but almost two fifths of this one. With it the first good laps are learnt sooner.
 
     ## Rewards
 

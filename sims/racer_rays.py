@@ -13,6 +13,8 @@ from mcaprl.sims.racer_car import Racer, corner_at
 FAR_PX = 1000.0
 """How far a ray reaches."""
 LOG_SCALE_PX = 10.0
+JOINT = 1e-9
+"""Walls are longer by this share at both ends, so that no ray slips through between two."""
 CENTRE_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
 """Directions of the rays from the car's centre; right is positive."""
 CENTRE_RAYS_RAD = tuple(math.radians(angle) for angle in CENTRE_RAYS_DEG)
@@ -72,8 +74,7 @@ def ray_length(walls: NDArray[np.float64], x_px: float, y_px: float, angle_rad: 
     nearest = 1.0
     for wall in walls:
         share, along_wall = crossing(x_px, y_px, dx, dy, wall)
-        # With its ends: a ray into the joint of two walls must not slip through.
-        if 0.0 < share < nearest and 0.0 <= along_wall <= 1.0:
+        if 0.0 < share < nearest and -JOINT <= along_wall <= 1.0 + JOINT:
             nearest = share
     return nearest * FAR_PX
 
