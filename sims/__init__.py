@@ -2,7 +2,7 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane']
+    ['lane', 'racer']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
@@ -15,7 +15,10 @@ import gymnasium as gym
 
 from mcaprl.errors import UnknownNameError, UsageError, import_extra
 
-SIMS: Final[dict[str, str]] = {"lane": "mcaprl/LaneKeeping-v0"}
+SIMS: Final[dict[str, str]] = {
+    "lane": "mcaprl/LaneKeeping-v0",
+    "racer": "mcaprl/Racer-v0",
+}
 """Short name of each sim, and the id that Gymnasium knows it by."""
 
 gym.register(
@@ -23,13 +26,19 @@ gym.register(
     entry_point="mcaprl.sims.lane:LaneKeepingEnv",
     max_episode_steps=400,
 )
+gym.register(
+    id=SIMS["racer"],
+    entry_point="mcaprl.sims.racer:RacerEnv",
+    # The classic rules' limit; the default ones end sooner by themselves.
+    max_episode_steps=10_000,
+)
 
 
 def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: `lane`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:

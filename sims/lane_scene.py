@@ -7,7 +7,6 @@ x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the 
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 
@@ -15,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims import lane_course as course
+from mcaprl.sims.car_parts import part, wheel
 from mcaprl.sims.geometry import point_at
 from mcaprl.sims.lane_rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
-from mcaprl.sims.scene import Color, Frame, Shape, yaw_rotation
+from mcaprl.sims.scene import Color, Frame, Shape, raised, yaw_rotation
 
 GRASS: Color = (0.36, 0.44, 0.33, 1.0)
 ASPHALT: Color = (0.21, 0.22, 0.24, 1.0)
@@ -44,12 +44,6 @@ TRACK_M = 1.6
 DASH_M = 3.0
 
 
-def _raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
-    """Give points of shape (..., 2) as (N, 3) at one height."""
-    flat = points_m.reshape(-1, 2)
-    return np.column_stack([flat, np.full(len(flat), z_m)])
-
-
 def _asphalt() -> NDArray[np.float64]:
     """Cover each paved cell with two triangles, (6 cells, 3)."""
     x_m, y_m, paved = course.pavement(course.RAIL_OFFSET_M)
@@ -58,7 +52,7 @@ def _asphalt() -> NDArray[np.float64]:
         low, right = (x_m[i], y_m[j]), (x_m[i + 1], y_m[j])
         left, high = (x_m[i], y_m[j + 1]), (x_m[i + 1], y_m[j + 1])
         corners += [low, right, high, low, high, left]
-    return _raised(np.array(corners), 0.0)
+    return raised(np.array(corners), 0.0)
 
 
 def _dashes() -> NDArray[np.float64]:
@@ -69,7 +63,7 @@ def _dashes() -> NDArray[np.float64]:
         forward = (end - start) / length_m
         for along_m in np.arange(DASH_M, length_m - DASH_M, 2 * DASH_M):
             pairs += [start + forward * along_m, start + forward * (along_m + DASH_M)]
-    return _raised(np.array(pairs), 0.02)
+    return raised(np.array(pairs), 0.02)
 
 
 def _road() -> list[Shape]:
@@ -88,7 +82,7 @@ def _road() -> list[Shape]:
             name="lane_borders",
             kind="segments",
             color=WHITE,
-            points=_raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02),
+            points=raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02),
             size=(0.15, 0.0, 0.0),
         ),
         Shape("centre_line", "segments", YELLOW, _dashes(), size=(0.12, 0.0, 0.0)),
@@ -112,36 +106,22 @@ def _surroundings() -> list[Shape]:
     return shapes
 
 
-def _part(
-    name: str, color: Color, size: tuple[float, float, float], at: tuple[float, float, float]
-) -> Shape:
-    return Shape(f"car_{name}", "box", color, size=size, position=at, frame="car")
-
-
 def _wheel(name: str, forward_m: float, left_m: float) -> Shape:
-    """Build a wheel from triangles: the rolling face and two sides of a 16-gon."""
-    turn = np.linspace(0.0, 2 * math.pi, 17)
-    rim = WHEEL_RADIUS_M * np.column_stack([np.cos(turn), np.zeros(17), np.sin(turn)])
-    half = np.array([0.0, WHEEL_WIDTH_M / 2, 0.0])
-    triangles = []
-    for a, b in itertools.pairwise(rim):
-        triangles += [a - half, b - half, b + half, a - half, b + half, a + half]
-        triangles += [-half, b - half, a - half, half, a + half, b + half]
-    hub = np.array([forward_m, left_m, WHEEL_RADIUS_M])
-    return Shape(f"car_wheel_{name}", "triangles", RUBBER, hub + np.array(triangles), frame="car")
+    hub = (forward_m, left_m, WHEEL_RADIUS_M)
+    return wheel(name, RUBBER, hub, WHEEL_RADIUS_M, WHEEL_WIDTH_M)
 
 
 def _car() -> list[Shape]:
     axle_m, side_m = WHEELBASE_M / 2, TRACK_M / 2
     return [
-        _part("body", PAINT, (4.3, 1.75, 0.5), (0.05, 0.0, 0.58)),
-        _part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
-        _part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
-        _part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
-        _part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
-        _part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
-        _part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
-        _part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
+        part("body", PAINT, (4.3, 1.75, 0.5), (0.05, 0.0, 0.58)),
+        part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
+        part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
+        part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
+        part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
+        part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
+        part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
+        part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
         _wheel("front_left", axle_m, side_m),
         _wheel("front_right", axle_m, -side_m),
         _wheel("rear_left", -axle_m, side_m),
@@ -170,9 +150,9 @@ def moving_shapes(car: Car, trail_m: Sequence[tuple[float, float]]) -> tuple[Sha
     axle = np.array([WHEELBASE_M / 2, 0.0, 1.0])
     tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
     return (
-        Shape("trail", "line", TRAIL, _raised(trail, 0.06), size=(0.25, 0.0, 0.0)),
-        Shape("lookahead", "points", LOOK, _raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
-        Shape("offset", "line", LOOK, _raised(link, 0.08), size=(0.12, 0.0, 0.0)),
+        Shape("trail", "line", TRAIL, raised(trail, 0.06), size=(0.25, 0.0, 0.0)),
+        Shape("lookahead", "points", LOOK, raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
+        Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
         Shape("steering", "arrow", LOOK, np.array([axle, tip]), size=(0.12, 0.3, 0.4), frame="car"),
         Shape(
             name="speed",

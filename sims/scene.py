@@ -73,3 +73,9 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
     (0.0, 0.0, 0.0, 1.0)
     """
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
+    """Give points of shape (..., 2) as (N, 3) at one height."""
+    flat = points_m.reshape(-1, 2)
+    return np.column_stack([flat, np.full(len(flat), z_m)])

@@ -6,13 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from mcaprl.sims import make_sim
 from mcaprl.sims.lane import LaneKeepingEnv
-from mcaprl.sims.scene import Frame, Shape
-
-DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "arrow": 2}
+from tests.sim_shapes import rotated
 
 
 @pytest.fixture
@@ -22,36 +19,6 @@ def sim() -> LaneKeepingEnv:
     assert isinstance(made, LaneKeepingEnv)
     made.reset(options={"pose": (131.0, -60.0, -math.pi / 2, 6.0)})
     return made
-
-
-def rotated(frame: Frame, vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Turn a vector of a frame into its parent: v + 2 u x (u x v + w v)."""
-    axis, w = np.array(frame.rotation[:3]), frame.rotation[3]
-    cross = np.cross(axis, vector) + w * np.array(vector)
-    turned: NDArray[np.float64] = np.array(vector) + 2 * np.cross(axis, cross)
-    return turned
-
-
-def check_shape(shape: Shape) -> None:
-    assert all(0.0 <= part <= 1.0 for part in shape.color)
-    assert shape.points.dtype == np.float64
-    assert shape.points.shape == (len(shape.points), 3)
-    assert np.isfinite(shape.points).all()
-    assert shape.frame in ("map", "car")
-    if shape.kind in DRAWN_BY_POINTS:
-        assert len(shape.points) > 0
-        assert len(shape.points) % DRAWN_BY_POINTS[shape.kind] == 0
-    else:
-        assert len(shape.points) == 0
-        assert min(shape.size) > 0.0
-
-
-def test_every_shape_can_be_drawn(sim: LaneKeepingEnv) -> None:
-    sim.step(1)
-    shapes = [*sim.static_scene(), *sim.scene()]
-    for shape in shapes:
-        check_shape(shape)
-    assert len({shape.name for shape in shapes}) == len(shapes)
 
 
 def test_the_moving_shapes_keep_their_names_and_stay_few(sim: LaneKeepingEnv) -> None:
