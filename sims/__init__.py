@@ -2,7 +2,7 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane']
+    ['lane', 'powerline']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
@@ -15,12 +15,20 @@ import gymnasium as gym
 
 from mcaprl.errors import UnknownNameError, UsageError, import_extra
 
-SIMS: Final[dict[str, str]] = {"lane": "mcaprl/LaneKeeping-v0"}
+SIMS: Final[dict[str, str]] = {
+    "lane": "mcaprl/LaneKeeping-v0",
+    "powerline": "mcaprl/Powerline-v0",
+}
 """Short name of each sim, and the id that Gymnasium knows it by."""
 
 gym.register(
     id=SIMS["lane"],
     entry_point="mcaprl.sims.lane:LaneKeepingEnv",
+    max_episode_steps=400,
+)
+gym.register(
+    id=SIMS["powerline"],
+    entry_point="mcaprl.sims.powerline:PowerlineEnv",
     max_episode_steps=400,
 )
 
@@ -29,7 +37,7 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: `lane`, `powerline`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:

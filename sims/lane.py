@@ -12,9 +12,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.errors import UsageError
 from mcaprl.sims import lane_scene
+from mcaprl.sims.arguments import check_action, check_name, read_pose
 from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.camera import level_axes
 from mcaprl.sims.depth import DepthCamera, encode_depth
 from mcaprl.sims.geometry import leg_at, point_at, project
 from mcaprl.sims.lane_camera import lane_camera
@@ -54,6 +56,7 @@ CLEAR_AFTER_CORNER_M = 2.0
 CLEAR_BEFORE_CORNER_M = 8.0
 """Random starts keep clear of corners: nearer than that, some cars cannot turn in time."""
 TRAIL_LENGTH = 40
+POSE_NAMES = ("x_m", "y_m", "yaw_rad", "speed_m_s")
 
 
 class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
@@ -150,11 +153,11 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
         Raises:
             UnknownNameError: an argument has a value that is not in its list.
         """
-        _check_name("rules", rules, RULES)
-        _check_name("observation", observation, OBSERVATIONS)
-        _check_name("start", start, STARTS)
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("start", start, STARTS)
         if render_mode is not None:
-            _check_name("render_mode", render_mode, RENDER_MODES)
+            check_name("render_mode", render_mode, RENDER_MODES)
         self.render_mode = self._render_mode = render_mode
         self.observation_names = OBSERVATION_NAMES if observation == "state" else ()
         self.action_space = spaces.Discrete(len(ACTION_MEANINGS))
@@ -207,8 +210,7 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
         Raises:
             UsageError: the action is not 0 to 5.
         """
-        if not 0 <= action < len(ACTION_MEANINGS):
-            raise UsageError(f"action {action} does not exist: 0 to {len(ACTION_MEANINGS) - 1} do")
+        check_action(action, len(ACTION_MEANINGS))
         self._actions[0] = action
         step_cars(self._cars, self._actions, self._rewards, self._ends, self._observations)
         self._car = Car._make(self._cars[0].tolist())
@@ -290,7 +292,7 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
                 car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad),
                 CAMERA_HEIGHT_M,
             )
-            self._depth_m = self._camera.image_m(position, car.yaw_rad)
+            self._depth_m = self._camera.image_m(position, level_axes(car.yaw_rad))
         return self._depth_m
 
     def static_scene(self) -> Sequence[Shape]:
@@ -327,24 +329,9 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
             self._view = None
 
 
-def _check_name(argument: str, value: str, allowed: Sequence[str]) -> None:
-    if value not in allowed:
-        raise UnknownNameError(argument, str(value), allowed)
-
-
 def _car_from(options: dict[str, Any]) -> Car:
     """Read a start from the options of `reset`."""
-    if set(options) != {"pose"}:
-        raise UsageError(f"reset knows only the option 'pose', not {sorted(set(options))}")
-    try:
-        pose = np.asarray(options["pose"], dtype=np.float64)
-    except (TypeError, ValueError):
-        pose = np.full(1, math.nan)
-    if pose.shape not in ((3,), (4,)) or not np.isfinite(pose).all():
-        raise UsageError(
-            f"pose {options['pose']!r} is not (x_m, y_m, yaw_rad) or (x_m, y_m, yaw_rad, speed_m_s)"
-        )
-    x_m, y_m, yaw_rad, speed_m_s = [*pose.tolist(), 0.0][:4]
+    x_m, y_m, yaw_rad, speed_m_s = read_pose(options, POSE_NAMES, least=3)
     if not 0.0 <= speed_m_s <= MAX_SPEED_M_S:
         raise UsageError(f"a pose's speed is 0 to {MAX_SPEED_M_S} m/s, not {speed_m_s}")
     place = project(COURSE, x_m, y_m, 0.0, COURSE.length_m)
