@@ -60,7 +60,6 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
         pose = np.full(1, math.nan)
     if pose.shape not in ((least,), (len(names),)) or not np.isfinite(pose).all():
         raise UsageError(
-            f"pose {options['pose']!r} is not ({', '.join(names[:least])})"
-            f" or ({', '.join(names)})"
+            f"pose {options['pose']!r} is not ({', '.join(names[:least])}) or ({', '.join(names)})"
         )
     return [*pose.tolist(), *[0.0] * (len(names) - len(pose))]

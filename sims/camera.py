@@ -239,9 +239,7 @@ def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
     width, length = inverse_z.shape
     start, end = ends[first, main], ends[last, main]
     across, across_end = ends[first, 1 - main], ends[last, 1 - main]
-    for step in range(
-        math.ceil(max(0.0, start - 0.5)), math.ceil(min(float(length), end - 0.5))
-    ):
+    for step in range(math.ceil(max(0.0, start - 0.5)), math.ceil(min(float(length), end - 0.5))):
         share = (step + 0.5 - start) / (end - start)
         place = math.floor(across + share * (across_end - across))
         value = ends[first, 2] + share * (ends[last, 2] - ends[first, 2])

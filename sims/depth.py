@@ -146,9 +146,7 @@ class DepthCamera:
         inverse *= self._nearness
         return inverse
 
-    def image_m(
-        self, position_m: tuple[float, float, float], axes: Floats
-    ) -> NDArray[np.float32]:
+    def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
         """Draw the small picture: (h, w) metres along each ray, infinity where nothing is hit."""
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)

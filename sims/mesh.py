@@ -46,10 +46,11 @@ def frustum_mesh(
     With a top of 0 it is a pyramid, (4, 3, 3).
     """
     height = _CORNERS[:, 2:] + 0.5
-    sides = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)
-    corners: NDArray[np.float64] = np.array(foot_m) + np.hstack([sides, height_m * height])
+    level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)
+    corners: NDArray[np.float64] = np.array(foot_m) + np.hstack([level, height_m * height])
     triangles: NDArray[np.float64] = corners[_TRIANGLES]
     on_base = np.all(triangles[:, :, 2] == foot_m[2], axis=1)
-    flat = np.all(np.cross(*(triangles[:, i] - triangles[:, 0] for i in (1, 2))) == 0.0, axis=1)
+    sides = triangles[:, 1:] - triangles[:, :1]
+    flat = np.all(np.cross(sides[:, 0], sides[:, 1]) == 0.0, axis=1)
     seen: NDArray[np.float64] = triangles[~(on_base | flat)]
     return seen

@@ -256,9 +256,7 @@ class PowerlineEnv(gym.Env[Any, Any]):
         self._trail_m.clear()
         return self._seen(), self._info()
 
-    def step(
-        self, action: int | np.integer[Any]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Fly on for a decision: 0.5 s, or 5 s with classic rules.
 
         Raises:

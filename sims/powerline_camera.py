@@ -48,7 +48,7 @@ GROUND_X_M = np.concatenate(
     [np.linspace(-180, -6, 7), np.linspace(0, 54, 10), np.linspace(60, 720, 31)]
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
-"""NED grid of the ground's mesh: closer on the first leg's steep hill, and 100 m beyond the line."""
+"""NED grid of the ground's mesh: closest on the steep hill, and 100 m beyond the line."""
 TREE_SIDE_M = 0.45
 """Of a fir's height."""
 MAST_FOOT_M = 3.0
@@ -107,6 +107,14 @@ class DroneCamera:
 
     def image_m(self, drone: Drone) -> NDArray[np.float32]:
         """Give (84, 84) distances along each ray, metres; inf where nothing is."""
+        return self._camera.image_m(*self.pose(drone))
+
+    def without_wires(self, drone: Drone) -> Floats:
+        """Give the whole picture, (144, 256) 1/m along each ray, without conductors."""
+        return self._camera.inverse_distance(*self.pose(drone))
+
+    def pose(self, drone: Drone) -> tuple[tuple[float, float, float], Floats]:
+        """Give where the camera is, and its (3, 3) axes as rows, in ROS axes."""
         at = plus(drone.position_m, rotate(drone.attitude, CAMERA_AT_M[self._view]))
         axes = [rotate(drone.attitude, axis) for axis in CAMERA_AXES[self._view]]
-        return self._camera.image_m((at.x, -at.y, -at.z), to_ros(np.array(axes)))
+        return (at.x, -at.y, -at.z), to_ros(np.array(axes))

@@ -81,13 +81,16 @@ class PowerlinePilot:
         """Take over `sim`."""
         self._sim = sim
 
-    def act(self, observations: NDArray[np.generic] | dict[str, NDArray[np.generic]]) -> NDArray[np.int64]:
+    def act(
+        self, observations: NDArray[np.generic] | dict[str, NDArray[np.generic]]
+    ) -> NDArray[np.int64]:
         """Give the action, shape (1,), for the drone as it is now.
 
         Raises:
             ValueError: there are observations of more than one environment.
         """
-        count = len(next(iter(observations.values()))) if isinstance(observations, dict) else len(observations)
+        seen = observations
+        count = len(next(iter(seen.values())) if isinstance(seen, dict) else seen)
         if count != 1:
             raise ValueError(f"one pilot flies one environment, not {count}")
         sim = self._sim

@@ -20,12 +20,11 @@ from mcaprl.sims.powerline_world import (
     Place,
     ground_height,
     nearest_on_line,
-    point_on_line,
     tower_distance,
     wire_distance,
 )
 from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
-from mcaprl.sims.vectors import Vector, minus, norm, plus, times
+from mcaprl.sims.vectors import Vector, norm, plus, times
 
 ACTION_MEANINGS = (
     "faster north (+x)",
@@ -274,9 +273,7 @@ def step_flights(
     for i in range(len(flights)):
         flight = flight_at(flights[i])
         gust = blown(flight.gust_m_s, gust_m_s, noise[i])
-        before = Flight(
-            flight.drone, flight.command_m_s, flight.wind_m_s, gust, flight.furthest_m
-        )
+        before = Flight(flight.drone, flight.command_m_s, flight.wind_m_s, gust, flight.furthest_m)
         after, ends[i] = decide(plant, before, actions[i])
         rewards[i] = reward_of(before, after, ends[i])
         observe(after, observations[i])

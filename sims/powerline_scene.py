@@ -8,6 +8,7 @@ The drone is drawn five times its size, so that it can be seen.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -80,7 +81,7 @@ def _lattice(tower: world.Tower) -> Floats:
         ring = np.column_stack([side_m * corners, np.full(4, share * height_m)])
         rings.append(foot + ring)
     pairs = []
-    for lower, upper in zip(rings[:-1], rings[1:], strict=True):
+    for lower, upper in itertools.pairwise(rings):
         for i in range(4):
             j = (i + 1) % 4
             pairs += [lower[i], upper[i], lower[i], upper[j], upper[i], upper[j]]

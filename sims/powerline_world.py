@@ -141,7 +141,7 @@ def ground_height(x_m: float, y_m: float) -> float:
     start, end = POINTS_M[span], POINTS_M[span + 1]
     share = min(max((x_m - start[0]) / (end[0] - start[0]), 0.0), 1.0)
     low, high = _foot_height(span), _foot_height(span + 1)
-    base_m = low + (high - low) * share * share * (3.0 - 2.0 * share)
+    base_m: float = low + (high - low) * share * share * (3.0 - 2.0 * share)
     beside_m = y_m - (start[1] + share * (end[1] - start[1]))
     away = 1.0 - math.exp(-((beside_m / 60.0) ** 2))
     hills_m = 9.0 * math.sin(x_m / 47.0 + 1.0) * math.cos(y_m / 39.0) + 4.0 * math.sin(y_m / 61.0)
@@ -150,7 +150,8 @@ def ground_height(x_m: float, y_m: float) -> float:
 
 @compiled
 def _foot_height(tower: int) -> float:
-    return -POINTS_M[tower, 2] - BELOW_LINE_M - ARM_BELOW_WIRES_M - TOWER_HEIGHTS_M[tower]
+    arm_m: float = -POINTS_M[tower, 2] - BELOW_LINE_M - ARM_BELOW_WIRES_M
+    return arm_m - TOWER_HEIGHTS_M[tower]
 
 
 @compiled
@@ -167,9 +168,7 @@ def wire_distance(position_m: Vector) -> float:
         along = (position_m.x - start[0]) * ux + (position_m.y - start[1]) * uy
         middle = math.floor(min(max(along / (ux * ux + uy * uy), 0.0), 1.0) * CHORDS)
         for chord in range(max(0, middle - 2), min(CHORDS, middle + 3)):
-            chord_m = distance_to_piece(
-                position_m, WIRES_M[wire, chord], WIRES_M[wire, chord + 1]
-            )
+            chord_m = distance_to_piece(position_m, WIRES_M[wire, chord], WIRES_M[wire, chord + 1])
             nearest_m = min(nearest_m, chord_m)
     return nearest_m
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -73,7 +74,7 @@ def test_the_distance_is_the_published_formula() -> None:
     for place in random.uniform([-50, -150, -90], [600, 200, 0], size=(50, 3)):
         published = min(
             np.linalg.norm(np.cross(place - a, place - b)) / np.linalg.norm(a - b)
-            for a, b in zip(POINTS_M[:-1], POINTS_M[1:], strict=True)
+            for a, b in itertools.pairwise(POINTS_M)
         )
         assert classic_distance(Vector(*place.tolist())) == pytest.approx(published)
 

@@ -58,8 +58,8 @@ def test_it_flies_on_pictures_too_and_one_drone_at_a_time() -> None:
     env = make_sim("powerline", observation="depth")
     observation, _ = env.reset(seed=0)
     pilot = make_pilot(env)
-    one = {key: value[np.newaxis] for key, value in observation.items()}
-    assert pilot.act(one).dtype == np.int64  # type: ignore[arg-type]
+    one: Any = {key: value[np.newaxis] for key, value in observation.items()}
+    assert pilot.act(one).dtype == np.int64
     two = np.zeros((2, 18))
     with pytest.raises(ValueError, match="not 2"):
         pilot.act(two)

@@ -97,9 +97,7 @@ def test_the_distance_to_wires_is_the_smallest_of_all_pieces(
     chord = int(place)
     start, end = WIRES_M[wire, chord], WIRES_M[wire, chord + 1]
     position = Vector(*(start + (place - chord) * (end - start) + away).tolist())
-    pieces = [
-        distance_to_piece(position, one[i], one[i + 1]) for one in WIRES_M for i in range(16)
-    ]
+    pieces = [distance_to_piece(position, one[i], one[i + 1]) for one in WIRES_M for i in range(16)]
     assert wire_distance(position) == min(pieces)
 
 
