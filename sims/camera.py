@@ -209,13 +209,8 @@ def draw_wires(
                 ends[i, k] = 0.0
                 for m in range(3):
                     ends[i, k] += axes[k, m] * (wires[wire, i, m] - eye_m[m])
-        if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
+        if not _cut_near(ends):
             continue
-        for i in range(2):
-            if ends[i, 2] < _NEAR_M:
-                share = (_NEAR_M - ends[i, 2]) / (ends[1 - i, 2] - ends[i, 2])
-                for k in range(3):
-                    ends[i, k] += share * (ends[1 - i, k] - ends[i, k])
         for i in range(2):
             ends[i, 2] = 1.0 / ends[i, 2]
             ends[i, 0] = 0.5 * inverse_z.shape[1] + focal_x_px * ends[i, 0] * ends[i, 2]
@@ -224,6 +219,19 @@ def draw_wires(
             _trace(ends, 0, inverse_z)
         else:
             _trace(ends, 1, inverse_z.T)
+
+
+@compiled
+def _cut_near(ends: Floats) -> bool:
+    """Keep the part of a wire before the near plane; say whether there is any."""
+    if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
+        return False
+    for i in range(2):
+        if ends[i, 2] < _NEAR_M:
+            share = (_NEAR_M - ends[i, 2]) / (ends[1 - i, 2] - ends[i, 2])
+            for k in range(3):
+                ends[i, k] += share * (ends[1 - i, k] - ends[i, k])
+    return True
 
 
 @compiled

@@ -11,16 +11,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
 from mcaprl.sims import powerline_scene
-from mcaprl.sims.arguments import check_action, check_name, check_range, read_pose
+from mcaprl.sims.arguments import check_action, check_name, check_range
 from mcaprl.sims.depth import encode_depth, encode_nearness
 from mcaprl.sims.powerline_camera import CAMERAS, IMAGE_SHAPE, DroneCamera
 from mcaprl.sims.powerline_classic import (
     CLASSIC_DECISION_S,
     CLASSIC_FIRST_COMMAND_M_S,
     CLASSIC_VELOCITY_STEP_M_S,
-    classic_end,
     step_classic,
 )
 from mcaprl.sims.powerline_rules import (
@@ -29,31 +27,20 @@ from mcaprl.sims.powerline_rules import (
     FIRST_COMMAND_M_S,
     FLIGHT_SIZE,
     FLYING,
-    MAX_COMMAND_M_S,
     OBSERVATION_LIMIT,
     OBSERVATION_NAMES,
     REASONS,
     VELOCITY_STEP_M_S,
     Flight,
-    approach,
-    begin,
-    collides,
-    end_of,
     flight_at,
     observe,
     step_flights,
     store_flight,
 )
-from mcaprl.sims.powerline_world import (
-    LENGTH_M,
-    POINTS_M,
-    TANGENTS,
-    nearest_on_line,
-    point_on_line,
-)
+from mcaprl.sims.powerline_start import draw_wind, flight_from, start_anywhere, start_on_line
 from mcaprl.sims.quadrotor import PLANTS
 from mcaprl.sims.scene import Frame, Shape
-from mcaprl.sims.vectors import Vector, norm
+from mcaprl.sims.vectors import Vector
 
 if TYPE_CHECKING:
     from mcaprl.sims.powerline_view import PowerlineView
@@ -63,11 +50,6 @@ OBSERVATIONS = ("state", "depth")
 STARTS = ("anywhere", "line")
 RENDER_MODES = ("human", "rgb_array")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / DECISION_S)}
-POSE_NAMES = ("x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s")
-START_NOISE_M = 0.2
-LAST_START_M = 20.0
-"""Random starts are at least this far from the line's end."""
-MAX_START_SPEED_M_S = 5.0
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 TRAIL_LENGTH = 60
@@ -160,6 +142,9 @@ class PowerlineEnv(gym.Env[Any, Any]):
     - In 5 s, nothing can be corrected: 25 m at 5 m/s, three and a half times the width allowed.
     - The picture's code spends half of its values on 1 to 2 m.
 
+    Ours are the world, the point's lag, and the picture's averaging where the published one
+    interpolates. A flight stops where it collides.
+
     ## Arguments
 
     - `rules`: `"default"` or `"classic"`.
@@ -196,17 +181,16 @@ class PowerlineEnv(gym.Env[Any, Any]):
             UnknownNameError: an argument has a value that is not in its list.
             UsageError: a number is outside its range, or the classic rules are to have gusts.
         """
+        classic = rules == "classic"
+        plant = plant or ("point" if classic else "quad")
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
         check_name("camera", camera, CAMERAS)
         check_name("start", start, STARTS)
-        classic = rules == "classic"
-        plant = plant or ("point" if classic else "quad")
         check_name("plant", plant, PLANTS)
+        check_name("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
         check_range("wind_m_s", wind_m_s, 0.0, MAX_WIND_M_S)
         check_range("gust_m_s", gust_m_s, 0.0, 0.0 if classic else MAX_GUST_M_S)
-        if render_mode is not None:
-            check_name("render_mode", render_mode, RENDER_MODES)
         self.rules = rules
         self.velocity_step_m_s = CLASSIC_VELOCITY_STEP_M_S if classic else VELOCITY_STEP_M_S
         self.step_duration_s = CLASSIC_DECISION_S if classic else DECISION_S
@@ -216,7 +200,7 @@ class PowerlineEnv(gym.Env[Any, Any]):
         self.observation_space = _space(observation, classic)
         self._classic = classic
         self._plant = PLANTS.index(plant)
-        self._starts_on_line = classic or start == "line"
+        self._start = start
         self._wind_m_s, self._gust_m_s = wind_m_s, gust_m_s
         self._shows_state = observation == "state"
         self._row = np.zeros((1, FLIGHT_SIZE))
@@ -247,8 +231,17 @@ class PowerlineEnv(gym.Env[Any, Any]):
             UsageError: `options` has an unknown key, or a pose that is not free and near the line.
         """
         super().reset(seed=seed)
-        wind = self._draw_wind()
-        self._flight = self._flight_from(options, wind) if options else self._start(wind)
+        wind = draw_wind(self.np_random, self._wind_m_s)
+        if options:
+            self._flight = flight_from(options, wind, self._classic)
+        elif self._classic:
+            self._flight = start_on_line(
+                self.np_random, self._plant, CLASSIC_FIRST_COMMAND_M_S, wind
+            )
+        elif self._start == "line" or self.np_random.random() < 0.5:
+            self._flight = start_on_line(self.np_random, self._plant, FIRST_COMMAND_M_S, wind)
+        else:
+            self._flight = start_anywhere(self.np_random, wind)
         store_flight(self._flight, self._row[0])
         self._rewards[0] = 0.0
         observe(self._flight, self._observations[0])
@@ -285,47 +278,6 @@ class PowerlineEnv(gym.Env[Any, Any]):
         if end != FLYING:
             info["reason"] = REASONS[end]
         return self._seen(), reward, end != FLYING, False, info
-
-    def _draw_wind(self) -> Vector:
-        """Draw the episode's steady wind: level, from any side."""
-        if not self._wind_m_s:
-            return Vector(0.0, 0.0, 0.0)
-        speed_m_s = self.np_random.uniform(0.0, self._wind_m_s)
-        toward_rad = self.np_random.uniform(-np.pi, np.pi)
-        return Vector(speed_m_s * np.cos(toward_rad), speed_m_s * np.sin(toward_rad), 0.0)
-
-    def _start(self, wind: Vector) -> Flight:
-        """Draw a start."""
-        if self._starts_on_line or self.np_random.random() < 0.5:
-            noise = self.np_random.uniform(-START_NOISE_M, START_NOISE_M, 3)
-            first = CLASSIC_FIRST_COMMAND_M_S if self._classic else FIRST_COMMAND_M_S
-            position = Vector(*(POINTS_M[0] + noise).tolist())
-            return approach(self._plant, position, Vector(*first), wind)
-        along_m = self.np_random.uniform(0.0, LENGTH_M - LAST_START_M)
-        on_line = np.array(point_on_line(along_m))
-        place = nearest_on_line(Vector(*on_line.tolist()))
-        speed_m_s = self.np_random.uniform(0.0, MAX_START_SPEED_M_S)
-        steps = np.rint(speed_m_s * TANGENTS[place.leg] / VELOCITY_STEP_M_S)
-        noise = self.np_random.uniform(-1.0, 1.0, 3) / np.sqrt(3.0)
-        position = Vector(*(on_line + noise).tolist())
-        return begin(position, Vector(*(VELOCITY_STEP_M_S * steps).tolist()), wind)
-
-    def _flight_from(self, options: dict[str, Any], wind: Vector) -> Flight:
-        """Read a start from the options of `reset`."""
-        pose = read_pose(options, POSE_NAMES, least=3)
-        position, velocity = Vector(*pose[:3]), Vector(*pose[3:])
-        check_range("a pose's speed in m/s", norm(velocity), 0.0, MAX_COMMAND_M_S)
-        place = nearest_on_line(position)
-        if self._classic:
-            end = classic_end(position, collides(position))
-        else:
-            end = end_of(position, place)
-        if end != FLYING:
-            raise UsageError(
-                f"pose {tuple(pose[:3])} ends the episode at once: {REASONS[end]},"
-                f" {place.distance_m:.1f} m from the line (z points down)"
-            )
-        return begin(position, velocity, wind)
 
     def _seen(self) -> Any:
         """Give the observation, and take note of the place for what is drawn."""
