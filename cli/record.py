@@ -104,7 +104,7 @@ def record(
 ) -> None:
     """Record episodes of SIM into an MCAP file.
 
-    SIM is lane, or any Gymnasium id. Each finished episode is on disk at once.
+    SIM is lane, powerline, racer, or any Gymnasium id. Each finished episode is on disk at once.
     """
     if (episodes is None) == (steps is None):
         raise UsageError("record needs --episodes N or --steps N, one of the two")

@@ -1,7 +1,7 @@
 """Writes what the docs show and nobody should type: `make docs`.
 
 docs/cli.md                    the commands and their options, from the program itself
-docs/images/lane-frames.png    what the lane sim looks like, from above and to its depth camera
+docs/images/SIM-frames.png     what the sims look like, from above and to their depth cameras
 docs/images/comparison.png     from the last `make demo`, if there was one
 docs/images/trajectories.png   likewise
 """
@@ -13,20 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import click
-import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
-import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl.cli import cli
+from mcaprl.sims import make_sim
 from mcaprl.sims.pilots import make_pilot
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
 DEMO_REPORT = DOCS.parent / "demo" / "report"
-# Decisions of the pilot between two columns of the contact sheet, and where it starts.
-FRAME_EVERY, FRAMES = 30, 6
-START = (110.0, 1.0, 0.0, 10.0)
+# Columns of a contact sheet, and decisions of each sim's pilot between two of them.
+FRAMES = 6
+FRAME_EVERY = {"lane": 30, "powerline": 18, "racer": 25}
 
 
 def command_reference() -> str:
@@ -42,20 +41,30 @@ def command_reference() -> str:
     return "\n".join(parts)
 
 
-def lane_frames() -> Figure:
-    """A contact sheet: the pilot's drive from above, and what the depth camera sees."""
-    env = gym.make("mcaprl/LaneKeeping-v0", render_mode="rgb_array", observation="depth")
-    observation, _ = env.reset(seed=1, options={"pose": START})
+def frames_of(sim: str, every: int, **arguments: Any) -> Figure:
+    """A contact sheet of the pilot's drive: from above, and what the depth camera sees, if any.
+
+    Args:
+        sim: short name.
+        every: decisions between two columns.
+        **arguments: of the sim.
+    """
+    env = make_sim(sim, render_mode="rgb_array", **arguments)
+    observation, _ = env.reset(seed=1)
     pilot = make_pilot(env)
-    figure = Figure(figsize=(2.4 * FRAMES, 5.2), dpi=110)
-    grid = figure.subplots(2, FRAMES)
+    has_depth = hasattr(env.unwrapped, "depth_image_m")
+    figure = Figure(figsize=(2.4 * FRAMES, 5.2 if has_depth else 2.2), dpi=110)
+    grid = figure.subplots(1 + has_depth, FRAMES, squeeze=False)
+    sim_: Any = env.unwrapped
     for column in range(FRAMES):
-        telemetry = env.unwrapped.telemetry()  # type: ignore[attr-defined]
-        title = f"{column * FRAME_EVERY * 0.25:.0f} s, {telemetry['speed_m_s']:.0f} m/s"
+        seconds = column * every * sim_.step_duration_s
+        title = f"{seconds:.0f} s, {sim_.telemetry()['speed_m_s']:.0f} m/s"
         _show(grid[0, column], np.asarray(env.render()), title)
-        _show(grid[1, column], observation[:, :, 0], "")
-        for _ in range(FRAME_EVERY):
-            observation = env.step(pilot.act(observation[None])[0])[0]
+        if has_depth:
+            depth_m = sim_.depth_image_m()
+            _show(grid[1, column], np.log(np.minimum(depth_m, 200.0)), "")
+        for _ in range(every):
+            observation = env.step(pilot.act(np.asarray(observation)[None])[0])[0]
     env.close()
     figure.tight_layout()
     return figure
@@ -75,7 +84,8 @@ def main() -> None:
     """Write all of it."""
     IMAGES.mkdir(exist_ok=True)
     (DOCS / "cli.md").write_text(command_reference())
-    lane_frames().savefig(IMAGES / "lane-frames.png", facecolor="white")
+    for sim, every in FRAME_EVERY.items():
+        frames_of(sim, every).savefig(IMAGES / f"{sim}-frames.png", facecolor="white")
     for name in ("comparison.png", "trajectories.png"):
         if (DEMO_REPORT / name).exists():
             shutil.copy(DEMO_REPORT / name, IMAGES / name)

@@ -17,6 +17,9 @@ LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 # Observations of more numbers than this get a series for each of the first ones only.
 MAX_SERIES = 24
+# Of the telemetry, what says how well an agent follows its course.
+PLOTTED_ENDINGS = ("speed_m_s", "offset_m")
+MAX_PLOTTED = 4
 # The depth image's colours span this much, millimetres.
 DEPTH_RANGE_MM = (0, 50_000)
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
@@ -94,7 +97,7 @@ def _plots(
         series["q_values"] = {
             f"Q {name}": f"{VALUES_TOPIC}.q[{index}]" for index, name in enumerate(names)
         }
-    shown = [name for name in telemetry_names if name in ("speed_m_s", "lateral_offset_m")]
+    shown = [name for name in telemetry_names if name.endswith(PLOTTED_ENDINGS)][:MAX_PLOTTED]
     for name in shown:
         series[name] = {name: f"/telemetry.{name}"}
     if not shown:

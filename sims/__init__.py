@@ -2,7 +2,7 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane', 'racer']
+    ['lane', 'powerline', 'racer']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
@@ -18,6 +18,7 @@ from mcaprl.errors import UnknownNameError, UsageError, import_extra
 SIMS: Final[dict[str, str]] = {
     "lane": "mcaprl/LaneKeeping-v0",
     "racer": "mcaprl/Racer-v0",
+    "powerline": "mcaprl/Powerline-v0",
 }
 """Short name of each sim, and the id that Gymnasium knows it by."""
 
@@ -32,13 +33,18 @@ gym.register(
     # The classic rules' limit; the default ones end sooner by themselves.
     max_episode_steps=10_000,
 )
+gym.register(
+    id=SIMS["powerline"],
+    entry_point="mcaprl.sims.powerline:PowerlineEnv",
+    max_episode_steps=400,
+)
 
 
 def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: `lane`, `powerline`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What every sim asks of the arguments it is given."""
+"""Checks of what a user hands to a sim; each refusal says what is allowed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 
 
 class Pose(NamedTuple):
-    """Where a caller wants a vehicle to start, in the map."""
+    """Where a caller wants a vehicle on the ground to start, in the map."""
 
     x_m: float
     y_m: float
@@ -21,35 +21,45 @@ class Pose(NamedTuple):
 
 
 def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
-    """Make sure that an argument has one of the values that it may have.
+    """Refuse a value that is not in the list.
 
     Raises:
-        UnknownNameError: it has another one; the message lists them.
+        UnknownNameError: it is not; the message lists those that are.
     """
     if value not in allowed:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
 
 
-def check_action(action: int | np.integer[Any], count: int) -> None:
-    """Make sure that there is such an action.
+def check_range(argument: str, value: float, low: float, high: float) -> None:
+    """Refuse a number outside [low, high].
 
     Raises:
-        UsageError: it is not 0 to `count` - 1.
+        UsageError: it is outside, or no number.
+    """
+    if not low <= value <= high:
+        raise UsageError(f"{argument} is {low:g} to {high:g}, not {value}")
+
+
+def check_action(action: int | np.integer[Any], count: int) -> None:
+    """Refuse an action that is not 0 to count - 1.
+
+    Raises:
+        UsageError: it is not.
     """
     if not 0 <= action < count:
         raise UsageError(f"action {action} does not exist: 0 to {count - 1} do")
 
 
-def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -> Pose:
-    """Read a start from the options of `reset`.
+def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:
+    """Read the one option of `reset`, `pose`.
 
     Args:
-        options: `{"pose": (x_m, y_m, yaw_rad)}`; a fourth number is the speed in m/s, 0 if missing.
-        slowest_m_s: a vehicle can be.
-        fastest_m_s: a vehicle can be.
+        options: of `reset`.
+        names: of all the numbers that a pose can have, with units.
+        least: how many it must have; those left out are 0.
 
     Raises:
-        UsageError: there is another key, or no such pose.
+        UsageError: there is another option, or the pose is not so many finite numbers.
     """
     if set(options) != {"pose"}:
         raise UsageError(f"reset knows only the option 'pose', not {sorted(set(options))}")
@@ -57,11 +67,19 @@ def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -
         pose = np.asarray(options["pose"], dtype=np.float64)
     except (TypeError, ValueError):
         pose = np.full(1, math.nan)
-    if pose.shape not in ((3,), (4,)) or not np.isfinite(pose).all():
+    if pose.shape not in ((least,), (len(names),)) or not np.isfinite(pose).all():
         raise UsageError(
-            f"pose {options['pose']!r} is not (x_m, y_m, yaw_rad) or (x_m, y_m, yaw_rad, speed_m_s)"
+            f"pose {options['pose']!r} is not ({', '.join(names[:least])}) or ({', '.join(names)})"
         )
-    x_m, y_m, yaw_rad, speed_m_s = [*pose.tolist(), 0.0][:4]
-    if not slowest_m_s <= speed_m_s <= fastest_m_s:
-        raise UsageError(f"a pose's speed is {slowest_m_s:g} to {fastest_m_s} m/s, not {speed_m_s}")
-    return Pose(x_m, y_m, yaw_rad, speed_m_s)
+    return [*pose.tolist(), *[0.0] * (len(names) - len(pose))]
+
+
+def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -> Pose:
+    """Read the start of a vehicle on the ground: (x_m, y_m, yaw_rad), or with speed_m_s.
+
+    Raises:
+        UsageError: there is another option, no such pose, or a speed beyond the vehicle's.
+    """
+    pose = Pose(*read_pose(options, Pose._fields, least=3))
+    check_range("a pose's speed_m_s", pose.speed_m_s, slowest_m_s, fastest_m_s)
+    return pose

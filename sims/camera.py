@@ -42,8 +42,14 @@ def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
 
 def ray_lengths(view: Lens) -> Floats:
     """Give (height, width) lengths of the rays from the eye to the plane z = 1."""
-    x = (np.arange(view.width_px) + 0.5 - view.width_px / 2) / view.focal_px
-    y = (np.arange(view.height_px) + 0.5 - view.height_px / 2) / view.focal_px
+    return lengths((view.height_px, view.width_px), view.focal_px, view.focal_px)
+
+
+def lengths(shape: tuple[int, int], focal_x_px: float, focal_y_px: float) -> Floats:
+    """Give (height, width) lengths of rays, for pixels that need not be square."""
+    height_px, width_px = shape
+    x = (np.arange(width_px) + 0.5 - width_px / 2) / focal_x_px
+    y = (np.arange(height_px) + 0.5 - height_px / 2) / focal_y_px
     return np.sqrt(x**2 + y[:, None] ** 2 + 1.0)
 
 
@@ -172,3 +178,78 @@ def _span(polygon: Floats, count: int, v: float) -> tuple[float, float]:
             u = polygon[above, 0] + share * (polygon[below, 0] - polygon[above, 0])
             left_u, right_u = min(left_u, u), max(right_u, u)
     return left_u, right_u
+
+
+@compiled
+def draw_wires(
+    wires: Floats,
+    eye_m: Floats,
+    axes: Floats,
+    focal_x_px: float,
+    focal_y_px: float,
+    inverse_z: Floats,
+) -> None:
+    """Draw straight wires over `inverse_z`, (height, width) 1/m, where they are nearer.
+
+    However thin or far a wire is, it is one pixel wide: it takes one pixel of each column that it
+    crosses, or of each row if it is steeper than that.
+
+    Args:
+        wires: (S, 2, 3) their ends.
+        eye_m: (3,) where the camera is.
+        axes: (3, 3) as of `draw`.
+        focal_x_px: of the lens, in widths of a pixel.
+        focal_y_px: of the lens, in heights of a pixel.
+        inverse_z: the picture to draw over.
+    """
+    ends = np.empty((2, 3))
+    for wire in range(len(wires)):
+        for i in range(2):
+            for k in range(3):
+                ends[i, k] = 0.0
+                for m in range(3):
+                    ends[i, k] += axes[k, m] * (wires[wire, i, m] - eye_m[m])
+        if not _cut_near(ends):
+            continue
+        for i in range(2):
+            ends[i, 2] = 1.0 / ends[i, 2]
+            ends[i, 0] = 0.5 * inverse_z.shape[1] + focal_x_px * ends[i, 0] * ends[i, 2]
+            ends[i, 1] = 0.5 * inverse_z.shape[0] + focal_y_px * ends[i, 1] * ends[i, 2]
+        if abs(ends[1, 0] - ends[0, 0]) >= abs(ends[1, 1] - ends[0, 1]):
+            _trace(ends, 0, inverse_z)
+        else:
+            _trace(ends, 1, inverse_z.T)
+
+
+@compiled
+def _cut_near(ends: Floats) -> bool:
+    """Keep the part of a wire before the near plane; say whether there is any."""
+    if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
+        return False
+    for i in range(2):
+        if ends[i, 2] < _NEAR_M:
+            share = (_NEAR_M - ends[i, 2]) / (ends[1 - i, 2] - ends[i, 2])
+            for k in range(3):
+                ends[i, k] += share * (ends[1 - i, k] - ends[i, k])
+    return True
+
+
+@compiled
+def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
+    """Draw a line between two points u, v, 1/z, one pixel for each step of its main direction.
+
+    Args:
+        ends: (2, 3)
+        main: 0 to take steps in u, 1 in v.
+        inverse_z: the picture, its second axis along the main direction.
+    """
+    first, last = (0, 1) if ends[0, main] <= ends[1, main] else (1, 0)
+    width, length = inverse_z.shape
+    start, end = ends[first, main], ends[last, main]
+    across, across_end = ends[first, 1 - main], ends[last, 1 - main]
+    for step in range(math.ceil(max(0.0, start - 0.5)), math.ceil(min(float(length), end - 0.5))):
+        share = (step + 0.5 - start) / (end - start)
+        place = math.floor(across + share * (across_end - across))
+        value = ends[first, 2] + share * (ends[last, 2] - ends[first, 2])
+        if 0 <= place < width and value > inverse_z[place, step]:
+            inverse_z[place, step] = value

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.camera import Lens, draw, level_axes, ray_lengths
+from mcaprl.sims.camera import Lens, draw, draw_wires, lengths, ray_lengths
 from mcaprl.sims.compiled import compiled
 
 Floats = NDArray[np.float64]
@@ -18,6 +18,7 @@ NEAREST_M = 0.5
 FARTHEST_M = 100.0
 """Distance of code 255, and of all that is farther, nothing included."""
 _CODES_PER_E = 255.0 / math.log(FARTHEST_M / NEAREST_M)
+_NO_WIRES: Floats = np.empty((0, 2, 3))
 
 
 def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -36,6 +37,15 @@ def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Unpack bytes into metres; 255 becomes infinity. `encode_depth` gives the same codes again."""
     depth_m = NEAREST_M * np.exp(codes.astype(np.float64) / _CODES_PER_E)
     return np.where(codes == 255, np.inf, depth_m).astype(np.float32)
+
+
+def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Pack metres into bytes as AirSim's examples do: 255 / max(1, d), rounded down; infinity is 0.
+
+    Half of the codes go to distances of 1 to 2 m.
+    """
+    codes: NDArray[np.uint8] = (255.0 / np.maximum(1.0, depth_m)).astype(np.uint8)
+    return codes
 
 
 class Overlaps(NamedTuple):
@@ -95,33 +105,56 @@ def shrink(
 
 
 class DepthCamera:
-    """A level camera in a world that does not change."""
+    """A camera in a world that does not change."""
 
-    def __init__(self, mesh: Floats, view: Lens, small: tuple[int, int]) -> None:
+    def __init__(
+        self, mesh: Floats, view: Lens, small: tuple[int, int], wires: Floats = _NO_WIRES
+    ) -> None:
         """Look at a mesh, (T, 3, 3) metres, through a lens.
 
         Args:
             mesh: triangles; see `draw`.
             view: the lens, and the size at which pictures are drawn.
             small: (h, w) pixels, the size to which they are averaged down.
+            wires: (S, 2, 3) metres, drawn into the small picture, one pixel wide.
         """
         self._mesh = mesh
+        self._wires = wires
         self._view = view
         self._nearness = 1.0 / ray_lengths(view)
         self._rows = overlaps(view.height_px, small[0])
         self._columns = overlaps(view.width_px, small[1])
+        self._small = small
+        self._small_focal_px = (
+            view.focal_px * small[1] / view.width_px,
+            view.focal_px * small[0] / view.height_px,
+        )
+        self._small_lengths = lengths(small, *self._small_focal_px)
 
-    def inverse_distance(self, position_m: tuple[float, float, float], yaw_rad: float) -> Floats:
-        """Draw the whole picture: (height, width) 1/m along each ray, 0 where nothing is hit."""
+    def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
+        """Draw the whole picture, without wires.
+
+        Args:
+            position_m: of the camera.
+            axes: (3, 3) its x, y and z axes as rows, in the mesh's coordinates.
+
+        Returns:
+            (height, width) 1/m along each ray, 0 where nothing is hit.
+        """
         inverse = np.empty((self._view.height_px, self._view.width_px))
-        draw(self._mesh, np.array(position_m), level_axes(yaw_rad), self._view.focal_px, inverse)
+        draw(self._mesh, np.array(position_m), axes, self._view.focal_px, inverse)
         inverse *= self._nearness
         return inverse
 
-    def image_m(
-        self, position_m: tuple[float, float, float], yaw_rad: float
-    ) -> NDArray[np.float32]:
+    def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
         """Draw the small picture: (h, w) metres along each ray, infinity where nothing is hit."""
-        small = np.empty((len(self._rows.first), len(self._columns.first)), dtype=np.float32)
-        shrink(self.inverse_distance(position_m, yaw_rad), self._rows, self._columns, small)
+        small = np.empty(self._small, dtype=np.float32)
+        shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
+        if len(self._wires):
+            wired = np.zeros(self._small)
+            eye = np.array(position_m)
+            draw_wires(self._wires, eye, axes, *self._small_focal_px, wired)
+            shown = wired > 0.0
+            wires_m = (self._small_lengths[shown] / wired[shown]).astype(np.float32)
+            small[shown] = np.minimum(small[shown], wires_m)
         return small

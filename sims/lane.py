@@ -16,6 +16,7 @@ from mcaprl.errors import UsageError
 from mcaprl.sims import lane_scene
 from mcaprl.sims.arguments import check_action, check_name, pose_from
 from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.camera import level_axes
 from mcaprl.sims.depth import DepthCamera, encode_depth
 from mcaprl.sims.geometry import leg_at, point_at, project
 from mcaprl.sims.lane_camera import lane_camera
@@ -290,7 +291,7 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
                 car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad),
                 CAMERA_HEIGHT_M,
             )
-            self._depth_m = self._camera.image_m(position, car.yaw_rad)
+            self._depth_m = self._camera.image_m(position, level_axes(car.yaw_rad))
         return self._depth_m
 
     def static_scene(self) -> Sequence[Shape]:

@@ -36,3 +36,21 @@ def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     triangles: NDArray[np.float64] = half_side_m * corners[[[0, 1, 2], [0, 2, 3]]]
     return triangles
+
+
+def frustum_mesh(
+    foot_m: Vector, foot_side_m: float, top_side_m: float, height_m: float
+) -> NDArray[np.float64]:
+    """Give an upright block on a square foot, narrower at its top, without its base; (10, 3, 3).
+
+    With a top of 0 it is a pyramid, (4, 3, 3).
+    """
+    height = _CORNERS[:, 2:] + 0.5
+    level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)
+    corners: NDArray[np.float64] = np.array(foot_m) + np.hstack([level, height_m * height])
+    triangles: NDArray[np.float64] = corners[_TRIANGLES]
+    on_base = np.all(triangles[:, :, 2] == foot_m[2], axis=1)
+    sides = triangles[:, 1:] - triangles[:, :1]
+    flat = np.all(np.cross(sides[:, 0], sides[:, 1]) == 0.0, axis=1)
+    seen: NDArray[np.float64] = triangles[~(on_base | flat)]
+    return seen

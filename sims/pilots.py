@@ -14,6 +14,7 @@ from mcaprl.errors import UnknownNameError
 PILOTS: Final[dict[str, tuple[str, str]]] = {
     "mcaprl/LaneKeeping-v0": ("mcaprl.sims.lane_pilot", "LanePilot"),
     "mcaprl/Racer-v0": ("mcaprl.sims.racer_pilot", "RacerPilot"),
+    "mcaprl/Powerline-v0": ("mcaprl.sims.powerline_pilot", "PowerlinePilot"),
 }
 """Module and class of each sim's pilot, by the sim's id."""
 

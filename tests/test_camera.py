@@ -69,7 +69,7 @@ def test_the_course_looks_as_ray_casting_says() -> None:
         columns, rows = random.integers(256, size=4000), random.integers(144, size=4000)
         expected = cast_on_course(np.array(eye), unit_rays(columns, rows, yaw_rad))
         with np.errstate(divide="ignore"):
-            drawn = 1.0 / camera.inverse_distance(eye, yaw_rad)[rows, columns]
+            drawn = 1.0 / camera.inverse_distance(eye, level_axes(yaw_rad))[rows, columns]
         differing += int(np.sum(encode_depth(drawn) != encode_depth(expected)))
     assert differing <= 24
 
