@@ -25,7 +25,7 @@ IMAGES = DOCS / "images"
 DEMO_REPORT = DOCS.parent / "demo" / "report"
 # Columns of a contact sheet, and decisions of each sim's pilot between two of them.
 FRAMES = 6
-FRAME_EVERY = {"lane": 30, "powerline": 18, "racer": 25}
+FRAME_EVERY = {"lane": 30, "powerline": 40, "racer": 25}
 
 
 def command_reference() -> str:
@@ -85,7 +85,7 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     (DOCS / "cli.md").write_text(command_reference())
     for sim, every in FRAME_EVERY.items():
-        frames_of(sim, every).savefig(IMAGES / f"{sim}-frames.png", facecolor="white")
+        frames_of(sim, every, start="line").savefig(IMAGES / f"{sim}-frames.png", facecolor="white")
     for name in ("comparison.png", "trajectories.png"):
         if (DEMO_REPORT / name).exists():
             shutil.copy(DEMO_REPORT / name, IMAGES / name)
