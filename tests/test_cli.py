@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -352,7 +351,11 @@ def test_golden_log_reads_as_ever(capsys: pytest.CaptureFixture[str]) -> None:
 def test_stopped_recording_is_readable(number: signal.Signals) -> None:
     command = [sys.executable, "-m", "mcaprl.cli", "record", "lane", "--episodes", "100000"]
     process = subprocess.Popen(
-        [*command, "--out", "stopped.mcap"], stderr=subprocess.PIPE, text=True, env={**os.environ}
+        [*command, "--out", "stopped.mcap"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in the background may ignore SIGINT, and its children would, too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120
     path = Path("stopped.mcap")

@@ -8,6 +8,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -305,6 +306,15 @@ def test_disk_full_leaves_the_finished_episodes(
         assert len(mcaprl.open(log_path).episodes) == 1
 
 
+@pytest.fixture
+def _hears_sigint() -> Iterator[None]:
+    """A test run in the background may ignore SIGINT, as shells arrange it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_hears_sigint")
 def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
     """Ctrl-C a hundred times, each at another moment of a recording."""
     main = threading.get_ident()
