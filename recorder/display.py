@@ -105,7 +105,7 @@ class Display:
             data = struct.pack(f"<I{len(numbers)}d", ENCAPSULATION, *numbers)
             self._emit(TELEMETRY, time_ns, data)
         if self._depth is not None and self._depth_images is not None:
-            if self._depth_images.is_full(step):
+            if step >= self._depth_images.full_at:
                 with HoldSignals():
                     self._depth_images.flush(step)
             millimetres = depth_millimetres(self._depth.depth_image_m())

@@ -42,9 +42,10 @@ class StepColumns:
         self._episode, self._start_ns, self._step_ns = episode, start_ns, step_ns
         self._first_step, self._total_reward = 0, 0.0
 
-    def is_full(self, step: int) -> bool:
-        """Whether there is no row for the observation at `step`."""
-        return step - self._first_step >= len(self._rows)
+    @property
+    def full_at(self) -> int:
+        """The first step for whose observation there is no row."""
+        return self._first_step + len(self._rows)
 
     def make_room(self, step: int) -> None:
         """Write all rows before the transition that leads to `step`.
@@ -130,9 +131,10 @@ class ImageColumn:
         """Begin an episode: `start_ns` is the log_time of its first picture."""
         self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
 
-    def is_full(self, step: int) -> bool:
-        """Whether there is no row for the picture at `step`."""
-        return step - self._first_step >= len(self._rows)
+    @property
+    def full_at(self) -> int:
+        """The first step for whose picture there is no row."""
+        return self._first_step + len(self._rows)
 
     def put(self, step: int, picture: NDArray[Any]) -> None:
         """Put the picture at `step`, of any shape with as many bytes."""

@@ -107,7 +107,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._images = list(images.values())
         self._converters = converters(env.observation_space)
         self._writers = writers(env.observation_space, self._columns, images)
-        self._episodes = 0
+        self._episodes = self._full_at = 0
         self._open: _OpenEpisode | None = None
 
     def reset(
@@ -148,7 +148,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             observation, reward, terminated, truncated, info = self.env.step(action)
             values = [convert(observation) for convert in self._converters]
             self._columns.reward(step, float(reward))
-            if terminated or truncated or self._is_full(step + 1):
+            if terminated or truncated or step + 1 >= self._full_at:
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
                     self._make_room(step + 1)
@@ -186,19 +186,22 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._columns.begin(self._episodes, start_ns, self._step_ns)
         for image in self._images:
             image.begin(start_ns, self._step_ns)
+        self._full_at = self._next_full()
         if self._display.begin(start_ns, self._step_ns, self._episodes, episode.policy):
             self._attach_layout(start_ns)
         self._open = episode
 
-    def _is_full(self, step: int) -> bool:
-        return self._columns.is_full(step) or any(image.is_full(step) for image in self._images)
-
     def _make_room(self, step: int) -> None:
-        if self._columns.is_full(step):
+        if step >= self._columns.full_at:
             self._columns.make_room(step)
         for image in self._images:
-            if image.is_full(step):
+            if step >= image.full_at:
                 image.flush(step)
+        self._full_at = self._next_full()
+
+    def _next_full(self) -> int:
+        """The first step for whose observation there is no room."""
+        return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
     def _observe(self, step: int, values: list[NDArray[Any]]) -> None:
         for write, value in zip(self._writers, values, strict=True):
