@@ -87,57 +87,37 @@ class Recording:
 @click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
 @click.option("--compression", default="zstd", show_default=True, type=click.Choice(COMPRESSIONS))
 @click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
-def record(
-    sim: str,
-    out: Path,
-    policy: str,
-    epsilon: float,
-    episodes: int | None,
-    steps: int | None,
-    seed: int,
-    envs: int,
-    sim_arguments: dict[str, Any],
-    no_scene: bool,
-    camera: bool,
-    compression: str,
-    overwrite: bool,
-) -> None:
+def record(envs: int, sim_arguments: dict[str, Any], no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 
     SIM is lane, powerline, racer, or any Gymnasium id. Each finished episode is on disk at once.
     """
-    if (episodes is None) == (steps is None):
-        raise UsageError("record needs --episodes N or --steps N, one of the two")
-    if math.isnan(epsilon):
-        raise UsageError("--epsilon nan: give a probability from 0 to 1")
-    if envs > 1 and out.suffix == ".mcap":
-        raise UsageError(
-            f"--envs {envs} writes a file of each into a folder; {out} is no name for one"
-        )
-    whole = Recording(
-        sim=sim,
-        sim_options=sim_arguments,
-        out=out,
-        policy=policy,
-        epsilon=epsilon,
-        episodes=episodes,
-        steps=steps,
-        first_episode=0,
-        seed=seed,
-        scene=not no_scene,
-        camera=camera,
-        compression=compression,
-        overwrite=overwrite,
-    )
-    with progress(f"recording {sim}", episodes or steps) as advance:
+    whole = Recording(sim_options=sim_arguments, scene=not no_scene, first_episode=0, **request)
+    _check_request(whole, envs)
+    with progress(f"recording {whole.sim}", whole.episodes or whole.steps) as advance:
 
         def on_episode(result: EpisodeResult) -> None:
-            advance(1 if episodes else result.length)
+            advance(1 if whole.episodes else result.length)
 
         if envs == 1:
             results = run_recording(whole, on_episode)
         else:
             results = run_shards(whole, envs, on_episode)
+    _print_summary(whole.out, results)
+
+
+def _check_request(whole: Recording, envs: int) -> None:
+    if (whole.episodes is None) == (whole.steps is None):
+        raise UsageError("record needs --episodes N or --steps N, one of the two")
+    if math.isnan(whole.epsilon):
+        raise UsageError("--epsilon nan: give a probability from 0 to 1")
+    if envs > 1 and whole.out.suffix == ".mcap":
+        raise UsageError(
+            f"--envs {envs} writes a file of each into a folder; {whole.out} is no name for one"
+        )
+
+
+def _print_summary(out: Path, results: list[EpisodeResult]) -> None:
     returns = np.array([result.total_reward for result in results])
     length = sum(result.length for result in results)
     files = [out] if out.is_file() else sorted(out.glob("*.mcap"))
