@@ -27,7 +27,9 @@ RESULT_NAME = "evaluation.json"
 
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
-@click.option("--sim", required=True, help="lane, powerline, racer, or any Gymnasium id.")
+@click.option(
+    "--sim", required=True, help="lane, powerline, racer, highway-lane, or any Gymnasium id."
+)
 @click.option("--episodes", default=30, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=1_000_000, show_default=True, type=click.IntRange(0))
 @sim_options

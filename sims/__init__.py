@@ -2,7 +2,7 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane', 'powerline', 'racer']
+    ['highway-lane', 'lane', 'powerline', 'racer']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
@@ -19,8 +19,13 @@ SIMS: Final[dict[str, str]] = {
     "lane": "mcaprl/LaneKeeping-v0",
     "racer": "mcaprl/Racer-v0",
     "powerline": "mcaprl/Powerline-v0",
+    "highway-lane": "mcaprl/HighwayLane-v0",
 }
 """Short name of each sim, and the id that Gymnasium knows it by."""
+ENGINES: Final[dict[str, str]] = dict.fromkeys(SIMS.values(), "numba") | {
+    SIMS["highway-lane"]: "highway_env"
+}
+"""What a sim needs of the extra `sims`, by the sim's id."""
 
 gym.register(
     id=SIMS["lane"],
@@ -38,13 +43,18 @@ gym.register(
     entry_point="mcaprl.sims.powerline:PowerlineEnv",
     max_episode_steps=400,
 )
+gym.register(
+    id=SIMS["highway-lane"],
+    entry_point="mcaprl.sims.highway_lane:HighwayLaneEnv",
+    max_episode_steps=700,
+)
 
 
 def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, `powerline`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: one of `SIMS`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:
@@ -53,8 +63,8 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
         UsageError: the environment takes no such argument, or cannot be made.
     """
     env_id = SIMS.get(name, name)
-    if env_id in SIMS.values():
-        import_extra("numba", "sims")
+    if env_id in ENGINES:
+        import_extra(ENGINES[env_id], "sims")
     try:
         return gym.make(env_id, **kwargs)
     except gym.error.UnregisteredEnv as error:
