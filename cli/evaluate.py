@@ -12,6 +12,7 @@ from typing import Any
 import click
 import gymnasium as gym
 
+from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.show import print_json, print_table, progress, write_json
@@ -27,16 +28,61 @@ RESULT_NAME = "evaluation.json"
 
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
-@click.option("--sim", required=True, help="lane, powerline, racer, or any Gymnasium id.")
+@click.option("--sim", help="lane, powerline, racer, or any Gymnasium id.")
+@click.option("--data", help="Estimate from these logs alone, instead of running a sim.")
 @click.option("--episodes", default=30, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=1_000_000, show_default=True, type=click.IntRange(0))
 @sim_options
+@click.option("--gamma", type=click.FloatRange(0, 1), help="With --data: discount. [default: 0.97]")
+@click.option(
+    "--epsilon",
+    type=click.FloatRange(0, 1),
+    help="With --data: probability of a random action instead of the policy's.  [default: 0]",
+)
+@click.option(
+    "--updates",
+    type=click.IntRange(1),
+    help="With --data: gradient steps of the model.  [default: 10000]",
+)
 @click.option("--behavior", metavar="DATA", help="Compare with the returns in these logs.")
 @click.option("--record", "record_path", type=click.Path(path_type=Path), help="Log the episodes.")
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for pictures and JSON.")
 @click.option("--overwrite", is_flag=True, help="Replace a log that is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def evaluate(
+    policies: tuple[str, ...],
+    sim: str | None,
+    data: str | None,
+    seed: int,
+    as_json: bool,
+    **others: Any,
+) -> None:
+    """Run each POLICY greedily through the same episodes of SIM, or ask the logs DATA about it.
+
+    POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
+    are given beside random = 0 and pilot = 1, where the sim has a pilot. Without a sim the values
+    are estimates of discounted returns, each with a verdict on whether the logs suffice for it.
+    """
+    if (sim is None) == (data is None):
+        raise UsageError("evaluate needs --sim SIM or --data DATA, one of the two")
+    of_data = {name: others.pop(name) for name in ("gamma", "epsilon", "updates")}
+    _refuse_unused(of_data if data is None else others, "data" if data is None else "sim")
+    if data is not None:
+        given = {name: value for name, value in of_data.items() if value is not None}
+        result = evaluate_from_log(policies, data, seed=seed, **given)
+        print_json(result) if as_json else print_estimates(result)
+        return
+    assert sim is not None
+    _evaluate_in_sim(policies, sim, seed=seed, as_json=as_json, **others)
+
+
+def _refuse_unused(options: dict[str, Any], needs: str) -> None:
+    for name, value in options.items():
+        if value and name != "episodes":
+            raise UsageError(f"--{name.removesuffix('_path')} is of use with --{needs} only")
+
+
+def _evaluate_in_sim(
     policies: tuple[str, ...],
     sim: str,
     episodes: int,
@@ -48,11 +94,6 @@ def evaluate(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Run each POLICY greedily through the same episodes of SIM.
-
-    POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
-    are given beside random = 0 and pilot = 1, where the sim has a pilot.
-    """
     env = make_sim(sim, **sim_arguments)
     with closing(env):
         # What can be wrong is looked for first: episodes may take minutes.
