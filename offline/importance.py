@@ -63,7 +63,7 @@ class EpisodeTable:
     @property
     def rho(self) -> Floats:
         """(E, T) the product of the ratios up to and with step t."""
-        return np.cumprod(self.ratios, axis=1)
+        return np.cumprod(self.ratios, axis=1, dtype=np.float64)
 
     @property
     def rho_before(self) -> Floats:
