@@ -20,8 +20,9 @@ from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluate import PolicyScore, bootstrap_interval, normalize
+from mcaprl.sims.evaluate import Improvement, PolicyScore, improvements, normalize
 from mcaprl.sims.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.statistics import bootstrap_interval, interquartile_mean
 
 RESULT_NAME = "evaluation.json"
 
@@ -105,16 +106,19 @@ def _evaluate_in_sim(
         scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
     if logged is not None:
         logged = _scaled(logged, scores)
+    compared = improvements(scores)
     result = {
         "sim": sim,
         "seed": seed,
         "behavior": logged,
         "policies": [score.to_json() for score in scores],
+        "improvements": [improvement.to_json() for improvement in compared],
     }
     if as_json:
         print_json(result)
     else:
         _print_scores(sim, episodes, scores, logged)
+        _print_improvements(compared)
     if report is not None:
         _write_report(report, result, scores, world)
 
@@ -225,6 +229,7 @@ def _print_scores(
                 "behavior, as logged",
                 f"{logged['mean_return']:.2f}",
                 _interval(logged["interval"]),
+                "",
                 _score(logged["normalized_score"]),
                 f"{logged['episodes']} episodes",
             ]
@@ -234,6 +239,7 @@ def _print_scores(
             score.policy,
             f"{score.mean_return:.2f}",
             _interval(score.interval),
+            f"{float(interquartile_mean(score.returns)):.2f}",
             _score(score.normalized_score),
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
         ]
@@ -241,8 +247,19 @@ def _print_scores(
     ]
     print_table(
         f"{sim}: {episodes} episodes for each policy and training seed",
-        ["policy", "mean return", "95 % interval", "random 0, pilot 1", "ends"],
+        ["policy", "mean return", "95 % interval", "middle half", "random 0, pilot 1", "ends"],
         rows,
+    )
+
+
+def _print_improvements(compared: list[Improvement]) -> None:
+    print_table(
+        "how often an episode of one returns more than an episode of the other",
+        ["policy", "than", "probability", "95 % interval"],
+        [
+            [one.better, one.than, f"{one.probability:.2f}", _interval(one.interval)]
+            for one in compared
+        ],
     )
 
 
