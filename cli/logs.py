@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from mcaprl.cli.show import print_facts, print_json, size, write_json
 from mcaprl.errors import CorruptLogError, LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.lint import Finding, lint
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.reader import describe, find_logs, open_logs
 from mcaprl.recorder.scene import DepthSource
@@ -40,7 +40,11 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
         dataset = open_logs(paths)
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
-    facts["problems"] = [str(warning.message) for warning in caught] + facts["problems"]
+    findings = lint(dataset)
+    facts["problems"] = [str(warning.message) for warning in caught] + [
+        str(finding) for finding in findings if finding.severity == "problem"
+    ]
+    facts["findings"] = [asdict(finding) for finding in findings]
     if report is not None:
         from mcaprl.recorder.report import dataset_picture
 
@@ -49,7 +53,7 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
     if as_json:
         print_json(facts)
     else:
-        _print_facts(facts, dataset, len(paths))
+        _print_facts(facts, findings, dataset, len(paths))
     return int(strict and bool(facts["problems"]))
 
 
@@ -100,13 +104,6 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """The facts that `info --json` gives, but for the files' size."""
     statistics = dataset.statistics
-    not_finite = {k: c.not_finite for k, c in statistics.observations.items() if c.not_finite}
-    problems = [
-        f"{count} values of {name} are NaN or infinite" for name, count in not_finite.items()
-    ]
-    bad_rewards = int((~np.isfinite(dataset.rewards)).sum())
-    if bad_rewards:
-        problems.append(f"{bad_rewards} rewards are NaN or infinite")
     return {
         "env_id": dataset.env_id,
         "episodes": statistics.episodes,
@@ -123,11 +120,12 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         },
         "policies": sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         "ends": dict(statistics.ends),
-        "problems": problems,
     }
 
 
-def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
+def _print_facts(
+    facts: dict[str, Any], findings: list[Finding], dataset: Dataset, files: int
+) -> None:
     low, high = facts["return_range"]
     rows = [
         ("environment", facts["env_id"] or "unknown"),
@@ -141,8 +139,10 @@ def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),
         ("ends", _counts(facts["ends"])),
-        ("problems", "; ".join(facts["problems"]) or "none"),
+        ("problems", "\n".join(facts["problems"]) or "none"),
     ]
+    notes = [str(finding) for finding in findings if finding.severity == "note"]
+    rows += [("notes", "\n".join(notes))] if notes else []
     print_facts(_title(dataset.sources), rows)
 
 
