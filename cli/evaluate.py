@@ -47,7 +47,7 @@ RESULT_NAME = "evaluation.json"
 )
 @click.option("--behavior", metavar="DATA", help="Compare with the returns in these logs.")
 @click.option("--record", "record_path", type=click.Path(path_type=Path), help="Log the episodes.")
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for pictures and JSON.")
+@click.option("--report", type=click.Path(path_type=Path), help="Folder for a page and more.")
 @click.option("--overwrite", is_flag=True, help="Replace a log that is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def evaluate(
@@ -101,6 +101,7 @@ def _evaluate_in_sim(
         logged = _behavior(behavior, env, record_path)
         if report is not None:
             import_extra("matplotlib", "report")
+            import_extra("jinja2", "report")
             write_json(report / RESULT_NAME, {})
         world = list(getattr(env.unwrapped, "static_scene", list)())
         scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
@@ -120,7 +121,8 @@ def _evaluate_in_sim(
         _print_scores(sim, episodes, scores, logged)
         _print_improvements(compared)
     if report is not None:
-        _write_report(report, result, scores, world)
+        recorded = None if record_path is None else (record_path, len(set(policies)))
+        _write_report(report, result, scores, compared, world, recorded)
 
 
 def _score_all(
@@ -208,15 +210,19 @@ def _scaled(logged: dict[str, Any], scores: list[PolicyScore]) -> dict[str, Any]
 
 
 def _write_report(
-    folder: Path, result: dict[str, Any], scores: list[PolicyScore], world: list[Any]
+    folder: Path,
+    result: dict[str, Any],
+    scores: list[PolicyScore],
+    compared: list[Improvement],
+    world: list[Any],
+    recorded: tuple[Path, int] | None,
 ) -> None:
-    from mcaprl.sims.report import comparison_picture, trajectory_picture
+    from mcaprl.sims.report import evaluation_page
 
     write_json(folder / RESULT_NAME, result)
     logged = result["behavior"]
     band = None if logged is None else (logged["mean_return"], *logged["interval"])
-    comparison_picture(folder / "comparison.png", scores, f"{result['sim']}: mean return", band)
-    trajectory_picture(folder / "trajectories.png", scores, world)
+    evaluation_page(folder, result["sim"], scores, compared, world, band, recorded)
 
 
 def _print_scores(

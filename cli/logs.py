@@ -27,7 +27,9 @@ from mcaprl.sims import SIMS, make_sim
 
 @click.command()
 @click.argument("data", nargs=-1, required=True)
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for a picture and JSON.")
+@click.option(
+    "--report", type=click.Path(path_type=Path), help="Folder for a page, a picture and JSON."
+)
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
@@ -35,6 +37,7 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
     paths = find_logs(data)
     if report is not None:
         import_extra("matplotlib", "report")
+        import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         dataset = open_logs(paths)
@@ -46,10 +49,13 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
     ]
     facts["findings"] = [asdict(finding) for finding in findings]
     if report is not None:
-        from mcaprl.recorder.report import dataset_picture
+        from mcaprl.recorder.report import dataset_page, dataset_picture
 
+        title = _title(dataset.sources)
         write_json(report / "dataset.json", facts)
-        dataset_picture(report / "dataset.png", dataset, _title(dataset.sources))
+        dataset_picture(report / "dataset.png", dataset, title)
+        rows = _fact_rows(facts, len(paths))
+        dataset_page(report / "index.html", dataset, title, rows, findings)
     if as_json:
         print_json(facts)
     else:
@@ -126,8 +132,16 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
 def _print_facts(
     facts: dict[str, Any], findings: list[Finding], dataset: Dataset, files: int
 ) -> None:
+    rows = _fact_rows(facts, files)
+    rows.append(("problems", "\n".join(facts["problems"]) or "none"))
+    notes = [str(finding) for finding in findings if finding.severity == "note"]
+    rows += [("notes", "\n".join(notes))] if notes else []
+    print_facts(_title(dataset.sources), rows)
+
+
+def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
     low, high = facts["return_range"]
-    rows = [
+    return [
         ("environment", facts["env_id"] or "unknown"),
         ("files", f"{files}, {size(facts['size_bytes'])}"),
         ("episodes", str(facts["episodes"])),
@@ -139,11 +153,7 @@ def _print_facts(
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),
         ("ends", _counts(facts["ends"])),
-        ("problems", "\n".join(facts["problems"]) or "none"),
     ]
-    notes = [str(finding) for finding in findings if finding.severity == "note"]
-    rows += [("notes", "\n".join(notes))] if notes else []
-    print_facts(_title(dataset.sources), rows)
 
 
 def _title(sources: Sequence[Path]) -> str:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mcaprl.sims.evaluate import evaluate, improvements, normalize
-from mcaprl.sims.report import comparison_picture, trajectory_picture
+from mcaprl.sims.report import evaluation_page
 from mcaprl.sims.rollout import EpsilonGreedy, episode_seed, rollout
 from mcaprl.sims.scene import Shape
 
@@ -89,15 +89,23 @@ def test_scores_by_hand(env: gym.Env[Any, Any]) -> None:
     json.dumps(compared.to_json())
 
 
-def test_pictures_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    score = evaluate(env, [None], name="random", episodes=3, seed=0)
-    comparison_picture(tmp_path / "a" / "comparison.png", [score], "title", (1.0, 0.5, 2.0))
+def test_reports_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
+    random = evaluate(env, [None], name="random", episodes=3, seed=0)
+    left = evaluate(env, [AlwaysLeft()], name="left", episodes=3, seed=0)
+    compared = improvements([random, left])
+    logged = (1.0, 0.5, 2.0)
+    evaluation_page(
+        tmp_path / "a", "CartPole", [left, random], compared, [], logged, (Path("x.mcap"), 1)
+    )
     assert (tmp_path / "a" / "comparison.png").read_bytes()[:4] == b"\x89PNG"
-    trajectory_picture(tmp_path / "none.png", [score], [])
-    assert not (tmp_path / "none.png").exists(), "CartPole has no map"
+    assert not (tmp_path / "a" / "trajectories.png").exists(), "CartPole has no map"
+    page = (tmp_path / "a" / "index.html").read_text()
+    assert "mcaprl replay x.mcap --episode " in page
+    worst = min(random.results[0], key=lambda episode: episode.total_reward)
+    assert f"reset(seed={worst.seed})" in page, "random was not recorded"
+    assert f"return {worst.total_reward:.4g}, {worst.length} steps, terminated" in page
     lane = gym.make("mcaprl/LaneKeeping-v0")
     driven = evaluate(lane, [None], name="random", episodes=2, seed=0)
     world = [Shape("line", "line", (1, 1, 1, 1), points=np.zeros((2, 3)))]
-    trajectory_picture(tmp_path / "map.png", [driven], world)
-    assert (tmp_path / "map.png").stat().st_size > 5000
+    evaluation_page(tmp_path / "b", "lane", [driven], [], world, None, None)
+    assert (tmp_path / "b" / "trajectories.png").stat().st_size > 5000
