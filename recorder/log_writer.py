@@ -13,6 +13,7 @@ file, and then all else of it is there too.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,10 +86,10 @@ class EpisodeSummary:
         return messages.new(messages.EPISODE_TYPE, **fields)
 
     @classmethod
-    def from_message(cls, message: Any) -> EpisodeSummary:
-        """From `mcaprl_msgs/msg/Episode`."""
-        fields = {name: getattr(message, name) for name in cls.__dataclass_fields__}
-        return cls(**{**fields, "seed": None if message.seed < 0 else message.seed})
+    def from_fields(cls, fields: Mapping[str, Any]) -> EpisodeSummary:
+        """From the fields of a `mcaprl_msgs/msg/Episode`."""
+        seed = fields.get("seed", -1)
+        return cls(**{**fields, "seed": None if seed < 0 else seed})
 
 
 class LogWriter:
