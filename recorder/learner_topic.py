@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
-from mcaprl.recorder.chunks import record_dtype
+from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.log_writer import LEARNER_TOPIC
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.schema import LEARNER_TEXT, message_dtype
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +35,10 @@ def read_learner(path: str | Path) -> LearnerColumns:
     Raises:
         LogError: the file has no such topic, or is damaged.
     """
-    reader = McapReader(path)
-    channel = reader.channel_of(LEARNER_TOPIC)
-    dtype = message_dtype(LEARNER_TEXT)
-    if channel is None or dtype is None:
+    topic = Topic(McapReader(path), LEARNER_TOPIC)
+    if not topic.fields:
         raise LogError(
             f"{path} has no topic {LEARNER_TOPIC}: it was recorded without a policy version"
         )
-    rows = [part.copy() for part in reader.rows(channel, dtype)]
-    joined = np.concatenate(rows) if rows else np.empty(0, record_dtype(dtype))
-    payload = joined["payload"]
-    return LearnerColumns(
-        joined["log_time"].astype(np.int64), payload["epsilon"], payload["policy_version"]
-    )
+    columns = topic.read(("epsilon", "policy_version"))
+    return LearnerColumns(topic.times, columns["epsilon"], columns["policy_version"])
