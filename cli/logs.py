@@ -176,7 +176,7 @@ def _layout_of_file(path: Path) -> dict[str, Any]:
     reader = McapReader(path)
     attached = reader.attachment(LAYOUT_NAME)
     if attached is None:
-        description, _ = describe(reader)
+        description = describe(reader)
         return layout_of(description, [channel.topic for channel in reader.channels.values()])
     try:
         found: dict[str, Any] = json.loads(attached)
