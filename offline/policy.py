@@ -20,7 +20,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, SpaceError
-from mcaprl.offline.files import write_json, write_tensors
+from mcaprl.files import write_json
+from mcaprl.offline.files import write_tensors
 from mcaprl.offline.learner import Learner, Outputs
 from mcaprl.offline.networks import build_network, discrete_actions, observation_tensor
 from mcaprl.recorder.spaces import space_from_json, space_to_json
