@@ -2,6 +2,7 @@
 
     columns of steps      -> /rl/step             one chunk, fixed-size rows
     columns of images     -> /rl/observation/...  one chunk, fixed-size rows
+    how the policy learns -> /rl/learner          one chunk, fixed-size rows; only if there is any
     one episode's summary -> /rl/episode          one chunk
     what viewers show     -> see `display`        one chunk
 
@@ -26,6 +27,8 @@ from mcaprl.recorder.mcap_writer import McapWriter
 from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.schema import (
     ENCAPSULATION,
+    LEARNER_TEXT,
+    LEARNER_TYPE,
     fill_image_constants,
     image_dtype,
     message_dtype,
@@ -35,6 +38,7 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
+LEARNER_TOPIC = "/rl/learner"
 # Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
@@ -148,6 +152,15 @@ class LogWriter:
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
         rows = message_rows(_rows_per_chunk(IMAGES_PER_CHUNK, dtype), dtype, channel)
         fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
+        return rows
+
+    def learner_rows(self) -> NDArray[Any]:
+        """Announce `/rl/learner` and preallocate a chunk of its rows."""
+        dtype = message_dtype(LEARNER_TEXT)
+        assert dtype is not None
+        channel = self.mcap.add_channel(LEARNER_TOPIC, LEARNER_TYPE, LEARNER_TEXT)
+        rows = message_rows(_rows_per_chunk(STEPS_PER_CHUNK, dtype), dtype, channel)
+        rows["payload"]["encapsulation"] = ENCAPSULATION
         return rows
 
     def write_steps(self, rows: NDArray[Any]) -> None:
