@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.errors import ReportError, import_extra
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_figure
 from mcaprl.sims.evaluate import PolicyScore
 from mcaprl.sims.scene import Shape
 
-_INK, _PALE = "#1d2733", "#b9c2cc"
-_COLORS = ("#2f6fb7", "#d9622b", "#2a9d6f", "#8a63c9", "#b08d1e", "#c04a7c")
 _MAX_PATHS = 30
 # What is lower than this is ground, not something to drive around.
 _FLAT_M = 1.0
@@ -36,19 +34,19 @@ def comparison_picture(
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure, axes = _axes(figsize=(8, 0.62 * len(scores) + 1.8))
+    figure, axes = new_figure(figsize=(8, 0.62 * len(scores) + 1.8))
     if behavior is not None:
         mean, low, high = behavior
-        axes.axvspan(low, high, color=_PALE, alpha=0.45, lw=0)
-        axes.axvline(mean, color=_INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
+        axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)
+        axes.axvline(mean, color=INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
     for row, score in enumerate(scores):
         low, high = score.interval
-        color = _COLORS[row % len(_COLORS)]
+        color = COLORS[row % len(COLORS)]
         axes.barh(row, score.mean_return, color=color, alpha=0.85, height=0.62)
-        axes.plot([low, high], [row, row], color=_INK, lw=2, solid_capstyle="butt")
+        axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
         means = score.returns.mean(axis=1)
         if len(means) > 1:
-            axes.plot(means, np.full(len(means), row), "o", color="white", mec=_INK, ms=4.5)
+            axes.plot(means, np.full(len(means), row), "o", color="white", mec=INK, ms=4.5)
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
@@ -60,11 +58,11 @@ def comparison_picture(
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
     axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
-    axes.set_title(title, loc="left", color=_INK)
+    axes.set_title(title, loc="left", color=INK)
     if behavior is not None:
         axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     axes.spines[["top", "right"]].set_visible(False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def trajectory_picture(path: Path, scores: Sequence[PolicyScore], world: Sequence[Shape]) -> None:
@@ -83,26 +81,26 @@ def trajectory_picture(path: Path, scores: Sequence[PolicyScore], world: Sequenc
         return
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
-    figure, grid = _axes(figsize=(4.2 * columns, 5.6 * rows), rows=rows, columns=columns)
+    figure, grid = new_figure(figsize=(4.2 * columns, 5.6 * rows), rows=rows, columns=columns)
     panels = np.atleast_1d(grid).ravel()
     for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
         _draw_world(axes, world)
-        color = _COLORS[row % len(_COLORS)]
+        color = COLORS[row % len(COLORS)]
         episodes = [episode for seed in score.results for episode in seed]
         stride = -(-len(episodes) // _MAX_PATHS)
         for episode in episodes[::stride]:
             x, y = episode.positions.T
             axes.plot(x, y, color=color, lw=1.1, alpha=0.75)
             if episode.reason != "time_limit":
-                axes.plot(x[-1], y[-1], "x", color=_INK, ms=5, mew=1.3)
+                axes.plot(x[-1], y[-1], "x", color=INK, ms=5, mew=1.3)
         ends = ", ".join(f"{count} {reason}" for reason, count in score.ends.items())
-        axes.set_title(f"{score.policy}\n{ends}", loc="left", fontsize=10, color=_INK)
+        axes.set_title(f"{score.policy}\n{ends}", loc="left", fontsize=10, color=INK)
         axes.set_aspect("equal")
         axes.set_xlabel("x, m")
         axes.set_ylabel("y, m")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
@@ -111,10 +109,10 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
         if shape.frame != "map":
             continue
         if shape.kind == "line":
-            axes.plot(shape.points[:, 0], shape.points[:, 1], color=_PALE, lw=1, zorder=0)
+            axes.plot(shape.points[:, 0], shape.points[:, 1], color=PALE, lw=1, zorder=0)
         elif shape.kind == "box" and shape.size[2] > _FLAT_M:
             corners = _box_corners(shape)
-            axes.fill(corners[:, 0], corners[:, 1], color=_PALE, alpha=0.6, lw=0, zorder=0)
+            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0, zorder=0)
 
 
 def _box_corners(shape: Shape) -> Any:
@@ -122,17 +120,3 @@ def _box_corners(shape: Shape) -> Any:
     local = np.array([(half_x, half_y), (-half_x, half_y), (-half_x, -half_y), (half_x, -half_y)])
     cos, sin = np.cos(shape.yaw_rad), np.sin(shape.yaw_rad)
     return local @ np.array([(cos, sin), (-sin, cos)]) + np.array(shape.position[:2])
-
-
-def _axes(*, figsize: tuple[float, float], rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and leaves no global state."""
-    figure = import_extra("matplotlib.figure", "report").Figure(figsize=figsize, dpi=130)
-    return figure, figure.subplots(rows, columns)
-
-
-def _save(figure: Any, path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, bbox_inches="tight", facecolor="white")
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror}") from error
