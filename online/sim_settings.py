@@ -46,9 +46,7 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
 """By the sim's id: what differs from the algorithm's own defaults."""
 
 
-def settings_for(
-    config_type: type, sim: str, sim_options: Mapping[str, Any]
-) -> dict[str, Any]:
+def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that a sim is learnt with; none for other environments, rules or pictures.
 
     Args:
