@@ -54,15 +54,27 @@ def find_algorithm(name: str) -> Algorithm:
     return ALGORITHMS[name]
 
 
-def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
-    """Make the algorithm with fresh weights; this seeds Python's, NumPy's and torch's generators.
+def check_spaces(
+    algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """Make sure that an algorithm can learn in an environment with these spaces.
 
     Raises:
-        SpaceError: it cannot learn with the environment's actions.
+        UnknownNameError: no algorithm has that name.
+        SpaceError: it cannot.
     """
+    find_algorithm(algo)
+    if not isinstance(action_space, spaces.Discrete):
+        raise SpaceError(f"{algo} needs discrete actions, got {action_space}")
+    parts = observation_space.values() if isinstance(observation_space, spaces.Dict) else ()
+    for space in parts or (observation_space,):
+        if not isinstance(space, spaces.Box):
+            raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")
+
+
+def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
+    """Make the algorithm with fresh weights, and seed Python, NumPy and torch."""
     algorithm = find_algorithm(algo)
-    if issubclass(algorithm.model_type, DQN) and not isinstance(env.action_space, spaces.Discrete):
-        raise SpaceError(f"{algo} needs discrete actions, got {env.action_space}")
     last_rate = config.learning_rate * config.final_learning_rate_fraction
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
     if algorithm.model_type is not A2C:

@@ -34,12 +34,12 @@ class OnlineConfig(Settings):
     """environment steps between two evaluations"""
     eval_episodes: int = 30
     """episodes of one evaluation, on an environment of its own; always the same ones"""
-    checkpoint_interval: int = 20_000
-    """environment steps between two checkpoints"""
+    final_episodes: int = 100
+    """episodes that score the best checkpoint at the end, none of which it was chosen by"""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
-        for name in ("steps", "envs", "eval_interval", "eval_episodes", "checkpoint_interval"):
+        for name in ("steps", "envs", "eval_interval", "eval_episodes", "final_episodes"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("learning_rate", "max_grad_norm"):
             self._require(name, getattr(self, name) > 0, "above 0")
@@ -140,6 +140,8 @@ class PPOConfig(OnlineConfig):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         whole = self.rollout_steps >= 2 * self.envs and self.rollout_steps % self.envs == 0
         self._require("rollout_steps", whole, f"a multiple of envs ({self.envs}), and twice it")
+        fits = self.rollout_steps % self.batch_size == 0
+        self._require("batch_size", fits, f"a divisor of rollout_steps ({self.rollout_steps})")
 
     def arguments(self) -> dict[str, Any]:
         """The same for the constructor of SB3's algorithm, all but learning rate and networks."""

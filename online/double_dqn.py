@@ -36,8 +36,8 @@ class DoubleDQN(DQN):
             torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
             self.policy.optimizer.step()
-            losses.append(loss.item())
-            mean_values.append(values.mean().item())
+            losses.append(loss.detach().item())
+            mean_values.append(values.detach().mean().item())
         self._n_updates += gradient_steps
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/loss", np.mean(losses))

@@ -30,7 +30,7 @@ from stable_baselines3.common.logger import configure
 
 from mcaprl.errors import OutputExistsError, TrainingError, UsageError
 from mcaprl.files import write_json
-from mcaprl.online.algorithms import find_algorithm, make_model
+from mcaprl.online.algorithms import check_spaces, find_algorithm, make_model
 from mcaprl.online.callbacks import EveryInterval
 from mcaprl.online.config import OnlineConfig
 from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
@@ -44,7 +44,6 @@ from mcaprl.sims import make_sim
 from mcaprl.sims.evaluate import evaluate
 
 CONFIG_NAME = "config.json"
-FRESH_EPISODES = 100
 LOG_INTERVAL = 1_000
 """Environment steps between two rows of scalars, and two signs of life."""
 
@@ -131,8 +130,9 @@ def train(
     config = config or default_config(algo, sim, options, {})
     run = _Run(Path(out), sim, options, algo, config)
     with closing(make_sim(sim, **options)) as env:
+        check_spaces(algo, env.observation_space, env.action_space)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
-        fresh = measure_scale(env, episodes=FRESH_EPISODES, seed=FRESH_SEED)
+        fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
         run.open()
         shown = terminal_progress("steps", "score")
         with nullcontext(progress) if progress else shown as report:
@@ -176,7 +176,7 @@ class _Run:
             for summary in summaries
         }
         scale = {"random": fresh.random, "pilot": _number(fresh.pilot)}
-        written = {"episodes": FRESH_EPISODES, "scale": scale, "seeds": seeds}
+        written = {"episodes": self.config.final_episodes, "scale": scale, "seeds": seeds}
         write_json(self.folder / SCORES_NAME, written)
         if find_spec("matplotlib") is not None:
             curve = read_run(self.folder)
@@ -222,7 +222,7 @@ class _Run:
             env,
             [load_policy(folder / BEST_NAME)],
             name=self.algo,
-            episodes=FRESH_EPISODES,
+            episodes=self.config.final_episodes,
             seed=FRESH_SEED,
         )
         return RunSummary(
@@ -274,6 +274,7 @@ class _Session:
                 EveryInterval(LOG_INTERVAL, partial(self._report, report)),
             ]
             self.model.learn(config.steps, callback=callbacks, log_interval=sys.maxsize)
+        self.model.logger.close()
 
     def _keep_best(self) -> None:
         save_policy(self.folder / BEST_NAME, self.model, self._description)
