@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.bicycle import steering_of
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import in_body_frame, leg_at, point_at
 from mcaprl.sims.lane import LaneKeepingEnv
@@ -54,7 +55,7 @@ def pursue(car: Car) -> int:
         x_m - car.x_m, y_m - car.y_m, math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     )
     slip_sine = WHEELBASE_M * left_m / (forward_m**2 + left_m**2)
-    wanted_rad = math.atan(2.0 * math.tan(math.asin(min(max(slip_sine, -1.0), 1.0))))
+    wanted_rad = steering_of(min(max(slip_sine, -1.0), 1.0))
     best, smallest_rad = BRAKE, math.inf
     for action in range(BRAKE + 1, len(STEERING)):
         error_rad = abs(wheel_angle(STEERING[action], car.speed_m_s) - wanted_rad)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.bicycle import Motion, roll, steering_for_lateral
+from mcaprl.sims.bicycle import Motion, roll, slip_for_lateral, slip_of, steering_of
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import in_body_frame, point_at, project, wrap_angle
 from mcaprl.sims.lane_course import COURSE, LANE_HALF_WIDTH_M
@@ -86,8 +86,8 @@ def car_at(row: NDArray[np.float64]) -> Car:
 
 
 @compiled
-def wheel_angle(steering: float, speed_m_s: float) -> float:
-    """Give the front wheels' angle, radians: the steering command, less at high speed.
+def slip(steering: float, speed_m_s: float) -> float:
+    """Give the sine of the car's slip angle: that of the steering command, less at high speed.
 
     The command counts for 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at 120 km/h; and
     the car never turns so sharply that it would feel more than 9 m/s^2 sideways.
@@ -101,8 +101,14 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
     else:
         slope = (shares[2] - shares[1]) / (speeds[2] - speeds[1])
         share = shares[1] + slope * (speed_m_s - speeds[1])
-    limit_rad = steering_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
-    return min(max(steering * MAX_STEERING_RAD * share, -limit_rad), limit_rad)
+    limit = slip_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
+    return min(max(slip_of(steering * MAX_STEERING_RAD * share), -limit), limit)
+
+
+@compiled
+def wheel_angle(steering: float, speed_m_s: float) -> float:
+    """Give the front wheels' angle, radians, for a steering command at a speed; see `slip`."""
+    return steering_of(slip(steering, speed_m_s))
 
 
 @compiled
@@ -133,8 +139,8 @@ def drive(car: Car, action: int) -> Car:
             acceleration_m_s2 = -min(BRAKE_M_S2, speed_m_s / SUBSTEP_S)
         else:
             acceleration_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s / MAX_SPEED_M_S)
-        angle_rad = wheel_angle(steering, speed_m_s)
-        motion = roll(motion, angle_rad, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
+        slip_sine = slip(steering, speed_m_s)
+        motion = roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
     slow_s = car.slow_s + DECISION_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, car.along_m, slow_s)
 
