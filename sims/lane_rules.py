@@ -38,8 +38,9 @@ AHEAD_M = 8.0
 STALL_SPEED_M_S = 1.0
 STALL_TIME_S = 3.0
 FAILURE_REWARD = -5.0
-DRIVING, OFF_LANE, STALL = 0, 1, 2
-REASONS = ("", "off_lane", "stall")
+DRIVING, OFF_LANE, STALL, LOW_REWARD, SLOW, COLLISION = range(6)
+REASONS = ("", "off_lane", "stall", "low_reward", "slow", "collision")
+"""The last three are the classic rules' own."""
 
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 OBSERVATION_NAMES = (
@@ -86,6 +87,13 @@ def car_at(row: NDArray[np.float64]) -> Car:
 
 
 @compiled
+def store_car(car: Car, row: NDArray[np.float64]) -> None:
+    """Write a car into a row of 9 floats."""
+    for i, value in enumerate(car):
+        row[i] = value
+
+
+@compiled
 def slip(steering: float, speed_m_s: float) -> float:
     """Give the sine of the car's slip angle: that of the steering command, less at high speed.
 
@@ -129,11 +137,11 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 
 
 @compiled
-def drive(car: Car, action: int) -> Car:
-    """Carry out one decision of a quarter second."""
+def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
+    """Carry out an action for so many sub-steps of 0.05 s."""
     motion = Motion(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
     steering = car.steering if action == BRAKE else STEERING[action]
-    for _ in range(SUBSTEPS):
+    for _ in range(substeps):
         speed_m_s = motion.speed_m_s
         if action == BRAKE:
             acceleration_m_s2 = -min(BRAKE_M_S2, speed_m_s / SUBSTEP_S)
@@ -141,7 +149,8 @@ def drive(car: Car, action: int) -> Car:
             acceleration_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s / MAX_SPEED_M_S)
         slip_sine = slip(steering, speed_m_s)
         motion = roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
-    slow_s = car.slow_s + DECISION_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
+    duration_s = substeps * SUBSTEP_S
+    slow_s = car.slow_s + duration_s if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, car.along_m, slow_s)
 
 
@@ -206,6 +215,4 @@ def step_cars(
         rewards[i] = reward_of(before, after)
         ends[i] = end_of(after)
         observe(after, observations[i])
-        row = cars[i]
-        for j, value in enumerate(after):
-            row[j] = value
+        store_car(after, cars[i])
