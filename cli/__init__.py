@@ -18,6 +18,7 @@ from mcaprl._version import __version__
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.logs import check, info, layout
 from mcaprl.cli.record import record
+from mcaprl.cli.replay import replay
 from mcaprl.cli.train_offline import train_offline
 from mcaprl.errors import McaprlError
 
@@ -28,7 +29,7 @@ def cli() -> None:
     """The robot's log is the dataset: record, learn from and replay MCAP files."""
 
 
-for _command in (record, train_offline, evaluate, info, check, layout):
+for _command in (record, train_offline, evaluate, replay, info, check, layout):
     cli.add_command(_command)
 
 
