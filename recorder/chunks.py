@@ -56,11 +56,11 @@ def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDAr
     return rows
 
 
-def compress(data: Any, compression: str) -> bytes:
-    """Compress a chunk's records: `zstd` (level 1), `lz4`, or `none`."""
+def compress(data: Any, compression: str, zstd_level: int = 1) -> bytes:
+    """Compress a chunk's records: `zstd`, `lz4`, or `none`."""
     match compression:
         case "zstd":
-            return zstandard.ZstdCompressor(level=1).compress(data)
+            return zstandard.ZstdCompressor(level=zstd_level).compress(data)
         case "lz4":
             return bytes(lz4.frame.compress(data))
         case _:

@@ -43,6 +43,9 @@ from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compress
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
+# Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
+# themselves so much that a slower search halves them.
+_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 6
 
 
 class McapWriter:
@@ -131,7 +134,7 @@ class McapWriter:
         index = np.empty(len(rows), INDEX_ENTRY)
         index["log_time"] = rows["log_time"]
         index["offset"] = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
-        self._write_chunk(rows.view(np.uint8).data, {channel_id: index})
+        self._write_chunk(rows.view(np.uint8).data, {channel_id: index}, _ROWS_LEVEL)
 
     def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
         """Write messages of any channels and lengths as one chunk.
@@ -148,7 +151,7 @@ class McapWriter:
             sequence = int(self._next_sequences(channel_id, 1)[0])
             Message(channel_id, time_ns, data, time_ns, sequence).write(builder)
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
-        self._write_chunk(memoryview(builder.end()), indexes)
+        self._write_chunk(memoryview(builder.end()), indexes, _MESSAGES_LEVEL)
 
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
@@ -179,11 +182,13 @@ class McapWriter:
         self._write(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
         self._file.close()
 
-    def _write_chunk(self, records: memoryview, indexes: dict[int, NDArray[Any]]) -> None:
+    def _write_chunk(
+        self, records: memoryview, indexes: dict[int, NDArray[Any]], zstd_level: int
+    ) -> None:
         assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
         start_time = min(int(index["log_time"].min()) for index in indexes.values())
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
-        data = compress(records, self._compression)
+        data = compress(records, self._compression, zstd_level)
         name = "" if self._compression == "none" else self._compression
         builder = RecordBuilder()
         Chunk(
