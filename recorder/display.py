@@ -64,7 +64,7 @@ class Display:
         camera = camera or bool(log.image_leaves)
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
-        self._shows_steps = any((self._scene, self._telemetry, self._depth))
+        self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._channels: dict[str, int] = {}
         self._static: dict[str, bytes] = {}
         # Shapes that were not drawn, for the next ones may be due: those at an episode's end are.
@@ -103,9 +103,7 @@ class Display:
         return is_first
 
     def observe(self, step: int) -> None:
-        """Show the environment as it is after `step` steps."""
-        if not self._shows_steps:
-            return
+        """Show the environment as it is after `step` steps, if anything of it can be shown."""
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
             self._held = (time_ns, self._scene.scene())
@@ -122,7 +120,7 @@ class Display:
                 with HoldSignals():
                     self._depth_images.flush(step)
             millimetres = depth_millimetres(self._depth.depth_image_m())
-            self._depth_images.put(step, millimetres.view("u1"))
+            self._depth_images.keep(millimetres)
 
     def end(self, summary: EpisodeSummary) -> None:
         """Tell how an episode ended, and write what has gathered."""
