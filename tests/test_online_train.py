@@ -20,6 +20,7 @@ from mcaprl.online.curve import read_curve
 from mcaprl.online.policy import load_policies
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
+from mcaprl.sims import make_sim
 
 SHORT: dict[str, Any] = {
     "steps": 600,
