@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_figure
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png
 from mcaprl.online.curve import CURVE_NAME, CurvePoint, read_curve
 
 PICTURE_NAME = "curve.png"
@@ -71,7 +71,7 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
         MissingExtraError: matplotlib is not installed.
         ReportError: it cannot be written.
     """
-    figure, axes = new_figure(figsize=(7.2, 4.0))
+    figure, axes = new_figure((7.2, 4.0))
     scored = all(np.isfinite(p.score) for run in runs for seed in run.seeds for p in seed)
     for run, color in zip(runs, COLORS, strict=False):
         _draw_run(axes, run, color, scored)
@@ -81,10 +81,9 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
     axes.set_ylabel("score: random 0, pilot 1" if scored else "mean return")
     dots = "; dots: best checkpoints on fresh episodes" if any(run.finals for run in runs) else ""
     axes.set_xlabel(f"environment steps{dots}")
-    axes.set_title(title, loc="left", color=INK)
-    axes.legend(frameon=False, loc="lower right")
-    axes.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, path)
+    axes.set_title(title)
+    axes.legend(loc="lower right")
+    save_png(figure, path)
 
 
 def _draw_run(axes: Any, run: RunCurve, color: str, scored: bool) -> None:
