@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.online.algorithms import find_algorithm
@@ -17,7 +16,7 @@ from mcaprl.online.config import OnlineConfig
 from mcaprl.online.presets import find_preset
 from mcaprl.online.sim_settings import settings_for
 from mcaprl.settings import check_settings, plain_settings
-from mcaprl.sims import make_sim
+from mcaprl.sims import make_sims
 
 CONFIG_NAME = "config.json"
 DEFAULT_ALGO = "double-dqn"
@@ -112,8 +111,8 @@ class Task:
 
     def batch(self, count: int) -> VectorEnv[Any, Any, Any]:
         """So many environments; each resets itself in the step that ends its episode."""
-        make_one = partial(make_sim, self.sim, **self.sim_options)
-        return SyncVectorEnv([make_one] * count, autoreset_mode=AutoresetMode.SAME_STEP)
+        mode = AutoresetMode.SAME_STEP.value
+        return make_sims(self.sim, count, autoreset_mode=mode, **self.sim_options)
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON types."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.display import TELEMETRY
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.schema import is_intact, message_dtype
 
 Track = NDArray[np.float64]
 PLACE = ("x_m", "y_m")
@@ -29,21 +29,11 @@ def tracks_of(dataset: Dataset) -> list[Track]:
 
 def _telemetry(path: Path) -> tuple[NDArray[np.int64], Track] | None:
     """Times (M,) and places (M, 2) of a log; None if it tells none."""
-    reader = McapReader(path)
-    channel = reader.channel_of(TELEMETRY)
-    if channel is None:
+    topic = Topic(McapReader(path), TELEMETRY)
+    if not len(topic) or not set(PLACE) <= set(topic.fields):
         return None
-    schema = reader.schema_of(channel)
-    payload = message_dtype(schema.data.decode(errors="replace"))
-    intact = is_intact(schema.name, schema.data)
-    if payload is None or not intact or not set(PLACE) <= set(payload.names or ()):
-        return None
-    parts = list(reader.rows(channel, payload))
-    if not parts:
-        return None
-    times = np.concatenate([rows["log_time"] for rows in parts]).astype(np.int64)
-    places = [np.concatenate([rows["payload"][name] for rows in parts]) for name in PLACE]
-    return times, np.column_stack(places).astype(np.float64)
+    columns = topic.read(list(PLACE))
+    return topic.times, np.column_stack([columns[name] for name in PLACE]).astype(np.float64)
 
 
 def _track(times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Track]]) -> Track:
