@@ -157,11 +157,10 @@ class TransitionBuffer:
 
     def batch(self, rows: Tensor) -> Batch:
         """The transitions of rows (R,)."""
-        both = self.observe(self.places.index_select(1, rows).flatten())
-        now, then = both.split(len(rows))
+        here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
-        return Batch(rows, now, actions, rewards, discounts, then)
+        return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw transitions."""

@@ -112,8 +112,7 @@ class Learner(ABC):
         """
         size = self.config.batch_size
         rows = [self.buffer.sample_rows(size, sampler) for sampler in self.samplers]
-        with torch.no_grad():
-            terms, slopes = self.losses(self.buffer.batch(torch.cat(rows)))
+        terms, slopes = self.losses(self.buffer.batch(torch.cat(rows)))
         if not math.isfinite(terms["loss"].sum().item()):
             raise NotFiniteError(self._first_bad(terms))
         for name, slope in slopes.items():

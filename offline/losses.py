@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 
 class Loss(NamedTuple):
@@ -60,7 +59,7 @@ def double_q_learning_target(
         q_t_value: (B, A) values of the target network, or (B, A, N) quantiles, as above.
         q_t_selector: likewise, of the network that learns.
     """
-    _check_shape("q_t_selector", q_t_selector, tuple(q_t_value.shape))
+    _check_shape("q_t_selector", q_t_selector, q_t_value.shape)
     return bellman_target(r_t, discount_t, q_t_value, best_actions(q_t_selector))
 
 
@@ -82,11 +81,18 @@ def bellman_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, a_t: Tensor) ->
     return r_t + discount_t * value_t
 
 
-def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
-    """Half the squared error target - Q(s, a) up to 1, the absolute error minus a half beyond.
+def huber(error: Tensor) -> Loss:
+    """Half the squared error up to 1, the absolute error minus a half beyond; any shape.
 
     One rare, large error (a crash, a fresh target) then pulls no harder than an error of 1: the
     clipped error of the DQN paper, as a loss.
+    """
+    slope = error.clamp(-1, 1)
+    return Loss(slope * (error - 0.5 * slope), slope)
+
+
+def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
+    """The Huber loss of Q(s, a) - target.
 
     Args:
         q_tm1: (B, A) values of the network that learns.
@@ -95,9 +101,8 @@ def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
     """
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
-    q_a_tm1 = chosen(q_tm1, a_tm1)
-    value = functional.huber_loss(q_a_tm1, target_tm1, reduction="none")
-    return Loss(value, _at_actions(q_tm1, a_tm1, (q_a_tm1 - target_tm1).clamp(-1, 1)))
+    value, slope = huber(chosen(q_tm1, a_tm1) - target_tm1)
+    return Loss(value, _at_actions(q_tm1, a_tm1, slope))
 
 
 def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
@@ -117,12 +122,11 @@ def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Los
     _check_shape("target_tm1", target_tm1, (len(z_tm1), n_quantiles))
     tau = (torch.arange(n_quantiles, device=z_tm1.device) + 0.5) / n_quantiles
     # (B, quantile i, sample j)
-    error = target_tm1.unsqueeze(1) - chosen(z_tm1, a_tm1).unsqueeze(2)
-    weight = (tau.unsqueeze(1) - (error < 0).float()).abs()
-    huber = functional.huber_loss(error, torch.zeros_like(error), reduction="none")
-    value = (weight * huber).mean(2).sum(1)
-    slope = -(weight * error.clamp(-1, 1)).mean(2)
-    return Loss(value, _at_actions(z_tm1, a_tm1, slope))
+    error = chosen(z_tm1, a_tm1).unsqueeze(2) - target_tm1.unsqueeze(1)
+    weight = (tau.unsqueeze(1) - (error > 0).float()).abs()
+    value, slope = huber(error)
+    value = (weight * value).mean(2).sum(1)
+    return Loss(value, _at_actions(z_tm1, a_tm1, (weight * slope).mean(2)))
 
 
 def cross_entropy(logits_tm1: Tensor, a_tm1: Tensor) -> Loss:
@@ -236,4 +240,4 @@ def _check_actions(values: Tensor, actions: Tensor) -> None:
 
 
 def _check_shape(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    assert tuple(tensor.shape) == shape, f"{name} must be {shape}, got {tuple(tensor.shape)}"
+    assert tensor.shape == shape, f"{name} must be {shape}, got {tuple(tensor.shape)}"

@@ -96,7 +96,7 @@ class StackedMLP(Model):
     """Plain fully connected networks on vectors, all seeds in one matrix product for each layer.
 
     The backward pass is written out: a third of the time of a small update is autograd's
-    bookkeeping. Results are those of `AnyModel`, which the tests hold it against.
+    bookkeeping, which none of these tensors asks for. Results are those of `AnyModel`, which the tests hold it against.
     """
 
     def __init__(self, networks: Sequence[Network]) -> None:
@@ -114,18 +114,15 @@ class StackedMLP(Model):
         one_input = len(network.stems) == 1
         return one_input and all(isinstance(module, kinds) for module in network.modules())
 
-    @torch.no_grad()
     def __call__(self, observations: Observations) -> Tensor:
         """The outputs, with nothing remembered."""
         return self._forward(observations)[-1].view(-1, *self._output_shape)
 
-    @torch.no_grad()
     def learn_from(self, observations: Observations) -> Tensor:
         """The outputs; remembers what went into each layer."""
         *self._inputs, outputs = self._forward(observations)
         return outputs.view(-1, *self._output_shape)
 
-    @torch.no_grad()
     def backward(self, slope: Tensor) -> None:
         """The chain rule, layer by layer: for y = x W^T + b, dW = dy^T x, db = sum dy, dx = dy W."""
         slope = slope.reshape(len(self.weights), -1, self._layers[-1][0].shape[1])

@@ -59,6 +59,8 @@ class Observations:
 
     def rows(self, index: Tensor) -> Observations:
         """Copy the rows of an index (R,)."""
+        if not self.images and self.mask is None:
+            return Observations(self.vector.index_select(0, index))
         return self.like([part.index_select(0, index) for part in self.parts()])
 
     def split(self, rows: int) -> list[Observations]:
