@@ -109,10 +109,14 @@ class StackedMLP(Model):
 
     @staticmethod
     def fits(network: Network) -> bool:
-        """Whether a network has nothing but linear layers and ReLU."""
+        """Whether a network has nothing but linear layers and ReLU.
+
+        Layers with a single input or output are left to others: a product with a vector is
+        computed in another way for one seed than for several, and ends in other bits.
+        """
         kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.ReLU)
-        one_input = len(network.stems) == 1
-        return one_input and all(isinstance(module, kinds) for module in network.modules())
+        plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
+        return plain and all(min(p.shape) > 1 for p in network.parameters() if p.ndim == 2)
 
     def __call__(self, observations: Observations) -> Tensor:
         """The outputs, with nothing remembered."""

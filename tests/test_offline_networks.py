@@ -160,6 +160,7 @@ def test_a_clone_has_weights_of_its_own() -> None:
         (Network(5, [], (4, 3), Architecture((8,))), StackedMLP),
         (Network(5, [], (4,), Architecture((8,), layer_norm=True)), AnyModel),
         (Network(5, [], (4,), Architecture((8,), dueling=True)), AnyModel),
+        (Network(5, [], (1,), Architecture((8,))), AnyModel),
         (Network(0, [(36, 36, 1)], (4,), Architecture((8,))), AnyModel),
     ],
 )
