@@ -1,7 +1,7 @@
 """Train one algorithm on one dataset, with several seeds at once, into a run folder.
 
 RUN/config.json                         algorithm, settings, data
-RUN/curves.png                          all seeds' curves
+RUN/curves.png                          all seeds' curves, see `curves`
 RUN/seed-0/policy.json, .safetensors    see `policy`
 RUN/seed-0/checkpoint.safetensors       see `checkpoint`
 RUN/seed-0/metrics.csv                  loss terms by update; the same for TensorBoard
@@ -32,7 +32,6 @@ from mcaprl.offline.checkpoint import (
     save_checkpoint,
 )
 from mcaprl.offline.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.curves import draw_curves
 from mcaprl.offline.learner import Learner, NotFiniteError
 from mcaprl.offline.metrics import MetricsWriter
 from mcaprl.offline.observations import ObservationEncoder
@@ -140,7 +139,6 @@ def train(
                 if checkpoint is not None:
                     checkpoint.restore(learner, number)
             summaries += run.train(learner, report)
-    draw_curves(folder.path)
     return sorted(summaries, key=lambda summary: summary.seed)
 
 
