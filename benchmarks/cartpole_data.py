@@ -1,10 +1,10 @@
 """Five CartPole-v1 logs of 50,000 transitions each, from agents of Stable-Baselines3.
 
-    random   actions at random
-    medium   PPO halfway: the first iteration at which it stands for 200 steps, actions drawn
-    expert   PPO at the end, its best actions
-    replay   all that DQN did while it learned
-    mixed    half random, half expert
+random   actions at random
+medium   PPO halfway: the first iteration at which it stands for 200 steps, actions drawn
+expert   PPO at the end, its best actions
+replay   all that DQN did while it learned
+mixed    half random, half expert
 """
 
 from __future__ import annotations
@@ -50,10 +50,23 @@ def _record_all(paths: dict[str, Path]) -> None:
     best: Act = lambda seen: int(expert.predict(seen, deterministic=True)[0])  # noqa: E731
     record(paths["expert"], best, STEPS)
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), paths["replay"], policy="dqn")
-    DQN("MlpPolicy", env, seed=0, device="cpu", learning_rate=2.3e-3, batch_size=64,
-        buffer_size=100_000, learning_starts=1000, gamma=0.99, target_update_interval=10,
-        train_freq=256, gradient_steps=128, exploration_fraction=0.16,
-        exploration_final_eps=0.04, policy_kwargs={"net_arch": [256, 256]}).learn(STEPS)
+    DQN(
+        "MlpPolicy",
+        env,
+        seed=0,
+        device="cpu",
+        learning_rate=2.3e-3,
+        batch_size=64,
+        buffer_size=100_000,
+        learning_starts=1000,
+        gamma=0.99,
+        target_update_interval=10,
+        train_freq=256,
+        gradient_steps=128,
+        exploration_fraction=0.16,
+        exploration_final_eps=0.04,
+        policy_kwargs={"net_arch": [256, 256]},
+    ).learn(STEPS)
     env.close()
     half = [paths["random"].with_name(f"half-{name}.mcap") for name in ("random", "expert")]
     record(half[0], lambda _: int(random.integers(2)), STEPS // 2)

@@ -26,17 +26,24 @@ import mcaprl
 from benchmarks.cartpole_data import make_logs
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
-from mcaprl.offline.policy import Scores
 from mcaprl.offline.config import BootstrapConfig
+from mcaprl.offline.policy import Scores
 
 UPDATES, EVALUATED_AT, EPISODES = 5000, (4000, 4500, 5000), 10
 SHARED: dict[str, Any] = {
-    "updates": UPDATES, "batch_size": 64, "learning_rate": 1e-3, "final_learning_rate_fraction": 1.0
+    "updates": UPDATES,
+    "batch_size": 64,
+    "learning_rate": 1e-3,
+    "final_learning_rate_fraction": 1.0,
 }
 VALUES: dict[str, Any] = {"gamma": 0.99, "target_interval": 200}
 ALGOS = ("double-dqn", "cql", "bcq", "bc", "iql")
-RIVALS = {"double-dqn": "DoubleDQNConfig", "cql": "DiscreteCQLConfig", "bcq": "DiscreteBCQConfig",
-          "bc": "DiscreteBCConfig"}
+RIVALS = {
+    "double-dqn": "DoubleDQNConfig",
+    "cql": "DiscreteCQLConfig",
+    "bcq": "DiscreteBCQConfig",
+    "bc": "DiscreteBCConfig",
+}
 Act = Callable[[NDArray[Any]], NDArray[Any]]
 
 
@@ -58,12 +65,16 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
     learner_type = ALGORITHMS[algo]
     values = VALUES if issubclass(learner_type.config_type, BootstrapConfig) else {}
     config = learner_type.config_type(**SHARED, **values)
-    learner = learner_type(config, TransitionBuffer.from_dataset(data, config.packing), range(seeds))
+    learner = learner_type(
+        config, TransitionBuffer.from_dataset(data, config.packing), range(seeds)
+    )
     found = []
     while learner.step < UPDATES:
         learner.update()
         if learner.step in EVALUATED_AT:
-            found.append([mean_return(greedy(learner, seed), learner.step) for seed in range(seeds)])
+            found.append(
+                [mean_return(greedy(learner, seed), learner.step) for seed in range(seeds)]
+            )
     return np.mean(found, axis=0).tolist()
 
 
@@ -85,8 +96,11 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
 
     d3rlpy.seed(0)
     log = d3rlpy.dataset.MDPDataset(
-        data.observations, data.actions, data.rewards.astype(np.float32),
-        data.terminated.astype(np.float32), data.truncated.astype(np.float32),
+        data.observations,
+        data.actions,
+        data.rewards.astype(np.float32),
+        data.terminated.astype(np.float32),
+        data.truncated.astype(np.float32),
         action_space=d3rlpy.ActionSpace.DISCRETE,
     )
     encoder = d3rlpy.models.VectorEncoderFactory([256, 256])
@@ -100,8 +114,14 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
         if step in EVALUATED_AT:
             found.append(mean_return(algorithm.predict, step))
 
-    learner.fit(log, n_steps=UPDATES, n_steps_per_epoch=UPDATES, show_progress=False,
-                logger_adapter=d3rlpy.logging.NoopAdapterFactory(), callback=on_update)
+    learner.fit(
+        log,
+        n_steps=UPDATES,
+        n_steps_per_epoch=UPDATES,
+        show_progress=False,
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+        callback=on_update,
+    )
     return [float(np.mean(found))]
 
 
@@ -140,7 +160,9 @@ def main() -> None:
             found[name][algo] = ours(data, algo, arguments.seeds)
             if has_rival and algo in RIVALS:
                 rivals[name][algo] = theirs(data, algo)
-            print(name, algo, found[name][algo], rivals[name].get(algo), file=sys.stderr, flush=True)
+            print(
+                name, algo, found[name][algo], rivals[name].get(algo), file=sys.stderr, flush=True
+            )
     result = {"behavior": behavior, "mcaprl": found, "d3rlpy": rivals}
     (arguments.folder / "grid.json").write_text(json.dumps(result, indent=2) + "\n")
     print_table(result)

@@ -23,11 +23,7 @@ def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
             default = getattr(config, name)
             if name in options:
                 continue
-            options[name] = click.Option(
-                [_flag(name), name],
-                type=_Widths() if isinstance(default, tuple) else type(default),
-                help=f"{line}  [default: {_shown(default)}]",
-            )
+            options[name] = _option(name, line, default)
     return list(options.values())
 
 
@@ -48,6 +44,17 @@ def plain_settings(found: object) -> dict[str, Any]:
     """The settings of an earlier session, as its config.json has them."""
     settings = found if isinstance(found, dict) else {}
     return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+
+
+def _option(name: str, line: str, default: Any) -> click.Option:
+    if isinstance(default, bool):
+        both = f"{_flag(name)}/--no-{name.replace('_', '-')}"
+        return click.Option([both, name], default=None, help=line)
+    return click.Option(
+        [_flag(name), name],
+        type=_Widths() if isinstance(default, tuple) else type(default),
+        help=f"{line}  [default: {_shown(default)}]",
+    )
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):

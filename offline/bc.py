@@ -26,7 +26,7 @@ class BC(Learner):
     name = "bc"
     config_type: ClassVar[type[TrainingConfig]] = BCConfig
     acts_by: ClassVar[ActsBy] = "logits"
-    policy_models = ("logits",)
+    policy_models: ClassVar[tuple[str, ...]] = ("logits",)
     config: BCConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:

@@ -1,6 +1,6 @@
 """Discrete batch-constrained Q-learning: Double DQN among the actions that the log would take.
 
-    https://arxiv.org/abs/1910.01708    argmax of Q(s, a) over all a with G(a|s) / max_a G(a|s) > tau
+    https://arxiv.org/abs/1910.01708    argmax_a Q(s, a) where G(a|s) / max_a G(a|s) >= threshold
 
 G clones the behavior. Where the log never did a thing, its value is not asked for, neither for the
 target nor when the policy acts.
@@ -55,7 +55,7 @@ class BCQ(DQN):
     name = "bcq"
     config_type: ClassVar[type[TrainingConfig]] = BCQConfig
     acts_by: ClassVar[ActsBy] = "filtered_q_values"
-    policy_models = ("q", "logits")
+    policy_models: ClassVar[tuple[str, ...]] = ("q", "logits")
     config: BCQConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -84,6 +84,4 @@ class BCQ(DQN):
         )
         q_t_selector = allowed_only(self.outputs("q", batch.next_observations), likely)
         q_t_value = self.target_outputs(batch)
-        return bellman_target(
-            batch.rewards, batch.discounts, q_t_value, best_actions(q_t_selector)
-        )
+        return bellman_target(batch.rewards, batch.discounts, q_t_value, best_actions(q_t_selector))

@@ -6,7 +6,7 @@ of indexes into these frames, worked out when the data are packed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -112,7 +112,7 @@ class TransitionBuffer:
             SpaceError: the actions are not discrete, or not in their space, or there is no network
                 for the observations.
             TrainingError: there are no transitions, a number is NaN or infinite, or a logged
-                action was not allowed.
+                action was not allowed; or all weights are 0.
         """
         packing = packing or Packing()
         action_space = discrete_actions(dataset.action_space)
@@ -128,7 +128,7 @@ class TransitionBuffer:
         actions = _counted_from_zero(dataset.actions, action_space)
         _check_finite("rewards", torch.from_numpy(returns[0]))
         _check_data(dataset, frames, actions)
-        return cls(
+        buffer = cls(
             encoder=encoder,
             action_space=action_space,
             packing=packing,
@@ -137,8 +137,8 @@ class TransitionBuffer:
             places=torch.from_numpy(places),
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
-            **_draws(weights, lengths),
         )
+        return buffer if weights is None else buffer.drawn_by(np.repeat(weights, lengths))
 
     def __len__(self) -> int:
         """The number of transitions."""
@@ -161,6 +161,22 @@ class TransitionBuffer:
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
         return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
+
+    def drawn_by(self, weights: NDArray[np.float64]) -> TransitionBuffer:
+        """The same transitions, each drawn by its weight (N,); 0 is never.
+
+        Raises:
+            TrainingError: nothing would ever be drawn.
+        """
+        rows = np.flatnonzero(weights > 0)
+        if not len(rows):
+            raise TrainingError("no transitions to learn from: all weights are 0")
+        above = weights[rows]
+        return replace(
+            self,
+            drawable=None if len(rows) == len(self) else torch.from_numpy(rows),
+            cumulative=None if (above == above[0]).all() else torch.from_numpy(above.cumsum()),
+        )
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw transitions."""
@@ -223,27 +239,6 @@ def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDAr
 
 def _starts(frame_counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.repeat(np.cumsum(frame_counts) - frame_counts, frame_counts)
-
-
-def _draws(
-    weights: NDArray[np.float64] | None, lengths: NDArray[np.int64]
-) -> dict[str, Tensor | None]:
-    """`drawable` and `cumulative` of `TransitionBuffer`.
-
-    Raises:
-        TrainingError: nothing would ever be drawn.
-    """
-    if weights is None:
-        return {}
-    each = np.repeat(weights, lengths)
-    rows = np.flatnonzero(each > 0)
-    if not len(rows):
-        raise TrainingError("no transitions to learn from: all weights are 0")
-    each = each[rows]
-    return {
-        "drawable": None if len(rows) == lengths.sum() else torch.from_numpy(rows),
-        "cumulative": None if (each == each[0]).all() else torch.from_numpy(each.cumsum()),
-    }
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:

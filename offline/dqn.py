@@ -70,12 +70,10 @@ class DQN(Learner):
     name = "dqn"
     config_type: ClassVar[type[TrainingConfig]] = DQNConfig
     acts_by: ClassVar[ActsBy] = "q_values"
-    policy_models = ("q",)
+    policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: DQNConfig
 
-    def __init__(
-        self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]
-    ) -> None:
+    def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
         """Start with random weights, and the same ones as target."""
         super().__init__(config, buffer, seeds)
         rows_per_sync = config.batch_size * config.target_interval

@@ -19,7 +19,10 @@ _DESCRIPTION = "description"
 def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
     """Write tensors, with a JSON object in the file's header."""
     # Copies, because safetensors refuses views of one storage.
-    whole = {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+    whole = {
+        name: tensor.clone(memory_format=torch.contiguous_format)
+        for name, tensor in tensors.items()
+    }
     write_atomically(path, save(whole, {_DESCRIPTION: json.dumps(description)}))
 
 

@@ -63,12 +63,10 @@ class IQL(Learner):
     name = "iql"
     config_type: ClassVar[type[TrainingConfig]] = IQLConfig
     acts_by: ClassVar[ActsBy] = "logits"
-    policy_models = ("logits", "q")
+    policy_models: ClassVar[tuple[str, ...]] = ("logits", "q")
     config: IQLConfig
 
-    def __init__(
-        self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]
-    ) -> None:
+    def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
         """Start with random weights, and the same ones as targets."""
         super().__init__(config, buffer, seeds)
         rows = config.batch_size * config.target_interval

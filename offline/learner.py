@@ -124,7 +124,9 @@ class Learner(ABC):
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
         """The means of (R,) terms over each seed's own rows."""
-        means = {name: term.view(len(self.seeds), -1).mean(1).tolist() for name, term in terms.items()}
+        means = {
+            name: term.view(len(self.seeds), -1).mean(1).tolist() for name, term in terms.items()
+        }
         return [{name: means[name][k] for name in means} for k in range(len(self.seeds))]
 
     def learn(self, name: str, observations: Observations) -> Tensor:

@@ -81,6 +81,38 @@ def bellman_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, a_t: Tensor) ->
     return r_t + discount_t * value_t
 
 
+def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Tensor) -> Tensor:
+    """(B,) the target r + discount sum_a pi(a|s') Q'(s', a) of evaluating a policy pi.
+
+    See "A theoretical and empirical analysis of expected Sarsa",
+    https://doi.org/10.1109/ADPRL.2009.4927542.
+
+    Args:
+        r_t: (B,) rewards.
+        discount_t: (B,) discounts.
+        q_t: (B, A) values of the target network.
+        pi_t: (B, A) probabilities of the policy in the next states.
+    """
+    _check_shape("r_t", r_t, (len(q_t),))
+    _check_shape("discount_t", discount_t, (len(q_t),))
+    _check_shape("pi_t", pi_t, q_t.shape)
+    return r_t + discount_t * (pi_t * q_t).sum(1)
+
+
+def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
+    """Half the squared error of Q(s, a): its minimum is the mean target, as Huber's is not.
+
+    Args:
+        q_tm1: (B, A) values of the network that learns.
+        a_tm1: (B,) int64 actions taken.
+        target_tm1: (B,) what Q(s, a) should be.
+    """
+    _check_actions(q_tm1, a_tm1)
+    _check_shape("target_tm1", target_tm1, (len(q_tm1),))
+    error = chosen(q_tm1, a_tm1) - target_tm1
+    return Loss(0.5 * error.square(), _at_actions(q_tm1, a_tm1, error))
+
+
 def huber(error: Tensor) -> Loss:
     """Half the squared error up to 1, the absolute error minus a half beyond; any shape.
 

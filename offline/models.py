@@ -96,7 +96,8 @@ class StackedMLP(Model):
     """Plain fully connected networks on vectors, all seeds in one matrix product for each layer.
 
     The backward pass is written out: a third of the time of a small update is autograd's
-    bookkeeping, which none of these tensors asks for. Results are those of `AnyModel`, which the tests hold it against.
+    bookkeeping, which none of these tensors asks for. Results are those of `AnyModel`, against
+    which the tests hold it.
     """
 
     def __init__(self, networks: Sequence[Network]) -> None:
@@ -128,7 +129,7 @@ class StackedMLP(Model):
         return outputs.view(-1, *self._output_shape)
 
     def backward(self, slope: Tensor) -> None:
-        """The chain rule, layer by layer: for y = x W^T + b, dW = dy^T x, db = sum dy, dx = dy W."""
+        """The chain rule, layer by layer: y = x W^T + b, so dW = dy^T x, db = sum dy, dx = dy W."""
         slope = slope.reshape(len(self.weights), -1, self._layers[-1][0].shape[1])
         for index in reversed(range(len(self._layers))):
             inputs = self._inputs[index]
@@ -161,7 +162,7 @@ def _layer_views(network: Network, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
         if isinstance(layer, nn.Linear):
             middle = start + layer.weight.numel()
             stop = middle + layer.out_features
-            matrix = flat[:, start:middle].unflatten(1, layer.weight.shape)
+            matrix = flat[:, start:middle].view(-1, *layer.weight.shape)
             views.append((matrix, flat[:, middle:stop].unsqueeze(1)))
             start = stop
     return views

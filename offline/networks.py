@@ -1,7 +1,7 @@
 """Networks from observations to numbers per action, built from what the observations hold.
 
-    picture -> convolutions -> layer -+
-    vector  ------------------> layer +-> layers -> outputs
+picture -> convolutions -> layer -+
+vector  ------------------> layer +-> layers -> outputs
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ class Network(nn.Module):
         inputs = [*observations.images, observations.vector]
         features = [stem(part) for stem, part in zip(self.stems, inputs, strict=False)]
         whole = features[0] if len(features) == 1 else torch.cat(features, 1)
-        return cast(Tensor, self.head(self.body(whole))).unflatten(1, self.output_shape)
+        outputs = cast(Tensor, self.head(self.body(whole)))
+        return outputs.view(-1, *self.output_shape)
 
 
 class NatureConvolutions(nn.Module):
@@ -125,8 +126,8 @@ class DuelingHead(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map features to flat outputs."""
-        advantages = cast(Tensor, self.advantages(features)).unflatten(1, self.output_shape)
-        value = cast(Tensor, self.value(features)).unflatten(1, (1, *self.output_shape[1:]))
+        advantages = cast(Tensor, self.advantages(features)).view(-1, *self.output_shape)
+        value = cast(Tensor, self.value(features)).view(-1, 1, *self.output_shape[1:])
         return (value + advantages - advantages.mean(1, keepdim=True)).flatten(1)
 
 

@@ -65,7 +65,8 @@ class Observations:
 
     def split(self, rows: int) -> list[Observations]:
         """Views of `rows` observations each; the last may have fewer."""
-        return [self.like(parts) for parts in zip(*(p.split(rows) for p in self.parts()))]
+        columns = [torch.split(part, rows) for part in self.parts()]
+        return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
         """Each `count` observations that follow each other as one; the last one's mask counts."""
@@ -73,10 +74,10 @@ class Observations:
             return self
         rows = len(self) // count
         images = tuple(
-            image.unflatten(0, (rows, count)).permute(0, 2, 3, 1, 4).flatten(3)
+            image.view(rows, count, *image.shape[1:]).permute(0, 2, 3, 1, 4).flatten(3)
             for image in self.images
         )
-        mask = None if self.mask is None else self.mask.unflatten(0, (rows, count))[:, -1]
+        mask = None if self.mask is None else self.mask.view(rows, count, -1)[:, -1]
         return Observations(self.vector.reshape(rows, -1), images, mask)
 
     def to(self, device: torch.device) -> Observations:
@@ -228,7 +229,9 @@ def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
     counted = flat - np.ravel(space.start)
     if ((counted < 0) | (counted >= choices)).any():
         raise SpaceError(f"observations are not in their space {space}")
-    codes = [np.eye(n, dtype=np.float32)[column] for n, column in zip(choices, counted.T)]
+    codes = [
+        np.eye(n, dtype=np.float32)[column] for n, column in zip(choices, counted.T, strict=True)
+    ]
     return np.concatenate(codes, 1)
 
 

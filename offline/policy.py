@@ -135,7 +135,9 @@ class Policy:
         if "q" not in self.scores.networks:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
         with torch.inference_mode():
-            return cast(NDArray[np.float32], self.scores.outputs("q", self._whole(observations)).numpy())
+            return cast(
+                NDArray[np.float32], self.scores.outputs("q", self._whole(observations)).numpy()
+            )
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
         """The probabilities (B, A) of all actions.

@@ -59,16 +59,19 @@ class HardTarget:
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
         if self._table is None:
-            self._table = self._all_outputs()
+            self._table = outputs_everywhere(
+                self.model, self._buffer, next_states=self._next_states
+            )
         rows = batch.rows
         if self._seeds > 1:
             rows = (rows.view(self._seeds, -1) + self._offsets).flatten()
         return self._table.index_select(0, rows)
 
-    def _all_outputs(self) -> Tensor:
-        """(K * N, ...) the outputs of K networks for all N transitions of the buffer."""
-        parts = []
-        for places in self._buffer.places[int(self._next_states)].split(_ROWS_AT_ONCE):
-            outputs = self.model(self._buffer.observe(places.repeat(self._seeds)))
-            parts.append(outputs.unflatten(0, (self._seeds, len(places))))
-        return torch.cat(parts, 1).flatten(0, 1)
+
+def outputs_everywhere(model: Model, buffer: TransitionBuffer, *, next_states: bool) -> Tensor:
+    """(K * N, ...) the outputs of K networks for the N states of a buffer, or its next states."""
+    seeds, parts = len(model.weights), []
+    for places in torch.split(buffer.places[int(next_states)], _ROWS_AT_ONCE):
+        outputs = model(buffer.observe(places.repeat(seeds)))
+        parts.append(outputs.view(seeds, len(places), *outputs.shape[1:]))
+    return torch.cat(parts, 1).flatten(0, 1)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +46,7 @@ from mcaprl.offline.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.sims.statistics import bootstrap_interval
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
@@ -140,6 +142,25 @@ def train(
                     checkpoint.restore(learner, number)
             summaries += run.train(learner, report)
     return sorted(summaries, key=lambda summary: summary.seed)
+
+
+def describe_seeds(summaries: Sequence[RunSummary]) -> list[str]:
+    """A line for each seed, and one with means and 95 % intervals over seeds."""
+    lines = []
+    for summary in summaries:
+        done = summary.updates - summary.resumed_at
+        rate = done / summary.seconds if summary.seconds else 0.0
+        terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
+        lines.append(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
+    finished = [summary.terms for summary in summaries if summary.terms]
+    if len(finished) > 1:
+        shown = []
+        for name in finished[0]:
+            values = np.array([[terms[name]] for terms in finished])
+            low, high = bootstrap_interval(values)
+            shown.append(f"{name} {values.mean():.4g} [{low:.4g}, {high:.4g}]")
+        lines.append(f"mean of {len(finished)} seeds [95 % interval]: {', '.join(shown)}")
+    return lines
 
 
 @dataclass(frozen=True)
@@ -260,4 +281,6 @@ def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
 
 def _check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
     if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
-        raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one for each episode")
+        raise UsageError(
+            f"weights must be {n_episodes} numbers of at least 0, one for each episode"
+        )

@@ -107,7 +107,7 @@ def monte_carlo_returns(
 
 
 def largest_return(dataset: Dataset, gamma: float) -> float:
-    """No discounted sum of rewards like these is larger in size, over the longest horizon there is."""
+    """No discounted sum of rewards like these is larger in size."""
     longest = float(dataset.episode_lengths.max())
     steps = longest if gamma == 1 else 1 / (1 - gamma)
     return float(np.abs(dataset.rewards).max()) * steps

@@ -16,7 +16,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, chunk_records, message_index
-from mcaprl.recorder.mcap_reader import McapReader, parse_record
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import parse_record
 from mcaprl.recorder.reader import read_log
 from mcaprl.recorder.rows import add_up
 

@@ -57,7 +57,7 @@ class Display:
         camera = camera or bool(log.image_leaves)
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
-        self._shows_steps = any((self._scene, self._telemetry, self._depth))
+        self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._channels: dict[str, int] = {}
         self.telemetry_names: tuple[str, ...] = ()
         self.follow_frame = ""
@@ -92,9 +92,7 @@ class Display:
         return is_first
 
     def observe(self, step: int) -> None:
-        """Show the environment as it is after `step` steps."""
-        if not self._shows_steps:
-            return
+        """Show the environment as it is after `step` steps, if anything of it can be shown."""
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
             self._emit(SCENE, time_ns, marker_array(self._scene.scene(), time_ns))
@@ -109,7 +107,7 @@ class Display:
                 with HoldSignals():
                     self._depth_images.flush(step)
             millimetres = depth_millimetres(self._depth.depth_image_m())
-            self._depth_images.put(step, millimetres.view("u1"))
+            self._depth_images.keep(millimetres)
 
     def end(self, summary: EpisodeSummary) -> None:
         """Tell how an episode ended, and write what has gathered."""

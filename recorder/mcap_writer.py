@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, OutputExistsError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compress
+from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
@@ -66,6 +66,7 @@ class McapWriter:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self.path = Path(path)
         self._compression = compression
+        self._compress = compressor(compression)
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
@@ -183,7 +184,7 @@ class McapWriter:
         assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
         start_time = min(int(index["log_time"].min()) for index in indexes.values())
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
-        data = compress(records, self._compression)
+        data = self._compress(records)
         name = "" if self._compression == "none" else self._compression
         builder = RecordBuilder()
         Chunk(

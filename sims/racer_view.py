@@ -38,7 +38,7 @@ class RacerView:
         self._static = patches(static_shapes(track))
 
     def draw(
-        self, car: Racer, trail_m: Sequence[tuple[float, float]], action: int
+        self, car: Racer, trail_m: Sequence[tuple[float, ...]], action: int
     ) -> NDArray[np.uint8]:
         """Draw the car where it is, and give the picture, (600, 1000, 3).
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.offline.algorithms import ALGORITHMS
-from mcaprl.offline.bc import BC, BCConfig
+from mcaprl.offline.bc import BCConfig
 from mcaprl.offline.bcq import BCQ, BCQConfig
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.cql import CQL, CQLConfig
+from mcaprl.offline.cql import CQLConfig
 from mcaprl.offline.dqn import DQN, DoubleDQN, DoubleDQNConfig, DQNConfig
 from mcaprl.offline.iql import IQL, IQLConfig
 from mcaprl.offline.learner import Learner, NotFiniteError
@@ -39,7 +39,9 @@ ALL = list(ALGORITHMS.values())
 
 def learner_of(config: TrainingConfig, dataset: Dataset, *seeds: int) -> Learner:
     learner_type = next(each for each in ALL if type(config) is each.config_type)
-    return learner_type(config, TransitionBuffer.from_dataset(dataset, config.packing), seeds or (0,))
+    return learner_type(
+        config, TransitionBuffer.from_dataset(dataset, config.packing), seeds or (0,)
+    )
 
 
 def trained(learner: Learner) -> Learner:
@@ -54,7 +56,8 @@ def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q"
     network = learner.network(name, learner.seeds[0])
     with torch.no_grad():
         found = network(Observations(torch.from_numpy(observations)))
-    return found.mean(2) if found.ndim == 3 else found
+    values: Tensor = found.mean(2) if found.ndim == 3 else found
+    return values
 
 
 def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
@@ -238,8 +241,10 @@ def test_iql_values_lie_between_the_mean_and_the_best() -> None:
 def test_a_bcq_threshold_of_one_is_imitation_and_of_zero_double_dqn() -> None:
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     found = [
-        best(trained(learner_of(BCQConfig(**SMALL_Q, threshold=threshold), mostly_left)),
-             inner_observations())
+        best(
+            trained(learner_of(BCQConfig(**SMALL_Q, threshold=threshold), mostly_left)),
+            inner_observations(),
+        )
         for threshold in (0.0, 1.0)
     ]
     assert found == [[1, 1, 1], [0, 0, 0]]
@@ -255,12 +260,16 @@ def test_bc_learns_how_often_each_action_was_taken() -> None:
 def masked_corridor() -> Dataset:
     """The corridor, in whose middle one may not go right."""
     data = corridor(ONLY_LEFT | {(1, 1): 1, (3, 1): 1})
-    blocked = {
-        name: {"action_mask": ~((getattr(data, name)[:, 2:3] == 1) & [[False, True]]),
-               "cell": getattr(data, name)}
+    blocked: dict[str, Any] = {
+        name: {
+            "action_mask": ~((getattr(data, name)[:, 2:3] == 1) & [[False, True]]),
+            "cell": getattr(data, name),
+        }
         for name in ("observations", "next_observations")
     }
-    columns = {name: getattr(data, name) for name in ("actions", "rewards", "terminated", "truncated")}
+    columns: dict[str, Any] = {
+        name: getattr(data, name) for name in ("actions", "rewards", "terminated", "truncated")
+    }
     space = spaces.Dict(
         {"action_mask": spaces.Box(0, 1, (2,), np.bool_), "cell": data.observation_space}
     )
@@ -289,12 +298,16 @@ def test_the_same_seed_gives_the_same_weights_whoever_learns_beside_it(
     for name, tensor in alone.state(3).items():
         assert torch.equal(tensor, again.state(3)[name])
         assert torch.equal(tensor, together.state(3)[name]), name
-    assert not torch.equal(alone.state(3)["generator.sampler"], together.state(4)["generator.sampler"])
+    assert not torch.equal(
+        alone.state(3)["generator.sampler"], together.state(4)["generator.sampler"]
+    )
 
 
 @pytest.mark.parametrize("learner_type", ALL)
 def test_a_restored_learner_goes_on_bit_for_bit(learner_type: type[Learner]) -> None:
-    values = {"target_interval": 20} if issubclass(learner_type.config_type, BootstrapConfig) else {}
+    values: dict[str, Any] = (
+        {"target_interval": 20} if issubclass(learner_type.config_type, BootstrapConfig) else {}
+    )
     config = learner_type.config_type(**{**SMALL, "updates": 60}, weight_decay=0.1, **values)
     whole = learner_of(config, corridor(), 0, 1)
     for _ in range(25):

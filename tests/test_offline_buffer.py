@@ -125,7 +125,12 @@ def test_stacks_repeat_the_first_frame_of_their_episode() -> None:
     buffer = TransitionBuffer.from_dataset(walks([3, 1], [True, True]), Packing(frame_stack=3))
     batch = whole(buffer)
     assert batch.observations.vector.tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [10, 10, 10]]
-    assert batch.next_observations.vector.tolist() == [[0, 0, 1], [0, 1, 2], [1, 2, 3], [10, 10, 11]]
+    assert batch.next_observations.vector.tolist() == [
+        [0, 0, 1],
+        [0, 1, 2],
+        [1, 2, 3],
+        [10, 10, 11],
+    ]
     assert buffer.vector_width == 3
 
 
@@ -178,9 +183,7 @@ def test_every_row_is_drawn_equally_often() -> None:
 
 @pytest.mark.parametrize("weights", [[3.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
 def test_rows_are_drawn_by_the_weights_of_their_episodes(weights: list[float]) -> None:
-    buffer = TransitionBuffer.from_dataset(
-        walks([2, 3, 1], [True] * 3), weights=np.array(weights)
-    )
+    buffer = TransitionBuffer.from_dataset(walks([2, 3, 1], [True] * 3), weights=np.array(weights))
     rows = buffer.sample_rows(60_000, torch.Generator().manual_seed(0))
     share = torch.bincount(rows, minlength=6) / 60_000
     each = np.repeat(weights, [2, 3, 1])

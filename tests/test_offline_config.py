@@ -111,7 +111,9 @@ def test_an_algorithm_is_chosen_by_name_or_by_its_settings() -> None:
 
 
 def test_an_unknown_algorithm_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match=r"'cqll'.*known: bc, bcq, cql, double-dqn, dqn, iql"):
+    with pytest.raises(
+        UnknownNameError, match=r"'cqll'.*known: bc, bcq, cql, double-dqn, dqn, iql"
+    ):
         choose_algorithm("cqll")
 
 

@@ -21,6 +21,7 @@ from mcaprl.offline.losses import (
     allowed_only,
     cross_entropy,
     double_q_learning_target,
+    expected_sarsa_target,
     expectile_regression,
     huber,
     huber_regression,
@@ -29,6 +30,7 @@ from mcaprl.offline.losses import (
     quantile_regression,
     scaled,
     square_penalty,
+    square_regression,
 )
 
 # Three transitions, two actions: one in mid-episode, one that terminated, one with gamma 0.
@@ -51,6 +53,12 @@ def test_q_learning_bootstraps_from_the_largest_value() -> None:
 def test_double_q_learning_values_the_action_that_the_other_network_selects() -> None:
     target = double_q_learning_target(R_T, DISCOUNT_T, Q_T, SELECTOR_T)
     torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 10, -1.0, 2.0]))
+
+
+def test_expected_sarsa_weights_the_next_values_with_the_policy() -> None:
+    pi_t = torch.tensor([[0.25, 0.75], [0.5, 0.5], [1.0, 0.0]])
+    target = expected_sarsa_target(R_T, DISCOUNT_T, Q_T, pi_t)
+    torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 17.5, -1.0, 2.0]))
 
 
 def test_of_quantiles_those_of_the_largest_mean_are_the_target() -> None:
@@ -151,6 +159,7 @@ def slopes_to_check() -> dict[str, tuple[Callable[[Tensor], Loss], tuple[int, ..
     samples = torch.linspace(-3, 3, 20).view(4, 5)
     return {
         "huber": (lambda q: huber_regression(q, a_tm1, target), (4, 3)),
+        "square regression": (lambda q: square_regression(q, a_tm1, target), (4, 3)),
         "quantiles": (lambda z: quantile_regression(z, a_tm1, samples), (4, 3, 5)),
         "cross entropy": (lambda q: cross_entropy(q, a_tm1), (4, 3)),
         "penalty of quantiles": (lambda z: conservative_penalty(z, a_tm1), (4, 3, 5)),

@@ -140,7 +140,9 @@ def test_a_network_shows_the_weights_of_its_model() -> None:
     model = build_model(networks(2))
     seen = vectors(6, 5)
     model.weights.mul_(0.5)
-    expected = torch.cat([net(part) for net, part in zip(model.networks, seen.split(3))])
+    expected = torch.cat(
+        [net(part) for net, part in zip(model.networks, seen.split(3), strict=True)]
+    )
     torch.testing.assert_close(model(seen), expected)
 
 

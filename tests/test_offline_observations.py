@@ -87,9 +87,12 @@ def test_counters_and_flags_are_flattened_as_gymnasium_does(seed: int) -> None:
     )
     space.seed(seed)
     sample = space.sample()
-    one = {key: np.asarray(sample[key])[None] for key in "abc"} | {"d": {"e": sample["d"]["e"][None]}}
+    one = {key: np.asarray(sample[key])[None] for key in "abc"} | {
+        "d": {"e": sample["d"]["e"][None]}
+    }
     encoded = ObservationEncoder(space, 2).encode(one).vector[0].numpy()
-    np.testing.assert_allclose(encoded, utils.flatten(space, sample))
+    expected: Any = utils.flatten(space, sample)
+    np.testing.assert_allclose(encoded, expected)
 
 
 def test_normalisation_gives_mean_zero_and_deviation_one() -> None:

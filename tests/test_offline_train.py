@@ -129,7 +129,8 @@ def test_progress_is_told_each_log_interval(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "config", [DQNConfig(**SHORT, gamma=0.5), DoubleDQNConfig(**SHORT, gamma=0.5), BCConfig(**SHORT)]
+    "config",
+    [DQNConfig(**SHORT, gamma=0.5), DoubleDQNConfig(**SHORT, gamma=0.5), BCConfig(**SHORT)],
 )
 def test_the_same_seed_gives_the_same_curve_and_weights(tmp_path: Path, config: Any) -> None:
     for name in ("a", "b"):
@@ -287,7 +288,12 @@ def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path:
     # One step of 1e15 in each of four layers, and the next output is beyond float32.
     wild = {"learning_rate": 1e15, "hidden": (16, 16, 16), "checkpoint_interval": 1}
     with pytest.raises(TrainingError) as caught:
-        train(corridor(), DQNConfig(**{**SHORT, **wild}, gamma=0.5, target_interval=10), tmp_path / "run", progress=silent)
+        train(
+            corridor(),
+            DQNConfig(**{**SHORT, **wild}, gamma=0.5, target_interval=10),
+            tmp_path / "run",
+            progress=silent,
+        )
     message = str(caught.value)
     folder = tmp_path / "run" / "seed-0"
     assert message.startswith(f"update 2 of {tmp_path / 'run'}: mean_q of seed 0 is ")
