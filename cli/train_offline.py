@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import click
 
-from mcaprl.errors import UsageError
+from mcaprl.cli.settings import setting_options
 from mcaprl.recorder.reader import open_logs
+from mcaprl.settings import check_settings, plain_settings
 
 
 class _TrainCommand(click.Command):
     """Has an option for each setting of the algorithms; loads them when it is asked for options."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        return [*super().get_params(ctx), *_setting_options()]
+        from mcaprl.offline.algorithms import ALGORITHMS
+
+        configs = [learner.config_type() for learner in ALGORITHMS.values()]
+        return [*super().get_params(ctx), *setting_options(configs)]
 
 
 @click.command(cls=_TrainCommand)
@@ -65,14 +68,10 @@ def train_offline(
     if resume and (out / CONFIG_NAME).exists():
         earlier = read_config(out / CONFIG_NAME)
         algo = algo or earlier.get("algo")
-        given = {**_plain_settings(earlier.get("config")), **given}
+        given = {**plain_settings(earlier.get("config")), **given}
     algo = algo or "cql"
     _, defaults = choose_algorithm(algo)
-    known = [field.name for field in fields(defaults)]
-    for name in given:
-        if name not in known:
-            options = ", ".join(_flag(field) for field in known)
-            raise UsageError(f"{algo} has no setting {_flag(name)}; it has {options}")
+    check_settings(algo, defaults, given)
     config = type(defaults)(**given)
     dataset = open_logs(list(data))
     click.echo(
@@ -85,51 +84,3 @@ def train_offline(
         terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
         click.echo(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
     click.echo(f"curves: tensorboard --logdir {out}")
-
-
-def _plain_settings(found: object) -> dict[str, Any]:
-    """The settings of an earlier session, as its config.json has them."""
-    settings = found if isinstance(found, dict) else {}
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
-
-
-def _setting_options() -> list[click.Option]:
-    """An option for each field of the algorithms' configs, its doc line as help."""
-    from mcaprl.offline.algorithms import ALGORITHMS
-    from mcaprl.offline.config import field_help
-
-    options: dict[str, click.Option] = {}
-    for learner in ALGORITHMS.values():
-        config = learner.config_type()
-        for name, line in field_help(type(config)).items():
-            default = getattr(config, name)
-            if name in options:
-                continue
-            options[name] = click.Option(
-                [_flag(name), name],
-                type=_Widths() if isinstance(default, tuple) else type(default),
-                help=f"{line}  [default: {_shown(default)}]",
-            )
-    return list(options.values())
-
-
-class _Widths(click.ParamType[tuple[int, ...]]):
-    """Layer widths, such as `256,256`."""
-
-    name = "widths"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        try:
-            return tuple(int(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is no list of widths such as 256,256", param, ctx)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
-def _shown(default: Any) -> str:
-    return ",".join(map(str, default)) if isinstance(default, tuple) else f"{default}"

@@ -15,6 +15,7 @@ from mcaprl.errors import McaprlError
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.reader import open_logs as open
+from mcaprl.recorder.vector_wrapper import RecordVecMcap
 from mcaprl.recorder.wrapper import RecordMcap
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ __all__ = [
     "Episode",
     "McaprlError",
     "RecordMcap",
+    "RecordVecMcap",
     "__version__",
     "load_policy",
     "open",

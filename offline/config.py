@@ -1,17 +1,14 @@
-"""Settings that every offline algorithm has, and where their help texts come from."""
+"""Settings that every offline algorithm has."""
 
 from __future__ import annotations
 
-import ast
-import inspect
-import textwrap
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 
-from mcaprl.errors import UsageError
+from mcaprl.settings import Settings
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Settings):
     """Settings shared by all algorithms; each adds its own in a subclass.
 
     The defaults are those that learn lane keeping from 15,000 transitions in half a CPU minute.
@@ -44,43 +41,7 @@ class TrainingConfig:
         self._require("final_learning_rate_fraction", 0 <= fraction <= 1, "within [0, 1]")
         self._require("hidden", all(width >= 1 for width in self.hidden), "widths of at least 1")
 
-    def _require(self, name: str, holds: bool, allowed: str) -> None:
-        if not holds:
-            raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
-
     def learning_rate_at(self, step: int) -> float:
         """The step size of the update that follows `step` finished ones."""
         done = step / max(1, self.updates - 1)
         return self.learning_rate * (1 - (1 - self.final_learning_rate_fraction) * done)
-
-
-def field_help(config_type: type) -> dict[str, str]:
-    """The doc line under each field of a config dataclass, inherited fields first.
-
-    Args:
-        config_type: a dataclass whose source can be read.
-
-    Returns:
-        Field name -> its line, in the order of the fields.
-    """
-    assert is_dataclass(config_type)
-    lines: dict[str, str] = {}
-    for base in reversed(config_type.__mro__):
-        if is_dataclass(base):
-            lines |= _lines_under_fields(base)
-    return {field.name: lines[field.name] for field in fields(config_type) if field.name in lines}
-
-
-def _lines_under_fields(config_type: type) -> dict[str, str]:
-    """Python keeps no docstring of a field, so it is read from the source."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
-    assert isinstance(tree, ast.ClassDef)
-    lines = {}
-    for field, below in zip(tree.body, tree.body[1:], strict=False):
-        match field, below:
-            case (
-                ast.AnnAssign(target=ast.Name(id=name)),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ):
-                lines[name] = inspect.cleandoc(text)
-    return lines

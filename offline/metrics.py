@@ -10,7 +10,7 @@ from typing import Self
 
 from torch.utils.tensorboard import SummaryWriter
 
-from mcaprl.offline.files import write_atomically
+from mcaprl.files import write_atomically
 
 METRICS_NAME = "metrics.csv"
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from mcaprl.errors import OutputExistsError, TrainingError, UsageError
+from mcaprl.files import write_json
 from mcaprl.offline.algorithms import choose_algorithm
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.checkpoint import (
@@ -28,11 +29,10 @@ from mcaprl.offline.checkpoint import (
     save_checkpoint,
 )
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.files import write_json
 from mcaprl.offline.learner import Learner, NotFiniteError
 from mcaprl.offline.metrics import MetricsWriter
 from mcaprl.offline.policy import save_policy
-from mcaprl.offline.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
@@ -100,7 +100,7 @@ def train(
     buffer = TransitionBuffer.from_dataset(dataset)
     run = _Run(Path(out), dataset, RunIdentity(learner_type.name, config, dataset.fingerprint))
     run.open(resume)
-    with nullcontext(progress) if progress else terminal_progress() as report:
+    with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
         return [
             run.train_seed(learner_type, buffer, number, report)
             for number in range(seed, seed + seeds)

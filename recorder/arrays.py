@@ -38,7 +38,7 @@ def columns_of_arrays(
     """
     description = LogMetadata(
         observation_space=observation_space or _space_of(observations),
-        action_space=action_space or _action_space_of(np.asarray(actions)),
+        action_space=action_space or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
     )
@@ -87,18 +87,23 @@ def _space_of(observations: Any) -> spaces.Space[Any]:
     if isinstance(observations, Mapping):
         return spaces.Dict([(key, _space_of(part)) for key, part in observations.items()])
     array = np.asarray(observations)
-    return _box(array)
+    return box_of(array)
 
 
-def _action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
+def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
+    """Discrete up to the largest of integers, an unbounded Box for all else.
+
+    Raises:
+        SpaceError: an integer is negative, or the array is of no number type.
+    """
     if actions.ndim == 1 and actions.dtype.kind in "iu" and actions.size:
         if actions.min() < 0:
             raise SpaceError(f"action {actions.min()} is negative; give action_space")
         return spaces.Discrete(int(actions.max()) + 1)
-    return _box(actions)
+    return box_of(actions)
 
 
-def _box(array: NDArray[Any]) -> spaces.Box:
+def box_of(array: NDArray[Any]) -> spaces.Box:
     """A Box without bounds: the whole range of an integer, infinity for a float."""
     kind = array.dtype.kind
     if kind in "iu":

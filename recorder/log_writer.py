@@ -2,6 +2,7 @@
 
     columns of steps      -> /rl/step             one chunk, fixed-size rows
     columns of images     -> /rl/observation/...  one chunk, fixed-size rows
+    how the policy learns -> /rl/learner          one chunk, fixed-size rows; only if there is any
     one episode's summary -> /rl/episode          one chunk
     what viewers show     -> see `display`        one chunk
 
@@ -12,6 +13,7 @@ file, and then all else of it is there too.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,8 @@ from mcaprl.recorder.mcap_writer import McapWriter
 from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.schema import (
     ENCAPSULATION,
+    LEARNER_TEXT,
+    LEARNER_TYPE,
     fill_image_constants,
     image_dtype,
     message_dtype,
@@ -34,6 +38,7 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
+LEARNER_TOPIC = "/rl/learner"
 # Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
@@ -81,10 +86,10 @@ class EpisodeSummary:
         return messages.new(messages.EPISODE_TYPE, **fields)
 
     @classmethod
-    def from_message(cls, message: Any) -> EpisodeSummary:
-        """From `mcaprl_msgs/msg/Episode`."""
-        fields = {name: getattr(message, name) for name in cls.__dataclass_fields__}
-        return cls(**{**fields, "seed": None if message.seed < 0 else message.seed})
+    def from_fields(cls, fields: Mapping[str, Any]) -> EpisodeSummary:
+        """From the fields of a `mcaprl_msgs/msg/Episode`."""
+        seed = fields.get("seed", -1)
+        return cls(**{**fields, "seed": None if seed < 0 else seed})
 
 
 class LogWriter:
@@ -147,6 +152,15 @@ class LogWriter:
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
         rows = message_rows(_rows_per_chunk(IMAGES_PER_CHUNK, dtype), dtype, channel)
         fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
+        return rows
+
+    def learner_rows(self) -> NDArray[Any]:
+        """Announce `/rl/learner` and preallocate a chunk of its rows."""
+        dtype = message_dtype(LEARNER_TEXT)
+        assert dtype is not None
+        channel = self.mcap.add_channel(LEARNER_TOPIC, LEARNER_TYPE, LEARNER_TEXT)
+        rows = message_rows(_rows_per_chunk(STEPS_PER_CHUNK, dtype), dtype, channel)
+        rows["payload"]["encapsulation"] = ENCAPSULATION
         return rows
 
     def write_steps(self, rows: NDArray[Any]) -> None:

@@ -1,8 +1,11 @@
 """Reads an MCAP file chunk by chunk; knows MCAP and nothing of what the messages mean.
 
 The file is mapped into memory, and only the chunks that hold an asked-for topic are touched. Every
-chunk read is checked against its CRC, every message against the index that led to it. A file
-without a summary, because its writer was killed or is still at work, is scanned from the start.
+chunk read is checked against its CRC, every message against the index that led to it.
+
+Files of any writer are read. What the summary leaves out is looked for: chunks and messages between
+the chunks it tells of, and schemas, channels and messages inside of them. So a file without a
+summary, because its writer was killed or is still at work, is scanned from the start.
 """
 
 from __future__ import annotations
@@ -12,51 +15,48 @@ import mmap
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    Schema,
-)
+from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.chunks import (
+    MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
     chunk_header,
     chunk_records,
-    gather,
     message_index,
-    record_dtype,
+)
+from mcaprl.recorder.mcap_records import (
+    MESSAGE_START,
+    RECORD_HEADER,
+    ChunkContents,
+    LooseMessages,
+    contents_of,
+    parse_record,
+    records_of,
 )
 
-_RECORD_HEADER = struct.Struct("<BQ")
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
-_PARSERS: dict[int, Any] = {
-    Opcode.HEADER: Header,
-    Opcode.FOOTER: Footer,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
-    Opcode.METADATA: Metadata,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.DATA_END: DataEnd,
-}
+_SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.STATISTICS)
 
 
-_TOPICS = (Opcode.SCHEMA, Opcode.CHANNEL)
+@dataclass(frozen=True)
+class Span:
+    """Messages of one channel that stand together.
+
+    Attributes:
+        chunk: in which they are; None for messages outside of all chunks.
+        index: their log_time and offset: `chunks.INDEX_ENTRY`, one for each.
+    """
+
+    chunk: ChunkIndex | None
+    index: NDArray[Any]
 
 
 class McapReader:
@@ -64,8 +64,8 @@ class McapReader:
 
     Attributes:
         path: of the file.
-        complete: whether the file has its summary; if not, it was cut off or is being written.
-        summary_start: where it begins; 0 if there is none.
+        complete: whether the file ends as it should; if not, it was cut off or is being written.
+        summary_start: where the summary begins; 0 if there is none.
         data_end: where the records that precede it end, as far as they were read.
         schemas: by id.
         channels: by id.
@@ -74,7 +74,7 @@ class McapReader:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Map the file and read its summary, or scan it if there is none.
+        """Map the file, read its summary, and look for what that leaves out.
 
         Raises:
             NotMcapError: it is no MCAP file.
@@ -90,15 +90,25 @@ class McapReader:
         self.chunks: list[ChunkIndex] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
+        self._counts: dict[int, int] = {}
+        self._loose = LooseMessages()
+        self._contents: dict[int, ChunkContents] = {}
         footer = self._footer()
         self.complete = footer is not None
         self.summary_start = footer.summary_start if footer is not None else 0
-        if footer is not None:
-            self._read_summary(footer)
-        # The summary has a CRC of its own and is believed; the data section's covers the whole
-        # file and is left to `check`.
-        self._topics_are_known = bool(self.channels)
-        self._read_data_section(scan=footer is None)
+        if self.summary_start:
+            self._read_summary()
+        self._summary_has_topics = bool(self.channels)
+        self._read_between_chunks()
+        self._loose_indexes = self._loose.indexes()
+        if self._loose_indexes:
+            self._check_data_crc()
+        self._find_topics_in_chunks()
+
+    def channels_of(self, topic: str) -> list[Channel]:
+        """The channels of a topic, by id; more than one where several writers took part."""
+        found = [channel for channel in self.channels.values() if channel.topic == topic]
+        return sorted(found, key=lambda channel: channel.id)
 
     def channel_of(self, topic: str) -> Channel | None:
         """The channel of a topic; None if the file has no such topic.
@@ -106,7 +116,7 @@ class McapReader:
         Raises:
             LogError: several channels have that topic.
         """
-        found = [channel for channel in self.channels.values() if channel.topic == topic]
+        found = self.channels_of(topic)
         if len(found) > 1:
             raise LogError(
                 f"{self.path}: {len(found)} channels are called {topic}; one is expected"
@@ -124,28 +134,46 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: {channel.topic} has no schema")
         return schema
 
-    def rows(self, channel: Channel, payload: np.dtype[Any]) -> Iterator[NDArray[Any]]:
-        """Yield a topic's messages chunk by chunk, as arrays of `chunks.record_dtype(payload)`.
+    def spans(self, channel: Channel) -> list[Span]:
+        """Where the messages of a channel are, in file order. No chunk is read that has an index.
 
         Raises:
-            CorruptLogError: a chunk is damaged, or a message is not what the index says.
+            CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
-        dtype = record_dtype(payload)
-        for chunk, index in self.indexed_chunks(channel):
-            rows = gather(chunk, index, dtype)
-            headers_fit = (
-                (rows["opcode"] == Opcode.MESSAGE)
-                & (rows["length"] == dtype.itemsize - RECORD_HEADER_BYTES)
-                & (rows["channel_id"] == channel.id)
-                & (rows["log_time"] == index["log_time"])
+        spans = []
+        for number, chunk in enumerate(self.chunks):
+            index = self._index(chunk, channel, is_last=number == len(self.chunks) - 1)
+            if index is not None and len(index):
+                spans.append(Span(chunk, index))
+        loose = self._loose_indexes.get(channel.id)
+        if loose is not None:
+            spans.append(Span(None, loose))
+        found, told = sum(len(span.index) for span in spans), self._counts.get(channel.id)
+        if told not in (None, found):
+            raise CorruptLogError(
+                f"{self.path}: the summary tells of {told} messages of {channel.topic}, its indexes"
+                f" of {found}"
             )
-            if not headers_fit.all():
-                where = int(index["offset"][int(np.argmin(headers_fit))])
-                raise CorruptLogError(
-                    f"{self.path}: the message of {channel.topic} at byte {where} of its chunk"
-                    " is not what the index says, or has not the length of its schema"
-                )
-            yield rows
+        return spans
+
+    def records_of(self, span: Span) -> memoryview:
+        """The bytes that the offsets of a span's index point into.
+
+        Raises:
+            CorruptLogError: the chunk is damaged.
+        """
+        return self.view if span.chunk is None else self.chunk_records(span.chunk)
+
+    def chunk_records(self, chunk: ChunkIndex) -> memoryview:
+        """The records of a chunk, decompressed and checked against their CRC.
+
+        Raises:
+            CorruptLogError: the chunk is damaged.
+        """
+        try:
+            return chunk_records(self.view, chunk.chunk_start_offset)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Yield log_time and bytes of a topic's messages, one by one.
@@ -153,33 +181,29 @@ class McapReader:
         Raises:
             CorruptLogError: a chunk is damaged, or a message is not what the index says.
         """
-        head = struct.Struct("<BQHIQQ")
-        for chunk, index in self.indexed_chunks(channel):
-            for time_ns, offset in index.tolist():
-                if offset > len(chunk) - head.size:
-                    raise CorruptLogError(f"{self.path}: an index points outside its chunk")
-                opcode, length, channel_id, _, log_time, _ = head.unpack_from(chunk, offset)
-                end = offset + RECORD_HEADER_BYTES + length
-                if (opcode, channel_id, log_time) != (Opcode.MESSAGE, channel.id, time_ns) or (
-                    end > len(chunk)
-                ):
-                    raise CorruptLogError(
-                        f"{self.path}: the message of {channel.topic} at byte {offset} of its"
-                        " chunk is not what the index says"
-                    )
-                yield log_time, bytes(chunk[offset + head.size : end])
+        for span in self.spans(channel):
+            records = self.records_of(span)
+            for time_ns, offset in span.index.tolist():
+                yield time_ns, self.message(records, channel, time_ns, offset)
 
-    def count(self, channel: Channel) -> int:
-        """How many messages a topic has, from the indexes alone."""
-        return sum(len(index) for _, index in self._indexes(channel))
+    def message(self, records: memoryview, channel: Channel, time_ns: int, offset: int) -> bytes:
+        """The bytes of the message that an index entry points at.
 
-    def indexed_chunks(self, channel: Channel) -> Iterator[tuple[memoryview, NDArray[Any]]]:
-        """Yield the records of each chunk with messages of the channel, and their index."""
-        for chunk, index in self._indexes(channel):
-            try:
-                yield chunk_records(self.view, chunk.chunk_start_offset), index
-            except CorruptLogError as error:
-                raise CorruptLogError(f"{self.path}: {error}") from error
+        Raises:
+            CorruptLogError: it is not what the entry says.
+        """
+        start = offset + MESSAGE_HEADER.itemsize
+        if start <= len(records):
+            opcode, length = RECORD_HEADER.unpack_from(records, offset)
+            found_id, _, found_ns = MESSAGE_START.unpack_from(records, offset + RECORD_HEADER.size)
+            end = offset + RECORD_HEADER.size + length
+            found = (opcode, found_id, found_ns)
+            if found == (Opcode.MESSAGE, channel.id, time_ns) and start <= end <= len(records):
+                return bytes(records[start:end])
+        raise CorruptLogError(
+            f"{self.path}: the message of {channel.topic} at byte {offset} of its chunk is not"
+            " what the index says"
+        )
 
     def attachment(self, name: str) -> bytes | None:
         """The first attachment of a name; None if there is none.
@@ -204,42 +228,41 @@ class McapReader:
 
         Ends before a record that reaches beyond the end of the file.
         """
-        offset = start
-        while offset + _RECORD_HEADER.size <= len(self.view):
-            opcode, length = _RECORD_HEADER.unpack_from(self.view, offset)
-            content = offset + _RECORD_HEADER.size
-            if opcode == 0 or length > len(self.view) - content:
-                return
-            yield offset, opcode, self.view[content : content + length]
-            offset = content + length
+        return records_of(self.view, start)
 
-    def _indexes(self, channel: Channel) -> Iterator[tuple[ChunkIndex, NDArray[Any]]]:
-        for number, chunk in enumerate(self.chunks):
-            cut_off = not self.complete and number == len(self.chunks) - 1
-            if not chunk.message_index_offsets and not cut_off:
-                raise LogError(
-                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} has no message"
-                    " index; write the file anew with message indexes"
-                )
-            offset = chunk.message_index_offsets.get(channel.id)
-            if offset is None:
-                continue
+    def _index(self, chunk: ChunkIndex, channel: Channel, *, is_last: bool) -> NDArray[Any] | None:
+        """Where a channel's messages are in a chunk; None if it has none."""
+        # A writer that was killed may have written some of the last chunk's indexes only.
+        if not chunk.message_index_offsets or (is_last and not self.complete):
+            return self._contents_of(chunk).indexes.get(channel.id)
+        offset = chunk.message_index_offsets.get(channel.id)
+        if offset is None:
+            return None
+        try:
+            return message_index(self.view, offset, channel.id)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
+
+    def _contents_of(self, chunk: ChunkIndex) -> ChunkContents:
+        start = chunk.chunk_start_offset
+        if start not in self._contents:
             try:
-                yield chunk, message_index(self.view, offset, channel.id)
+                self._contents[start] = contents_of(self.chunk_records(chunk))
             except CorruptLogError as error:
-                raise CorruptLogError(f"{self.path}: {error}") from error
+                raise CorruptLogError(f"{self.path}: {error} (chunk at byte {start})") from error
+        return self._contents[start]
 
     def _footer(self) -> Footer | None:
-        """The footer, if the file ends with one that tells of a summary."""
+        """The footer, if the file ends with one."""
         start = len(self.view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
         if start < len(MCAP0_MAGIC) or bytes(self.view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
             return None
-        opcode, length = _RECORD_HEADER.unpack_from(self.view, start)
+        opcode, length = RECORD_HEADER.unpack_from(self.view, start)
         if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD_HEADER_BYTES:
             return None
         footer: Footer = self._parse(opcode, self.view[start + RECORD_HEADER_BYTES :], start)
         if footer.summary_start == 0:
-            return None
+            return footer
         if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
             raise CorruptLogError(f"{self.path}: the footer points outside the file")
         covered = self.view[footer.summary_start : start + _FOOTER_BYTES - 4]
@@ -247,34 +270,49 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: the summary does not match its CRC")
         return footer
 
-    def _read_summary(self, footer: Footer) -> None:
-        for offset, opcode, content in self.records(footer.summary_start):
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX):
+    def _read_summary(self) -> None:
+        for offset, opcode, content in self.records(self.summary_start):
+            if opcode in _SUMMARY:
                 self._keep(self._parse(opcode, content, offset))
+        self.chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
 
-    def _read_data_section(self, *, scan: bool) -> None:
-        """Read what stands in front of the first chunk; all of it if the summary is missing."""
-        pending: ChunkIndex | None = None
-        for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
+    def _read_between_chunks(self) -> None:
+        """Read what the summary does not tell of: everything, if there is none."""
+        start, known, self.chunks = len(MCAP0_MAGIC), self.chunks, []
+        for chunk in known:
+            self._read_records(start, chunk.chunk_start_offset)
+            self.chunks.append(chunk)
+            start = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        self._read_records(start, None)
+
+    def _read_records(self, start: int, stop: int | None) -> None:
+        """Read the data section from `start` on, to `stop` or its end.
+
+        Raises:
+            CorruptLogError: there are no whole records in a file that has a summary.
+        """
+        self.data_end = start
+        for offset, opcode, content in records_of(self.view, start, stop):
             if opcode == Opcode.CHUNK:
-                if not scan:
-                    break
-                try:
-                    pending = self._scanned_chunk(offset, len(content))
-                except CorruptLogError as error:
-                    raise CorruptLogError(f"{self.path}: {error}") from error
-                self.chunks.append(pending)
-            elif opcode == Opcode.MESSAGE_INDEX and pending is not None:
+                self.chunks.append(self._scanned_chunk(offset, len(content)))
+            elif opcode == Opcode.MESSAGE_INDEX and self.chunks:
                 (channel_id,) = struct.unpack_from("<H", content)
-                pending.message_index_offsets[channel_id] = offset
+                self.chunks[-1].message_index_offsets[channel_id] = offset
+            elif opcode == Opcode.MESSAGE:
+                self._loose.add(offset, content)
             elif opcode == Opcode.DATA_END:
-                break
-            elif opcode == Opcode.METADATA or (opcode in _TOPICS and not self._topics_are_known):
+                return
+            elif opcode in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
                 self._keep(self._parse(opcode, content, offset))
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
+        if self.complete and self.data_end != stop:
+            raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
 
     def _scanned_chunk(self, offset: int, content_bytes: int) -> ChunkIndex:
-        header = chunk_header(self.view, offset)
+        try:
+            header = chunk_header(self.view, offset)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
         return ChunkIndex(
             chunk_start_offset=offset,
             chunk_length=RECORD_HEADER_BYTES + content_bytes,
@@ -287,39 +325,46 @@ class McapReader:
             message_index_length=0,
         )
 
+    def _check_data_crc(self) -> None:
+        """The only one that covers messages outside of chunks."""
+        for offset, opcode, content in records_of(self.view, self.data_end):
+            if opcode == Opcode.DATA_END:
+                (crc,) = struct.unpack_from("<I", content)
+                if crc and zlib.crc32(self.view[:offset]) != crc:
+                    raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
+            break
+
+    def _find_topics_in_chunks(self) -> None:
+        """Look into chunks for schemas and channels that stand nowhere else."""
+        for chunk in self.chunks:
+            ids = chunk.message_index_offsets
+            if not all(map(self._is_known, ids)) or not (ids or self._summary_has_topics):
+                for topic in self._contents_of(chunk).topics:
+                    self._keep(topic)
+
+    def _is_known(self, channel_id: int) -> bool:
+        channel = self.channels.get(channel_id)
+        return channel is not None and channel.schema_id in self.schemas
+
     def _keep(self, record: McapRecord) -> None:
+        """Note a record. What the summary says comes first: it has a CRC of its own."""
         match record:
             case Schema():
-                self.schemas[record.id] = record
+                self.schemas.setdefault(record.id, record)
             case Channel():
-                self.channels[record.id] = record
+                self.channels.setdefault(record.id, record)
             case Metadata():
                 self.metadata.setdefault(record.name, record.metadata)
             case ChunkIndex():
                 self.chunks.append(record)
+            case Statistics():
+                self._counts = record.channel_message_counts
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> Any:
         try:
             return parse_record(opcode, content)
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
-
-
-def parse_record(opcode: int, content: memoryview) -> Any:
-    """A record of the `mcap` library from its content.
-
-    Raises:
-        CorruptLogError: the content is no such record.
-    """
-    try:
-        return _PARSERS[opcode].read(_stream(content))
-    # The library raises whatever its parsing meets; none of it is more than "damaged".
-    except Exception as error:
-        raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
-
-
-def _stream(content: memoryview) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(content))
 
 
 def _map(path: Path) -> memoryview:

@@ -30,11 +30,20 @@ from gymnasium import spaces
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError
-from mcaprl.recorder.spaces import observation_leaves, space_from_json, space_to_json
+from mcaprl.recorder.spaces import leaves_of, space_from_json, space_to_json
 
 FORMAT_VERSION = "1"
 METADATA_NAME = "mcaprl.dataset"
 DEFAULT_STEP_DURATION_NS = 100_000_000
+# What a spec says of drawing, and of how environments are brought together.
+_NOT_OF_ONE_ENV = (
+    "render_mode",
+    "num_envs",
+    "vectorization_mode",
+    "vector_kwargs",
+    "wrappers",
+    "autoreset_mode",
+)
 _VERSIONED = ("gymnasium", "numpy", "numba", "highway-env")
 
 
@@ -89,7 +98,7 @@ class LogMetadata:
                 "path": leaf.path,
                 **({"topic": leaf.topic} if leaf.encoding else {"field": leaf.name}),
             }
-            for leaf in observation_leaves(self.observation_space)
+            for leaf in leaves_of(self.observation_space)
         ]
         return {
             "format_version": FORMAT_VERSION,
@@ -154,7 +163,7 @@ class LogMetadata:
     @classmethod
     def of_env(
         cls,
-        env: gym.Env[Any, Any],
+        env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
         *,
         step_duration_s: float | None = None,
         policy: str = "",
@@ -163,20 +172,24 @@ class LogMetadata:
     ) -> LogMetadata:
         """Describe an environment: its spaces, id and arguments, and its own names for things.
 
-        The time of a step is, in this order: the argument, the environment's `step_duration_s`, one
-        over `metadata["render_fps"]`, 0.1 s.
+        A vector environment is described as one of those in it. The time of a step is, in this
+        order: the argument, the environment's `step_duration_s`, one over `metadata["render_fps"]`,
+        0.1 s.
         """
-        inner = env.unwrapped
+        one = _one_of(env)
+        inner = one.unwrapped
         if step_duration_s is None:
             fps = inner.metadata.get("render_fps")
             fallback = 1 / fps if fps else DEFAULT_STEP_DURATION_NS / 1e9
             step_duration_s = float(getattr(inner, "step_duration_s", fallback))
-        kwargs = dict(env.spec.kwargs) if env.spec else {}
-        kwargs.pop("render_mode", None)
+        is_vector = isinstance(one, gym.vector.VectorEnv)
+        kwargs = dict(one.spec.kwargs) if one.spec else {}
+        for name in _NOT_OF_ONE_ENV:
+            kwargs.pop(name, None)
         return cls(
-            observation_space=env.observation_space,
-            action_space=env.action_space,
-            env_id=env.spec.id if env.spec else "",
+            observation_space=one.single_observation_space if is_vector else one.observation_space,
+            action_space=one.single_action_space if is_vector else one.action_space,
+            env_id=one.spec.id if one.spec else "",
             env_kwargs=kwargs,
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
@@ -186,6 +199,19 @@ class LogMetadata:
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _one_of(env: Any) -> Any:
+    """An environment that shows what all of a vector are, if they live in this process."""
+    if not isinstance(env, gym.vector.VectorEnv):
+        return env
+    inner = env.unwrapped
+    # Wrappers of the vector may have changed the spaces that its members know.
+    same = inner.single_observation_space == env.single_observation_space and (
+        inner.single_action_space == env.single_action_space
+    )
+    members = inner.envs if isinstance(inner, gym.vector.SyncVectorEnv) and same else []
+    return members[0] if members else env
 
 
 def _names(env: object, attribute: str) -> tuple[str, ...]:

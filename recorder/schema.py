@@ -14,6 +14,11 @@ type is a NumPy structured dtype, so that a chunk of messages is one array.
     bool terminated, truncated  of the transition that starts here
     bool final                  this record holds only an episode's last observation
 
+`/rl/learner` has, for each transition under its log_time, what changes while a policy learns:
+
+    float64 epsilon             probability of a random action; NaN if unknown
+    int64 policy_version        updates that the policy had seen; -1 if unknown
+
 Observations and actions keep their dtype (float16 is widened to float32). Image observations are
 not in it: they are `sensor_msgs/msg/Image` on topics of their own, under the same log_time.
 """
@@ -35,6 +40,13 @@ from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
 # The CDR encapsulation header "little endian, plain CDR": bytes 00 01 00 00.
 ENCAPSULATION = 0x0100
 ENCAPSULATION_BYTES = 4
+
+LEARNER_TYPE = "mcaprl_msgs/msg/Learner"
+LEARNER_TEXT = """\
+# Of the policy that took the action; NaN and -1 where unknown.
+float64 epsilon
+int64 policy_version
+"""
 
 ROS_TO_NUMPY = {
     "float64": "<f8",
@@ -87,7 +99,7 @@ def step_schema(
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
-    """Name and definition text of a message of float64 scalars, one per name.
+    """Name and definition text of a message of float32 scalars, one per name: they are to plot.
 
     Raises:
         SpaceError: a name is no ROS field name.
@@ -99,7 +111,7 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
                 f"telemetry '{name}' is no ROS field name: lower case letters, digits and single"
                 " underscores"
             )
-    return _named("Telemetry", [("float64", 0, name) for name in names])
+    return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:

@@ -8,23 +8,17 @@ when a chunk is written. Rows are copies, so the environment may reuse its buffe
 
 from __future__ import annotations
 
-import json
 import math
-import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
+from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
-from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
-from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
 from mcaprl.recorder.metadata import LogMetadata
-from mcaprl.recorder.rows import ImageColumn, StepColumns, converters, writers
+from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
+from mcaprl.recorder.rows import ImageColumn, StepColumns, observation_keeper
 from mcaprl.recorder.signals import HoldSignals
 
 
@@ -80,35 +74,36 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             OutputExistsError, LogError: the file cannot be created.
         """
         if isinstance(env, gym.vector.VectorEnv):
-            raise UsageError("RecordMcap wraps single environments: record each of a vector's own")
+            raise UsageError(
+                "RecordMcap wraps single environments; RecordVecMcap wraps vector ones"
+            )
         super().__init__(env)
         self.policy, self.epsilon, self.behavior_prob = policy, epsilon, math.nan
-        self._next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns
-        self._description = LogMetadata.of_env(
+        description = LogMetadata.of_env(
             env,
             step_duration_s=step_duration_s,
             policy=policy,
             epsilon="" if math.isnan(epsilon) else repr(epsilon),
             seed="" if seed is None else str(seed),
         )
-        self._step_ns = self._description.step_duration_ns
-        if self._step_ns < 1 or self._next_start_ns < 0:
-            raise UsageError(
-                f"a step of {self._step_ns} ns from {self._next_start_ns} ns on: times must rise"
-                " from 0 or later; give step_duration_s and start_time_ns"
-            )
-        self._log = LogWriter(path, self._description, compression=compression, overwrite=overwrite)
-        self._display = Display(self._log, env.unwrapped, scene=scene, camera=camera)
-        self._columns = StepColumns(self._log)
+        self._recording = Recording(
+            path,
+            description,
+            compression=compression,
+            overwrite=overwrite,
+            start_time_ns=start_time_ns,
+        )
+        log = self._recording.log
+        self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
+        self._columns = StepColumns(log)
         images = {
-            leaf: ImageColumn(self._log, leaf.topic, leaf.shape, leaf.encoding)
-            for leaf in self._log.image_leaves
+            leaf: ImageColumn(log, leaf.topic, leaf.shape, leaf.encoding)
+            for leaf in log.image_leaves
         }
         self._images = list(images.values())
-        self._converters = converters(env.observation_space)
-        self._writers = writers(env.observation_space, self._columns, images)
-        self._episodes = self._full_at = 0
-        self._open: _OpenEpisode | None = None
+        self._keep_observation = observation_keeper(env.observation_space, self._columns, images)
+        self._full_at = 0
+        self._open: OpenEpisode | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -119,13 +114,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             SpaceError: the observation does not fit its space.
             UsageError: the recording is closed, or the seed does not fit 63 bits.
         """
-        self._check_can_begin(seed)
+        self._recording.check_can_begin([seed])
         self._interrupt()
         observation, info = self.env.reset(seed=seed, options=options)
-        values = [convert(observation) for convert in self._converters]
         with HoldSignals():
-            self._begin(_OpenEpisode(self._next_start_ns, self.policy, self.epsilon, seed, options))
-            self._observe(0, values)
+            self._begin(OpenEpisode(self.policy, self.epsilon, seed, options), observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -140,25 +133,33 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
-        step = episode.steps
-        # Before the environment can change it.
-        self._columns.act(step, action, self.behavior_prob)
-        self.behavior_prob = math.nan
+        columns, step = self._columns, episode.steps + 1
+        try:
+            # Before the environment can change it.
+            columns.keep_action(action)
+            columns.keep_behavior_prob(self.behavior_prob)
+            self.behavior_prob = math.nan
+        except SpaceError:
+            raise
+        except BaseException:
+            self._interrupt()
+            raise
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
-            values = [convert(observation) for convert in self._converters]
-            self._columns.reward(step, float(reward))
-            if terminated or truncated or step + 1 >= self._full_at:
+            self._keep_observation(observation)
+            columns.keep_reward(float(reward))
+            if terminated or truncated or step >= self._full_at:
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
-                    self._make_room(step + 1)
-                    self._observe(step + 1, values)
+                    self._make_room(step)
+                    self._count(episode, step)
                     if terminated or truncated:
-                        self._end(
-                            bool(terminated), bool(truncated), _reason(info, bool(terminated))
-                        )
+                        reason = reason_of(info.get("reason"), bool(terminated))
+                        self._end(bool(terminated), bool(truncated), reason)
+            elif self._display.shows_steps:
+                self._count(episode, step)
             else:
-                self._observe(step + 1, values)
+                episode.steps = step
         except BaseException:
             # The environment may be a step ahead of the log: nothing may be joined to it.
             self._interrupt()
@@ -169,26 +170,22 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Finish the log and close the environment. Closing twice is harmless."""
         try:
             with HoldSignals():
-                if not self._log.mcap.closed:
+                if not self._recording.closed:
                     self._interrupt()
-                    self._log.close()
+                    self._recording.log.close()
         finally:
             super().close()
 
-    def _check_can_begin(self, seed: int | None) -> None:
-        if self._log.mcap.closed:
-            raise UsageError(f"{self._log.mcap.path} is closed; record another episode elsewhere")
-        if seed is not None and not 0 <= seed < 2**63:
-            raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
-
-    def _begin(self, episode: _OpenEpisode) -> None:
-        start_ns = episode.start_ns
-        self._columns.begin(self._episodes, start_ns, self._step_ns)
+    def _begin(self, episode: OpenEpisode, observation: Any) -> None:
+        recording = self._recording
+        start_ns, step_ns = recording.next_start_ns, recording.step_ns
+        self._columns.begin(recording.episodes, start_ns, step_ns)
         for image in self._images:
-            image.begin(start_ns, self._step_ns)
+            image.begin(start_ns, step_ns)
         self._full_at = self._next_full()
-        if self._display.begin(start_ns, self._step_ns, self._episodes, episode.policy):
-            self._attach_layout(start_ns)
+        self._keep_observation(observation)
+        recording.show(self._display, episode.policy)
+        self._count(episode, 0)
         self._open = episode
 
     def _make_room(self, step: int) -> None:
@@ -203,22 +200,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """The first step for whose observation there is no room."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
-    def _observe(self, step: int, values: list[NDArray[Any]]) -> None:
-        for write, value in zip(self._writers, values, strict=True):
-            write(step, value)
-        self._display.observe(step)
-        assert self._open is not None
+    def _count(self, episode: OpenEpisode, step: int) -> None:
+        if self._display.shows_steps:
+            self._display.observe(step)
         # From here on the step counts.
-        self._open.steps = step
-
-    def _attach_layout(self, time_ns: int) -> None:
-        display = self._display
-        layout = layout_of(
-            self._description, display.topics, display.telemetry_names, display.follow_frame
-        )
-        self._log.mcap.add_attachment(
-            LAYOUT_NAME, "application/json", json.dumps(layout).encode(), time_ns
-        )
+        episode.steps = step
 
     def _interrupt(self) -> None:
         """Keep an episode that is broken off; one without a transition leaves no trace."""
@@ -233,64 +219,16 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         assert episode is not None
         # Whatever goes wrong now, this episode is not written a second time.
         self._open = None
-        end_ns = episode.start_ns + episode.steps * self._step_ns
-        summary = EpisodeSummary(
-            episode=self._episodes,
-            length=episode.steps,
+        summary = self._recording.summary(
+            episode,
             total_reward=self._columns.total_reward(episode.steps),
             terminated=terminated,
             truncated=truncated,
-            start_time_ns=episode.start_ns,
-            end_time_ns=end_ns,
             reason=reason,
-            policy=episode.policy,
-            epsilon=episode.epsilon,
-            seed=episode.seed,
-            options="" if episode.options is None else _json(episode.options),
         )
         for image in self._images:
             image.flush(episode.steps + 1)
         self._display.end(summary)
-        self._log.write_episodes([summary])
+        self._recording.log.write_episodes([summary])
         self._columns.end(episode.steps, terminated, truncated)
-        self._next_start_ns = end_ns + self._step_ns
-        self._episodes += 1
-
-
-@dataclass
-class _OpenEpisode:
-    """The episode that is being recorded.
-
-    Attributes:
-        start_ns: log_time of its first record.
-        policy: who acts.
-        epsilon: its exploration.
-        seed: given to reset().
-        options: given to reset().
-        steps: transitions that are wholly in the columns.
-    """
-
-    start_ns: int
-    policy: str
-    epsilon: float
-    seed: int | None
-    options: dict[str, Any] | None
-    steps: int = 0
-
-
-def _reason(info: dict[str, Any], terminated: bool) -> str:
-    """Why an episode ended, in the environment's words if it has any."""
-    told = info.get("reason")
-    return told if isinstance(told, str) and told else "terminated" if terminated else "time_limit"
-
-
-def _json(options: dict[str, Any]) -> str:
-    try:
-        return json.dumps(options, default=_plain)
-    except (TypeError, ValueError):
-        return json.dumps(repr(options))
-
-
-def _plain(value: Any) -> Any:
-    """What json cannot write by itself: NumPy's numbers and arrays; anything else by its repr."""
-    return value.tolist() if isinstance(value, np.generic | np.ndarray) else repr(value)
+        self._recording.advance(summary)

@@ -10,9 +10,10 @@ import pytest
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.algorithms import ALGORITHMS, choose_algorithm
 from mcaprl.offline.bc import BCConfig
-from mcaprl.offline.config import TrainingConfig, field_help
+from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.cql import CQLConfig
 from mcaprl.offline.dqn import DQNConfig
+from mcaprl.settings import field_help
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

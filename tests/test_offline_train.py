@@ -21,8 +21,8 @@ from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownN
 from mcaprl.offline.bc import BCConfig
 from mcaprl.offline.cql import CQLConfig
 from mcaprl.offline.dqn import DoubleDQNConfig, DQNConfig
-from mcaprl.offline.progress import TrainingProgress
 from mcaprl.offline.train import train
+from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset import Dataset
 from tests.offline_tasks import corridor
 
@@ -47,7 +47,7 @@ class StopAt:
         self.update = update
 
     def __call__(self, now: TrainingProgress) -> None:
-        if now.update == self.update:
+        if now.done == self.update:
             raise Stopped
 
 
@@ -110,8 +110,8 @@ def test_tensorboard_shows_the_same_curve(tmp_path: Path) -> None:
 def test_progress_is_told_each_log_interval(tmp_path: Path) -> None:
     told: list[TrainingProgress] = []
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=told.append)
-    assert [now.update for now in told] == list(range(10, 101, 10))
-    assert all(now.updates == 100 and now.terms["loss"] > 0 for now in told)
+    assert [now.done for now in told] == list(range(10, 101, 10))
+    assert all(now.total == 100 and now.terms["loss"] > 0 for now in told)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
         from tests.test_offline_train import SHORT_CQL
 
         def linger(now):
-            if now.update == 70:
+            if now.done == 70:
                 print("reached", flush=True)
                 time.sleep(60)
 

@@ -14,6 +14,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.recorder import messages
+from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import LogMetadata
@@ -122,16 +123,9 @@ def test_frames_form_a_tree_under_map(log: Path) -> None:
 
 
 def test_car_frame_is_where_the_telemetry_says(log: Path) -> None:
-    reader = McapReader(log)
-    channel = reader.channel_of("/telemetry")
-    assert channel is not None
-    from mcaprl.recorder.schema import message_dtype
-
-    dtype = message_dtype(reader.schema_of(channel).data.decode())
-    assert dtype is not None
-    told = np.concatenate([rows["payload"] for rows in reader.rows(channel, dtype)])
+    told = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
     frames = [m.transforms[0] for _, m in read(log, "/tf", "tf2_msgs/msg/TFMessage")]
-    assert [frame.child_frame_id for frame in frames] == ["car"] * len(told)
+    assert [frame.child_frame_id for frame in frames] == ["car"] * len(told["x_m"])
     assert [frame.transform.translation.x for frame in frames] == told["x_m"].tolist()
     assert [frame.transform.translation.y for frame in frames] == told["y_m"].tolist()
     assert (told["speed_m_s"] >= 0).all()

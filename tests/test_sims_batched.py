@@ -16,10 +16,17 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import SIMS, make_sim, make_sims
-from tests.test_sims import CASES, every_sim
+from tests.test_sims import CASES
 
 Envs = VectorEnv[Any, Any, Any]
 COUNT = 3
+BATCHED = [name for name, id_ in SIMS.items() if gym.spec(id_).vector_entry_point]
+CASES_BATCHED = [(name, kwargs) for name, kwargs in CASES if name in BATCHED]
+every_batch = pytest.mark.parametrize(
+    ("name", "kwargs"),
+    CASES_BATCHED,
+    ids=[f"{name}-{'-'.join(kwargs)}" for name, kwargs in CASES_BATCHED],
+)
 MODES = [mode.value for mode in AutoresetMode]
 seeds = st.integers(0, 2**31)
 choices = st.lists(
@@ -62,7 +69,7 @@ def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, A
     return SyncVectorEnv(makers, autoreset_mode=mode)
 
 
-@every_sim
+@every_batch
 @pytest.mark.parametrize("mode", MODES)
 @settings(max_examples=6)
 @given(seeds, choices)
@@ -86,7 +93,7 @@ def test_a_batch_does_what_single_sims_do(
             check_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)), "mask")
 
 
-@every_sim
+@every_batch
 def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, Any]) -> None:
     """Vehicle i is the single sim of seed + i, whatever its neighbours do."""
     batch = make_sims(name, COUNT, **kwargs)
@@ -116,7 +123,7 @@ def part(observations: Any, i: int) -> Any:
     return observations[i]
 
 
-@pytest.mark.parametrize("name", SIMS)
+@pytest.mark.parametrize("name", BATCHED)
 def test_gymnasium_makes_batches(name: str) -> None:
     env = gym.make_vec(SIMS[name], num_envs=4, vectorization_mode="vector_entry_point")
     assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -253,7 +260,8 @@ def test_an_unknown_value_names_the_known_ones() -> None:
         make_sims("lane", 2, observation="smell")
 
 
-def test_the_cases_cover_every_kind_of_observation() -> None:
+def test_the_cases_cover_all_that_can_be_batched() -> None:
+    assert set(BATCHED) == {"lane", "powerline", "racer"}
     assert {kwargs.get("observation") for name, kwargs in CASES if name == "lane"} == {
         None,
         "depth",

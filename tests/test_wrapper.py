@@ -297,7 +297,7 @@ def test_disk_full_leaves_the_finished_episodes(
                 return int(self._file.write(data[:40]))
             raise OSError(28, "No space left on device")
 
-    writer = env._log.mcap
+    writer = env._recording.log.mcap
     monkeypatch.setattr(writer, "_file", Full(writer._file))
     with pytest.raises(LogError, match="No space left on device; the episodes finished before"):
         env.step(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,28 +14,33 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """One sign of life, after the metrics and the checkpoint of that update are written.
+    """One sign of life, after everything that belongs to that moment is written.
 
     Attributes:
         seed: which run.
-        update: updates done.
-        updates: updates in all.
-        terms: the loss terms of this update.
+        done: updates done, or steps.
+        total: updates in all, or steps.
+        terms: what was measured, such as the loss.
     """
 
     seed: int
-    update: int
-    updates: int
+    done: int
+    total: int
     terms: Mapping[str, float]
 
 
 ProgressCallback = Callable[[TrainingProgress], None]
-"""Called with each row of metrics; what it raises stops the training."""
+"""Called now and then while training; what it raises stops the training."""
 
 
 @contextmanager
-def terminal_progress() -> Iterator[ProgressCallback]:
-    """A bar per seed with speed, loss and time left; silent where stderr is no terminal."""
+def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
+    """A bar per seed with speed, one term and time left; silent where stderr is no terminal.
+
+    Args:
+        unit: of what is counted, such as `updates`.
+        term: to show beside it, such as `loss`.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda _: None
@@ -42,33 +48,34 @@ def terminal_progress() -> Iterator[ProgressCallback]:
     columns = (
         TextColumn("seed {task.fields[seed]}"),
         BarColumn(),
-        TextColumn("{task.completed}/{task.total} updates, {task.fields[rate]:.0f}/s"),
-        TextColumn("loss {task.fields[loss]:.4g}"),
+        TextColumn(f"{{task.completed}}/{{task.total}} {unit}, {{task.fields[rate]:.0f}}/s"),
+        TextColumn(f"{term} {{task.fields[shown]:.4g}}"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bars:
-        yield _SeedBars(bars).show
+        yield _SeedBars(bars, term).show
 
 
 class _SeedBars:
     """Adds a bar when a seed is first heard of."""
 
-    def __init__(self, bars: Progress) -> None:
+    def __init__(self, bars: Progress, term: str) -> None:
         self._bars = bars
+        self._term = term
         self._tasks: dict[int, TaskID] = {}
         self._started: dict[int, tuple[float, int]] = {}
 
     def show(self, now: TrainingProgress) -> None:
         if now.seed not in self._tasks:
             self._tasks[now.seed] = self._bars.add_task(
-                "", total=now.updates, seed=now.seed, rate=0.0, loss=0.0
+                "", total=now.total, seed=now.seed, rate=0.0, shown=math.nan
             )
-            self._started[now.seed] = (time.perf_counter(), now.update)
-        began, first_update = self._started[now.seed]
+            self._started[now.seed] = (time.perf_counter(), now.done)
+        began, first = self._started[now.seed]
         elapsed_s = max(time.perf_counter() - began, 1e-9)
         self._bars.update(
             self._tasks[now.seed],
-            completed=now.update,
-            rate=(now.update - first_update) / elapsed_s,
-            loss=now.terms["loss"],
+            completed=now.done,
+            rate=(now.done - first) / elapsed_s,
+            shown=now.terms.get(self._term, math.nan),
         )

@@ -1,0 +1,95 @@
+"""Settings of whatever trains: frozen dataclasses, checked when made, each field with its help.
+
+A string under a field, as `TrainingConfig` in `offline/config.py` has them, says what the field is
+for; the command line prints it as the help of the field's option.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+from mcaprl.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Base of all settings: it has none itself."""
+
+    def _require(self, name: str, holds: bool, allowed: str) -> None:
+        """Refuse a setting that cannot be meant.
+
+        Raises:
+            UsageError: it does not hold.
+        """
+        if not holds:
+            raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
+
+
+def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:
+    """Refuse settings that an algorithm does not have.
+
+    Args:
+        algo: the algorithm's name.
+        config: its settings, or their type.
+        given: names of those that were asked for.
+
+    Raises:
+        UsageError: there is such a one.
+    """
+    known = [field.name for field in fields(config)]
+    for name in given:
+        if name not in known:
+            options = ", ".join(map(flag, known))
+            raise UsageError(f"{algo} has no setting {flag(name)}; it has {options}")
+
+
+def plain_settings(found: object) -> dict[str, Any]:
+    """The settings of an earlier session, as JSON has them: lists are tuples again."""
+    settings = found if isinstance(found, dict) else {}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+
+
+def flag(name: str) -> str:
+    """What the command line calls a setting.
+
+    >>> flag("batch_size")
+    '--batch-size'
+    """
+    return f"--{name.replace('_', '-')}"
+
+
+def field_help(config_type: type) -> dict[str, str]:
+    """The doc line under each field of a config dataclass, inherited fields first.
+
+    Args:
+        config_type: a dataclass whose source can be read.
+
+    Returns:
+        Field name -> its line, in the order of the fields.
+    """
+    assert is_dataclass(config_type)
+    lines: dict[str, str] = {}
+    for base in reversed(config_type.__mro__):
+        if is_dataclass(base):
+            lines |= _lines_under_fields(base)
+    return {field.name: lines[field.name] for field in fields(config_type) if field.name in lines}
+
+
+def _lines_under_fields(config_type: type) -> dict[str, str]:
+    """Python keeps no docstring of a field, so it is read from the source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    lines = {}
+    for field, below in zip(tree.body, tree.body[1:], strict=False):
+        match field, below:
+            case (
+                ast.AnnAssign(target=ast.Name(id=name)),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ):
+                lines[name] = inspect.cleandoc(text)
+    return lines

@@ -1,0 +1,314 @@
+"""A topic's messages as columns: one array for each wanted field, in the order of log_time.
+
+Messages of one length are gathered from a chunk at once, by their offsets, whatever stands between
+them; the rest are decoded one by one. Which way a message went cannot be seen in the columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.cdr import Layout, MessageType, message_type
+from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, gather, record_dtype
+from mcaprl.recorder.mcap_reader import McapReader, Span
+
+# Messages of a chunk that are of more lengths than this are decoded one by one.
+_MAX_LENGTHS = 16
+_LAST_NS = np.iinfo(np.int64).max
+
+Columns = dict[str, NDArray[Any]]
+"""Arrays of one length, by field name; texts are arrays of `str` objects."""
+LOG_TIME = "log_time"
+Rows = slice | NDArray[np.int64]
+
+
+class Topic:
+    """A topic of a log: where its messages are, and of which types.
+
+    Attributes:
+        name: of the topic.
+        parts: its messages, as they stand together in the file.
+    """
+
+    def __init__(self, reader: McapReader, name: str) -> None:
+        """Find the messages. Only indexes are read.
+
+        Raises:
+            CorruptLogError: an index is damaged.
+            LogError: messages of the topic are encoded in a way that is not known.
+        """
+        self.name = name
+        self._reader = reader
+        self.parts = [
+            Part(reader, channel, span)
+            for channel in reader.channels_of(name)
+            for span in reader.spans(channel)
+        ]
+        self._counts = [len(part.span.index) for part in self.parts]
+        self._stops = np.cumsum(self._counts, dtype=np.int64)
+
+    def __len__(self) -> int:
+        """Messages."""
+        return sum(self._counts)
+
+    @cached_property
+    def times(self) -> NDArray[np.int64]:
+        """(N,) log_time of each message in the order of its channels and of the file."""
+        times = np.empty(len(self), np.int64)
+        for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
+            times[stop - count : stop] = part.times
+        return times
+
+    @property
+    def channel_ids(self) -> NDArray[np.uint16]:
+        """(N,) of each message, likewise."""
+        ids = np.array([part.channel.id for part in self.parts], np.uint16)
+        return np.repeat(ids, self._counts)
+
+    @property
+    def chunks_rise(self) -> bool:
+        """Whether it is one channel, and no chunk begins before the one before it has ended."""
+        chunks = [part.span.chunk for part in self.parts]
+        return len({part.channel.id for part in self.parts}) == 1 and all(
+            a is not None and b is not None and a.message_end_time <= b.message_start_time
+            for a, b in pairwise(chunks)
+        )
+
+    @cached_property
+    def fields(self) -> dict[str, np.dtype[Any]]:
+        """Fields of its messages, with their dtypes; `object` for texts.
+
+        Raises:
+            LogError: its channels do not agree on them.
+        """
+        types = list({id(part.type): part.type for part in self.parts}.values())
+        if any(other.dtypes != types[0].dtypes for other in types[1:]):
+            raise LogError(
+                f"{self._reader.path}: the channels of {self.name} have messages of different types"
+            )
+        return types[0].dtypes if types else {}
+
+    def read(
+        self, wanted: Collection[str], order: NDArray[np.int64] | None = None, *, threads: int = 1
+    ) -> Columns:
+        """Read columns: `log_time`, and those of fields.
+
+        Args:
+            wanted: names of fields.
+            order: which messages, by their place in `times`; default: all. Only chunks with one
+                of them are read.
+            threads: that decompress and copy at a time.
+
+        Raises:
+            CorruptLogError: a chunk is damaged, or a message does not fit its type.
+            LogError: a field has not the same shape in all messages.
+        """
+        order = np.arange(len(self)) if order is None else order
+        parts = list(self._chosen(order))
+        if not parts:
+            return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
+        columns = parts[0].part.empty_columns(wanted, len(order))
+        times = np.empty(len(order), np.int64)
+
+        def fill(chosen: _Chosen) -> None:
+            times[chosen.rows] = chosen.index["log_time"]
+            chosen.part.fill(columns, chosen.index, chosen.rows)
+
+        _for_each(fill, parts, threads)
+        return {LOG_TIME: times, **columns}
+
+    def _chosen(self, order: NDArray[np.int64]) -> Iterator[_Chosen]:
+        """The parts with messages that are wanted, and where those go."""
+        is_rising = len(order) < 2 or bool((order[1:] > order[:-1]).all())
+        by_place = None if is_rising else np.argsort(order, kind="stable")
+        places = order if by_place is None else order[by_place]
+        bounds = np.searchsorted(places, [0, *self._stops.tolist()]).tolist()
+        for part, stop, (low, high) in zip(self.parts, self._stops, pairwise(bounds), strict=True):
+            if low == high:
+                continue
+            index = part.span.index
+            if high - low < len(index):
+                index = index[places[low:high] - (stop - len(index))]
+            yield _Chosen(part, index, slice(low, high) if by_place is None else by_place[low:high])
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Messages of a part, and their rows in the columns."""
+
+    part: Part
+    index: NDArray[Any]
+    rows: Rows
+
+
+class Part:
+    """Messages of one channel that stand together.
+
+    Attributes:
+        span: where.
+        channel: which.
+        type: of the messages.
+    """
+
+    def __init__(self, reader: McapReader, channel: Channel, span: Span) -> None:
+        """Learn their type; none is read.
+
+        Raises:
+            LogError: messages are encoded in a way that is not known.
+        """
+        self.span, self.channel = span, channel
+        self.type = _type_of(reader, channel)
+        self._reader = reader
+
+    @property
+    def times(self) -> NDArray[np.uint64]:
+        """The log_time of each message."""
+        times: NDArray[np.uint64] = self.span.index["log_time"]
+        if times.max() > _LAST_NS:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} has a log_time beyond the year 2262"
+            )
+        return times
+
+    def empty_columns(self, wanted: Collection[str], count: int) -> Columns:
+        """Columns with the dtypes and shapes of the first message."""
+        example = self._values(self._reader.records_of(self.span), self.span.index[0], wanted)
+        return {
+            name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
+        }
+
+    def fill(self, columns: Columns, index: NDArray[Any], rows: Rows) -> None:
+        """Put the messages of an index into rows of the columns."""
+        records = self._reader.records_of(self.span)
+        if self._put_alike(columns, records, index, rows):
+            return
+        if isinstance(rows, slice):
+            rows = np.arange(rows.start, rows.stop)
+        index, rows = self._put_by_length(columns, records, index, rows)
+        for entry, row in zip(index, rows.tolist(), strict=True):
+            for name, value in self._values(records, entry, columns).items():
+                self._check_shape(name, value, columns[name], entry)
+                columns[name][row] = value
+
+    def _put_by_length(
+        self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Put the messages of one length after the other; gives back those that are of no form."""
+        if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
+            return index, rows
+        lengths = gather(records, index, MESSAGE_HEADER)["length"]
+        several = np.unique(lengths)
+        for length in several if len(several) <= _MAX_LENGTHS else ():
+            alike = lengths == length
+            if self._put_alike(columns, records, index[alike], rows[alike]):
+                index, rows, lengths = index[~alike], rows[~alike], lengths[~alike]
+        return index, rows
+
+    def _put_alike(
+        self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
+    ) -> bool:
+        """Put messages that have the form of the first; does nothing if one has not."""
+        found = self.alike(records, index, columns)
+        if found is None:
+            return False
+        if any(found[name].shape[1:] != column.shape[1:] for name, column in columns.items()):
+            return False
+        for name, column in columns.items():
+            column[rows] = self._texts(found[name]) if column.dtype.kind == "O" else found[name]
+        return True
+
+    def alike(
+        self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
+    ) -> NDArray[Any] | None:
+        """The messages as one structured array; None if they have not one form."""
+        layout = self.type.layout(self._message(records, index[0]), wanted)
+        return None if layout is None else self._laid_out(records, index, layout)
+
+    def _laid_out(
+        self, records: memoryview, index: NDArray[Any], layout: Layout
+    ) -> NDArray[Any] | None:
+        dtype = record_dtype(layout.dtype)
+        if int(index["offset"].max()) > len(records) - dtype.itemsize:
+            return None
+        rows = gather(records, index, dtype)
+        heads_fit = (
+            (rows["opcode"] == Opcode.MESSAGE).all()
+            and (rows["length"] == dtype.itemsize - RECORD_HEADER_BYTES).all()
+            and (rows["channel_id"] == self.channel.id).all()
+            and (rows["log_time"] == index["log_time"]).all()
+        )
+        payloads: NDArray[Any] = rows["payload"]
+        return payloads if heads_fit and layout.fits(payloads) else None
+
+    def _message(self, records: memoryview, entry: Any) -> bytes:
+        return self._reader.message(
+            records, self.channel, int(entry["log_time"]), int(entry["offset"])
+        )
+
+    def _values(self, records: memoryview, entry: Any, wanted: Collection[str]) -> Columns:
+        """Fields of one message, decoded by itself."""
+        data = self._message(records, entry)
+        try:
+            message = self.type.decode(data)
+        except CorruptLogError as error:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} at log_time {entry['log_time']}:"
+                f" {error}"
+            ) from error
+        return {name: np.asarray(getattr(message, name), self.type.dtypes[name]) for name in wanted}
+
+    def _texts(self, values: NDArray[Any]) -> list[str]:
+        try:
+            return [text.decode() for text in values.tolist()]
+        except UnicodeDecodeError as error:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} has a text that is no UTF-8"
+            ) from error
+
+    def _check_shape(
+        self, name: str, value: NDArray[Any], column: NDArray[Any], entry: Any
+    ) -> None:
+        if value.shape != column.shape[1:]:
+            raise LogError(
+                f"{self._reader.path}: {name} of {self.channel.topic} has shape {value.shape} at"
+                f" log_time {entry['log_time']} and {column.shape[1:]} elsewhere; all must have one"
+            )
+
+
+def _type_of(reader: McapReader, channel: Channel) -> MessageType:
+    if channel.message_encoding != "cdr":
+        raise LogError(
+            f"{reader.path}: messages of {channel.topic} are {channel.message_encoding!r};"
+            " known is 'cdr'"
+        )
+    schema = reader.schema_of(channel)
+    try:
+        return message_type(schema)
+    except LogError as error:
+        raise LogError(f"{reader.path}: {channel.topic}: {error}") from error
+
+
+def _for_each(do: Callable[[_Chosen], None], parts: list[_Chosen], threads: int) -> None:
+    """Call for each part, `threads` at a time; the first error ends it."""
+    if threads <= 1 or len(parts) == 1:
+        for part in parts:
+            do(part)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for _ in pool.map(do, parts):
+                pass
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
