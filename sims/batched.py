@@ -177,8 +177,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _told(self, chosen: Bools, ended_itself: Bools) -> dict[str, Any]:
         """Give the infos of some vehicles, with the reasons of those that ended by themselves."""
         infos: dict[str, Any] = {}
+        are_all = chosen.all()
         for key, values in self.fleet.infos().items():
-            infos[key], infos[f"_{key}"] = np.where(chosen, values, 0), chosen.copy()
+            infos[key] = values if are_all else np.where(chosen, values, 0)
+            infos[f"_{key}"] = chosen.copy()
         if ended_itself.any():
             reasons = np.full(self.num_envs, None, dtype=object)
             reasons[ended_itself] = self._reasons[self.fleet.ends[ended_itself]]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import SIMS, make_sim, make_sims
+from mcaprl.sims.pilots import make_pilot
 from tests.test_sims import CASES
 
 Envs = VectorEnv[Any, Any, Any]
@@ -175,6 +176,21 @@ def test_each_drone_has_gusts_of_its_own() -> None:
         seen, *_ = env.step(np.full(4, 6))
     assert seen[0].tolist() == seen[1].tolist()
     assert seen[1].tolist() != seen[2].tolist()
+
+
+def test_the_racer_s_own_time_limit_comes_before_the_registered_one() -> None:
+    """1,000 steps and 10,000: the pilot's actions of a single sim, in the first of two cars."""
+    single = make_sim("racer", start="line")
+    pilot = make_pilot(single)
+    observation, _ = single.reset(seed=3)
+    batch = make_sims("racer", 2, start="line")
+    batch.reset(seed=3)
+    for step in range(1, 1_001):
+        action = int(pilot.act(observation[np.newaxis])[0])
+        observation, *_ = single.step(action)
+        _, _, terminated, truncated, infos = batch.step(np.array([action, 0]))
+        assert (terminated[0], truncated[0]) == (False, step == 1_000)
+    assert infos["reason"][0] == "time_limit"
 
 
 def test_any_other_environment_is_batched_by_gymnasium() -> None:
