@@ -40,6 +40,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("highway-lane", {"road": "racetrack-v0"}),
 ]
 ON_THE_GROUND = ("lane", "racer", "highway-lane")
+BATCHED = [name for name, env_id in SIMS.items() if gym.spec(env_id).vector_entry_point]
 LONGEST = 3_000
 every_sim = pytest.mark.parametrize(
     ("name", "kwargs"), CASES, ids=[f"{name}-{'-'.join(kwargs)}" for name, kwargs in CASES]
@@ -202,6 +203,9 @@ def test_an_action_that_does_not_exist_is_refused(name: str, kwargs: dict[str, A
     for action in (-1, last + 1):
         with pytest.raises(UsageError, match=f"0 to {last} do"):
             sim.step(action)
+    if name in BATCHED:
+        with pytest.raises(UsageError, match="is no whole number"):
+            sim.step(1.5)
 
 
 @pytest.mark.parametrize("name", SIMS)

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import SIMS, make_sim, make_sims
 from mcaprl.sims.pilots import make_pilot
-from tests.test_sims import CASES
+from tests.test_sims import BATCHED, CASES
 
 Envs = VectorEnv[Any, Any, Any]
 COUNT = 3
-BATCHED = [name for name, id_ in SIMS.items() if gym.spec(id_).vector_entry_point]
 CASES_BATCHED = [(name, kwargs) for name, kwargs in CASES if name in BATCHED]
 every_batch = pytest.mark.parametrize(
     ("name", "kwargs"),
