@@ -1,4 +1,4 @@
-"""Measures recording, writing and reading beside other libraries: `make bench`.
+"""Measures recording, writing, reading and the sims beside other libraries: `make bench`.
 
 All sides run in one process, in turns, on the same data, by CPU time, and the best of several turns
 counts. What is printed are ratios: seconds depend on the machine, ratios much less.
@@ -22,6 +22,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 
 import mcaprl
+from benchmarks import sims
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.schema import message_dtype, step_schema
 
@@ -167,6 +168,9 @@ def main() -> None:
         "read to columns, share of plain zstd's speed": reading["zstd"] / reading["ours"],
         "bytes per transition on disk (raw: 97)": bytes_per_step,
     }
+    timed = sims.sides()
+    seconds = best_seconds({name: side.run for name, side in timed.items()})
+    results |= sims.ratios(seconds, timed)
     for name, value in results.items():
         print(f"{value:10.2f}  {name}")
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
