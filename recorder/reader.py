@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoStepsError, SpaceError
+from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
 from mcaprl.recorder.columns import Columns, Topic
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episodes import (
@@ -37,7 +37,8 @@ def open_logs(data: str | Path | Sequence[str | Path]) -> Dataset:
     """Read logs into memory.
 
     All chunks read are checked against their CRCs. A log that was cut off, or is still being
-    written, gives its finished episodes and a warning.
+    written, gives its finished episodes and a warning; one of several that has none yet is left
+    out, with a warning.
 
     Args:
         data: a file, a folder of `.mcap` files, a glob, or a sequence of these. Logs of one call
@@ -47,7 +48,17 @@ def open_logs(data: str | Path | Sequence[str | Path]) -> Dataset:
         LogError: a file is missing, no MCAP, damaged, or has no finished episode.
         SpaceError: the logs' spaces differ.
     """
-    return Dataset.concatenate([read_log(path) for path in find_logs(data)])
+    paths, parts = find_logs(data), []
+    for path in paths:
+        try:
+            parts.append(read_log(path))
+        except NoEpisodesError as error:
+            if len(paths) == 1:
+                raise
+            warnings.warn(f"{error}: left out", stacklevel=2)
+    if not parts:
+        raise NoEpisodesError(f"{len(paths)} logs have no finished episode, {paths[0]} first")
+    return Dataset.concatenate(parts)
 
 
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -87,7 +98,7 @@ def read_log(path: Path) -> Dataset:
     columns["log_time"] = steps.times if order is None else steps.times[order]
     lengths = episode_lengths(columns, str(path))
     if not len(lengths):
-        raise NoStepsError(f"{path} has no finished episode")
+        raise NoEpisodesError(f"{path} has no finished episode")
     frames = int(lengths.sum()) + len(lengths)
     if frames < len(steps) or not reader.complete:
         warnings.warn(
@@ -158,7 +169,7 @@ def _vector_fields(metadata: LogMetadata) -> list[str]:
 
 def _check_fields(path: Path, steps: Topic, wanted: Sequence[str]) -> None:
     if not len(steps):
-        raise NoStepsError(f"{path} has no finished episode")
+        raise NoEpisodesError(f"{path} has no finished episode")
     missing = [name for name in wanted if name not in steps.fields]
     if missing:
         raise LogError(f"{path}: {STEP_TOPIC} has no field {', '.join(missing)}")
