@@ -12,6 +12,7 @@ from typing import Any
 import click
 import gymnasium as gym
 
+from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.show import print_json, print_table, progress, write_json
@@ -19,24 +20,70 @@ from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluate import PolicyScore, bootstrap_interval, normalize
+from mcaprl.sims.evaluate import Improvement, PolicyScore, improvements, normalize
 from mcaprl.sims.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.statistics import bootstrap_interval, interquartile_mean
 
 RESULT_NAME = "evaluation.json"
 
 
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
-@click.option("--sim", required=True, help="lane, powerline, racer, or any Gymnasium id.")
+@click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
+@click.option("--data", help="Estimate from these logs alone, instead of running a sim.")
 @click.option("--episodes", default=30, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=1_000_000, show_default=True, type=click.IntRange(0))
 @sim_options
+@click.option("--gamma", type=click.FloatRange(0, 1), help="With --data: discount. [default: 0.97]")
+@click.option(
+    "--epsilon",
+    type=click.FloatRange(0, 1),
+    help="With --data: probability of a random action instead of the policy's.  [default: 0]",
+)
+@click.option(
+    "--updates",
+    type=click.IntRange(1),
+    help="With --data: gradient steps of the model.  [default: 10000]",
+)
 @click.option("--behavior", metavar="DATA", help="Compare with the returns in these logs.")
 @click.option("--record", "record_path", type=click.Path(path_type=Path), help="Log the episodes.")
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for pictures and JSON.")
+@click.option("--report", type=click.Path(path_type=Path), help="Folder for a page and more.")
 @click.option("--overwrite", is_flag=True, help="Replace a log that is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def evaluate(
+    policies: tuple[str, ...],
+    sim: str | None,
+    data: str | None,
+    seed: int,
+    as_json: bool,
+    **others: Any,
+) -> None:
+    """Run each POLICY greedily through the same episodes of SIM, or ask the logs DATA about it.
+
+    POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
+    are given beside random = 0 and pilot = 1, where the sim has a pilot. Without a sim the values
+    are estimates of discounted returns, each with a verdict on whether the logs suffice for it.
+    """
+    if (sim is None) == (data is None):
+        raise UsageError("evaluate needs --sim SIM or --data DATA, one of the two")
+    of_data = {name: others.pop(name) for name in ("gamma", "epsilon", "updates")}
+    _refuse_unused(of_data if data is None else others, "data" if data is None else "sim")
+    if data is not None:
+        given = {name: value for name, value in of_data.items() if value is not None}
+        result = evaluate_from_log(policies, data, seed=seed, **given)
+        print_json(result) if as_json else print_estimates(result)
+        return
+    assert sim is not None
+    _evaluate_in_sim(policies, sim, seed=seed, as_json=as_json, **others)
+
+
+def _refuse_unused(options: dict[str, Any], needs: str) -> None:
+    for name, value in options.items():
+        if value and name != "episodes":
+            raise UsageError(f"--{name.removesuffix('_path')} is of use with --{needs} only")
+
+
+def _evaluate_in_sim(
     policies: tuple[str, ...],
     sim: str,
     episodes: int,
@@ -48,34 +95,34 @@ def evaluate(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Run each POLICY greedily through the same episodes of SIM.
-
-    POLICY is pilot, random, or a trained run; of a run with several seeds all are scored. Scores
-    are given beside random = 0 and pilot = 1, where the sim has a pilot.
-    """
     env = make_sim(sim, **sim_arguments)
     with closing(env):
         # What can be wrong is looked for first: episodes may take minutes.
         logged = _behavior(behavior, env, record_path)
         if report is not None:
             import_extra("matplotlib", "report")
+            import_extra("jinja2", "report")
             write_json(report / RESULT_NAME, {})
         world = list(getattr(env.unwrapped, "static_scene", list)())
         scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
     if logged is not None:
         logged = _scaled(logged, scores)
+    compared = improvements(scores)
     result = {
         "sim": sim,
         "seed": seed,
         "behavior": logged,
         "policies": [score.to_json() for score in scores],
+        "improvements": [improvement.to_json() for improvement in compared],
     }
     if as_json:
         print_json(result)
     else:
         _print_scores(sim, episodes, scores, logged)
+        _print_improvements(compared)
     if report is not None:
-        _write_report(report, result, scores, world)
+        recorded = None if record_path is None else (record_path, len(set(policies)))
+        _write_report(report, result, scores, compared, world, recorded)
 
 
 def _score_all(
@@ -163,15 +210,19 @@ def _scaled(logged: dict[str, Any], scores: list[PolicyScore]) -> dict[str, Any]
 
 
 def _write_report(
-    folder: Path, result: dict[str, Any], scores: list[PolicyScore], world: list[Any]
+    folder: Path,
+    result: dict[str, Any],
+    scores: list[PolicyScore],
+    compared: list[Improvement],
+    world: list[Any],
+    recorded: tuple[Path, int] | None,
 ) -> None:
-    from mcaprl.sims.report import comparison_picture, trajectory_picture
+    from mcaprl.sims.report import evaluation_page
 
     write_json(folder / RESULT_NAME, result)
     logged = result["behavior"]
     band = None if logged is None else (logged["mean_return"], *logged["interval"])
-    comparison_picture(folder / "comparison.png", scores, f"{result['sim']}: mean return", band)
-    trajectory_picture(folder / "trajectories.png", scores, world)
+    evaluation_page(folder, result["sim"], scores, compared, world, band, recorded)
 
 
 def _print_scores(
@@ -184,6 +235,7 @@ def _print_scores(
                 "behavior, as logged",
                 f"{logged['mean_return']:.2f}",
                 _interval(logged["interval"]),
+                "",
                 _score(logged["normalized_score"]),
                 f"{logged['episodes']} episodes",
             ]
@@ -193,6 +245,7 @@ def _print_scores(
             score.policy,
             f"{score.mean_return:.2f}",
             _interval(score.interval),
+            f"{float(interquartile_mean(score.returns)):.2f}",
             _score(score.normalized_score),
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
         ]
@@ -200,8 +253,19 @@ def _print_scores(
     ]
     print_table(
         f"{sim}: {episodes} episodes for each policy and training seed",
-        ["policy", "mean return", "95 % interval", "random 0, pilot 1", "ends"],
+        ["policy", "mean return", "95 % interval", "middle half", "random 0, pilot 1", "ends"],
         rows,
+    )
+
+
+def _print_improvements(compared: list[Improvement]) -> None:
+    print_table(
+        "how often an episode of one returns more than an episode of the other",
+        ["policy", "than", "probability", "95 % interval"],
+        [
+            [one.better, one.than, f"{one.probability:.2f}", _interval(one.interval)]
+            for one in compared
+        ],
     )
 
 

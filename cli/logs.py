@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from mcaprl.cli.show import print_facts, print_json, size, write_json
 from mcaprl.errors import CorruptLogError, LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.lint import Finding, lint
+from mcaprl.recorder.log_reader import describe
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.reader import describe, find_logs, open_logs
+from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim
@@ -27,7 +28,9 @@ from mcaprl.sims import SIMS, make_sim
 
 @click.command()
 @click.argument("data", nargs=-1, required=True)
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for a picture and JSON.")
+@click.option(
+    "--report", type=click.Path(path_type=Path), help="Folder for a page, a picture and JSON."
+)
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
 def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
@@ -35,21 +38,29 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
     paths = find_logs(data)
     if report is not None:
         import_extra("matplotlib", "report")
+        import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         dataset = open_logs(paths)
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
-    facts["problems"] = [str(warning.message) for warning in caught] + facts["problems"]
+    findings = lint(dataset)
+    facts["problems"] = [str(warning.message) for warning in caught] + [
+        str(finding) for finding in findings if finding.severity == "problem"
+    ]
+    facts["findings"] = [asdict(finding) for finding in findings]
     if report is not None:
-        from mcaprl.recorder.report import dataset_picture
+        from mcaprl.recorder.report import dataset_page, dataset_picture
 
+        title = _title(dataset.sources)
         write_json(report / "dataset.json", facts)
-        dataset_picture(report / "dataset.png", dataset, _title(dataset.sources))
+        dataset_picture(report / "dataset.png", dataset, title)
+        rows = _fact_rows(facts, len(paths))
+        dataset_page(report / "index.html", dataset, title, rows, findings)
     if as_json:
         print_json(facts)
     else:
-        _print_facts(facts, dataset, len(paths))
+        _print_facts(facts, findings, dataset, len(paths))
     return int(strict and bool(facts["problems"]))
 
 
@@ -100,13 +111,6 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """The facts that `info --json` gives, but for the files' size."""
     statistics = dataset.statistics
-    not_finite = {k: c.not_finite for k, c in statistics.observations.items() if c.not_finite}
-    problems = [
-        f"{count} values of {name} are NaN or infinite" for name, count in not_finite.items()
-    ]
-    bad_rewards = int((~np.isfinite(dataset.rewards)).sum())
-    if bad_rewards:
-        problems.append(f"{bad_rewards} rewards are NaN or infinite")
     return {
         "env_id": dataset.env_id,
         "episodes": statistics.episodes,
@@ -123,13 +127,22 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
         },
         "policies": sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         "ends": dict(statistics.ends),
-        "problems": problems,
     }
 
 
-def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
+def _print_facts(
+    facts: dict[str, Any], findings: list[Finding], dataset: Dataset, files: int
+) -> None:
+    rows = _fact_rows(facts, files)
+    rows.append(("problems", "\n".join(facts["problems"]) or "none"))
+    notes = [str(finding) for finding in findings if finding.severity == "note"]
+    rows += [("notes", "\n".join(notes))] if notes else []
+    print_facts(_title(dataset.sources), rows)
+
+
+def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
     low, high = facts["return_range"]
-    rows = [
+    return [
         ("environment", facts["env_id"] or "unknown"),
         ("files", f"{files}, {size(facts['size_bytes'])}"),
         ("episodes", str(facts["episodes"])),
@@ -141,9 +154,7 @@ def _print_facts(facts: dict[str, Any], dataset: Dataset, files: int) -> None:
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),
         ("ends", _counts(facts["ends"])),
-        ("problems", "; ".join(facts["problems"]) or "none"),
     ]
-    print_facts(_title(dataset.sources), rows)
 
 
 def _title(sources: Sequence[Path]) -> str:

@@ -58,6 +58,10 @@ def policy_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _load(path: Path) -> list[Policy]:
+    if path.is_file() or any(path.rglob("best_model.zip")):
+        from mcaprl.online.policy import load_policies as load_online
+
+        return list(load_online(path))
     from mcaprl.offline.policy import load_policies
 
     return list(load_policies(path))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,6 +82,17 @@ class TransitionBuffer:
     def __len__(self) -> int:
         """The number of transitions."""
         return len(self.rewards)
+
+    def take(self, rows: Tensor) -> TransitionBuffer:
+        """The transitions in these (N,) rows, copied."""
+        return replace(
+            self,
+            observations=self.observations.index_select(0, rows),
+            actions=self.actions.index_select(0, rows),
+            rewards=self.rewards.index_select(0, rows),
+            continues=self.continues.index_select(0, rows),
+            next_observations=self.next_observations.index_select(0, rows),
+        )
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw transitions uniformly, with replacement."""

@@ -73,6 +73,28 @@ def double_q_learning(
     return _difference(q_tm1, a_tm1, target)
 
 
+def expected_sarsa(
+    q_tm1: Tensor, a_tm1: Tensor, r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Tensor
+) -> TemporalDifference:
+    """The error r + discount sum_a pi(a|s') Q'(s', a) - Q(s, a) of evaluating a policy pi.
+
+    See "A theoretical and empirical analysis of expected Sarsa",
+    https://doi.org/10.1109/ADPRL.2009.4927542.
+
+    Args:
+        q_tm1: (B, A) values of the network that learns.
+        a_tm1: (B,) int64 actions taken.
+        r_t: (B,) rewards.
+        discount_t: (B,) discounts.
+        q_t: (B, A) values of the target network.
+        pi_t: (B, A) probabilities of the policy in the next states.
+    """
+    _check_transitions(q_tm1, a_tm1, r_t, discount_t, q_t)
+    _check_shape("pi_t", pi_t, tuple(q_t.shape))
+    target = r_t + discount_t * (pi_t * q_t).sum(1)
+    return _difference(q_tm1, a_tm1, target)
+
+
 def huber(error: Tensor) -> Tensor:
     """(B,) half the squared error up to 1, the absolute error minus a half beyond.
 

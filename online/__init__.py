@@ -1,5 +1,20 @@
-"""Online learning beside recording. Empty for now: this version learns from logs only.
+"""Online learning that records what it does: SB3's DQN and Double DQN, PPO and A2C.
 
-The package has its place already because the direction of imports is fixed: it will stand on
-`sims` and `recorder`, beside `offline`, and neither of the two will import the other.
+Importing this package loads no torch; its modules do.
+
+    from mcaprl.online.task import Task
+    from mcaprl.online.train import train
+
+    train(Task.for_sim("lane", "double-dqn"), "runs/lane", seeds=4)
+
+Raises:
+    MissingExtraError: the packages of the `online` extra are not installed.
 """
+
+from importlib.util import find_spec
+
+from mcaprl.errors import MissingExtraError
+
+for _package in ("stable_baselines3", "tensorboard"):
+    if find_spec(_package) is None:
+        raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[online]'")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,15 +57,18 @@ def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDAr
     return rows
 
 
-def compress(data: Any, compression: str) -> bytes:
-    """Compress a chunk's records: `zstd` (level 1), `lz4`, or `none`."""
+def compressor(compression: str, zstd_level: int = 1) -> Callable[[Any], bytes]:
+    """A function that compresses a chunk's records: `zstd`, `lz4`, or `none`.
+
+    It keeps its memory between calls, so only one thread may call it.
+    """
     match compression:
         case "zstd":
-            return zstandard.ZstdCompressor(level=1).compress(data)
+            return zstandard.ZstdCompressor(level=zstd_level).compress
         case "lz4":
-            return bytes(lz4.frame.compress(data))
+            return lambda data: bytes(lz4.frame.compress(data))
         case _:
-            return bytes(data)
+            return bytes
 
 
 @dataclass(frozen=True)

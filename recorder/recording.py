@@ -126,6 +126,7 @@ class Recording:
         has_episodes = self.episodes > self._first_in_file
         if parts is not None and has_episodes and mcap.position >= parts.max_file_bytes:
             mcap.start_next(parts.next())
+            display.forget_what_stands()
             self._first_in_file = self.episodes
         if display.begin(start_ns, self.step_ns, self.episodes, policy):
             layout = layout_of(

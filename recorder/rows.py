@@ -1,13 +1,17 @@
-"""Rows that wait to be written: what the environment gives, copied into preallocated columns.
+"""Values that wait to be written: what the environment gives, copied and kept in order.
 
-The columns know no "present row" of their own: a row is found by the step it belongs to. So there
-is one counter, the wrapper's, and a step counts only when all of it is in place.
+Per step a value costs little more than its copy: all else (times, counters, constants, the layout
+of a message) is done by whole columns when a chunk is written. A list knows no "present row" of its
+own: its values belong to the steps from the first one that is not on disk, and a step counts only
+when all of it is in place. So there is one counter, the recorder's; what was kept beyond it is
+forgotten.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
+from array import array
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,28 +23,106 @@ from mcaprl.errors import SpaceError
 from mcaprl.recorder.log_writer import LogWriter
 from mcaprl.recorder.spaces import Leaf, observation_leaves
 
-Writer = Callable[[int, NDArray[Any]], None]
-"""Puts a leaf's value at a step."""
+Keeper = Callable[[Any], None]
+"""Keeps a copy of a value.
+
+Raises:
+    SpaceError: it is not one of its space's.
+"""
 Converter = Callable[[Any], NDArray[Any]]
 """Takes a leaf's value out of an observation, in the dtype and shape that its space declares."""
 
 
+class Arrays:
+    """Arrays of one dtype and size that wait, as bytes."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        """Begin with none."""
+        self._dtype = dtype
+        self._waiting: list[bytes] = []
+        self.append = self._waiting.append
+
+    def keeper(self, leaf: Leaf) -> Keeper:
+        """A function that keeps values of a leaf."""
+        append, shape, dtype = self.append, leaf.shape, leaf.dtype
+
+        def keep(value: Any) -> None:
+            if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
+                append(value.tobytes())
+            else:
+                append(as_declared(value, leaf).tobytes())
+
+        return keep
+
+    def put(self, column: NDArray[Any]) -> None:
+        """Put the first values into a column; they stay."""
+        joined = b"".join(self._waiting[: len(column)])
+        column[:] = np.frombuffer(joined, self._dtype).reshape(column.shape)
+
+    def forget(self, count: int | None = None) -> None:
+        """Drop the first values, or all."""
+        del self._waiting[:count]
+
+
+class Integers:
+    """64-bit integers that wait."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._waiting = array("q")
+
+    def keeper(self, leaf: Leaf) -> Keeper:
+        """A function that keeps values of a leaf."""
+        append = self._waiting.append
+
+        def keep(value: Any) -> None:
+            try:
+                append(value)
+            except (TypeError, OverflowError):
+                append(as_declared(value, leaf).item())
+
+        return keep
+
+    def put(self, column: NDArray[Any]) -> None:
+        """Put the first values into a column; they stay."""
+        column[:] = self._waiting[: len(column)]
+
+    def forget(self, count: int | None = None) -> None:
+        """Drop the first values, or all."""
+        del self._waiting[:count]
+
+
 class StepColumns:
-    """The rows of `/rl/step` that are not yet on disk, all of one episode."""
+    """What of `/rl/step` is not yet on disk, all of one episode.
+
+    Attributes:
+        keep_action: keeps an action.
+        keep_behavior_prob: keeps its probability.
+        keep_reward: keeps what it brought.
+    """
 
     def __init__(self, log: LogWriter) -> None:
-        """Preallocate a chunk of them."""
+        """Preallocate a chunk of rows."""
         self._log = log
         self._rows = log.step_rows()
         payload = self._rows["payload"]
-        self.fields = {name: payload[name] for name in payload.dtype.names or ()}
-        self._reward, self._prob = self.fields["reward"], self.fields["behavior_prob"]
-        self._action, self._action_leaf = self.fields["action"], log.action
+        self._fields = {name: payload[name] for name in payload.dtype.names or ()}
+        self._rewards, self._probs = array("d"), array("d")
+        self._waiting: dict[str, Arrays | Integers] = {}
+        self.keep_action = self.keeper(log.action)
+        self.keep_behavior_prob, self.keep_reward = self._probs.append, self._rewards.append
+
+    def keeper(self, leaf: Leaf) -> Keeper:
+        """A function that keeps values of a leaf."""
+        is_integer = leaf.shape == () and leaf.dtype == np.int64
+        waiting = self._waiting[leaf.name] = Integers() if is_integer else Arrays(leaf.dtype)
+        return waiting.keeper(leaf)
 
     def begin(self, episode: int, start_ns: int, step_ns: int) -> None:
         """Begin an episode: `start_ns` is the log_time of its first row."""
         self._episode, self._start_ns, self._step_ns = episode, start_ns, step_ns
         self._first_step, self._total_reward = 0, 0.0
+        self._forget(None)
 
     @property
     def full_at(self) -> int:
@@ -52,35 +134,10 @@ class StepColumns:
 
         That one stays behind, for its episode may end there and be marked so.
         """
-        keep = step - self._first_step - 1
-        self._write(keep)
-        self._rows["payload"][0] = self._rows["payload"][keep]
-
-    def act(self, step: int, action: Any, behavior_prob: float) -> None:
-        """Put the action that is taken at `step`, and its probability.
-
-        Raises:
-            SpaceError: the action is not one of the action space's.
-        """
-        row = step - self._first_step
-        if type(action) in (int, np.int64) and not self._action_leaf.shape:
-            self._action[row] = action
-        else:
-            self._action[row] = _flat(as_declared(action, self._action_leaf))
-        self._prob[row] = behavior_prob
-
-    def reward(self, step: int, reward: float) -> None:
-        """Put what the action at `step` brought."""
-        self._reward[step - self._first_step] = reward
-
-    def writer(self, leaf: Leaf) -> Writer:
-        """A function that puts observations of a leaf."""
-        column = self.fields[leaf.name]
-
-        def write(step: int, value: NDArray[Any]) -> None:
-            column[step - self._first_step] = _flat(value)
-
-        return write
+        count = step - self._first_step - 1
+        self._fill(count, count)
+        self._write(count)
+        self._forget(count)
 
     def end(self, steps: int, terminated: bool, truncated: bool) -> None:
         """Mark the last transition and the final row, and write all.
@@ -90,8 +147,9 @@ class StepColumns:
             terminated: of the last one.
             truncated: likewise.
         """
-        final, fields = steps - self._first_step, self.fields
+        final, fields = steps - self._first_step, self._fields
         assert final >= 1, "the last transition stays in memory"
+        self._fill(final, final + 1)
         fields["terminated"][final - 1], fields["truncated"][final - 1] = terminated, truncated
         fields["action"][final], fields["reward"][final] = 0, 0.0
         fields["behavior_prob"][final], fields["final"][final] = math.nan, True
@@ -101,17 +159,31 @@ class StepColumns:
 
     def total_reward(self, steps: int) -> float:
         """What the first `steps` transitions brought, added up in order."""
-        return add_up(self._reward[: steps - self._first_step], self._total_reward)
+        rewards = np.array(self._rewards[: steps - self._first_step])
+        return add_up(rewards, self._total_reward)
+
+    def _fill(self, actions: int, observations: int) -> None:
+        """Put what waits into the rows."""
+        self._fields["reward"][:actions] = self._rewards[:actions]
+        self._fields["behavior_prob"][:actions] = self._probs[:actions]
+        for name, waiting in self._waiting.items():
+            count = actions if name == "action" else observations
+            waiting.put(self._fields[name][:count])
 
     def _write(self, count: int) -> None:
         rows = self._rows[:count]
         steps = np.arange(self._first_step, self._first_step + count)
         rows["log_time"] = self._start_ns + steps * self._step_ns
-        self.fields["episode"][:count] = self._episode
-        self.fields["step"][:count] = steps
+        self._fields["episode"][:count] = self._episode
+        self._fields["step"][:count] = steps
         self._total_reward = self.total_reward(self._first_step + count)
         self._log.write_steps(rows)
         self._first_step += count
+
+    def _forget(self, count: int | None) -> None:
+        del self._rewards[:count], self._probs[:count]
+        for waiting in self._waiting.values():
+            waiting.forget(count)
 
 
 class ImageColumn:
@@ -124,44 +196,60 @@ class ImageColumn:
         assert encoding is not None, f"{topic} has no images"
         self._log = log
         self._rows = log.add_image_topic(topic, shape, encoding)
-        self._column = self._rows["payload"]["data"]
+        self._pictures = Arrays(np.dtype(np.uint8))
         self._first_step = 0
+
+    def keeper(self, leaf: Leaf) -> Keeper:
+        """A function that keeps the pictures of a leaf."""
+        return self._pictures.keeper(leaf)
 
     def begin(self, start_ns: int, step_ns: int) -> None:
         """Begin an episode: `start_ns` is the log_time of its first picture."""
         self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
+        self._pictures.forget()
 
     @property
     def full_at(self) -> int:
         """The first step for whose picture there is no row."""
         return self._first_step + len(self._rows)
 
-    def put(self, step: int, picture: NDArray[Any]) -> None:
-        """Put the picture at `step`, of any shape with as many bytes."""
-        self._column[step - self._first_step] = picture.reshape(-1)
+    def keep(self, picture: NDArray[Any]) -> None:
+        """Keep the next step's picture, of any dtype with as many bytes."""
+        self._pictures.append(picture.tobytes())
 
     def flush(self, stop: int) -> None:
         """Write all pictures before step `stop`."""
         rows = self._rows[: stop - self._first_step]
         steps = np.arange(self._first_step, stop)
         rows["log_time"] = self._start_ns + steps * self._step_ns
+        self._pictures.put(rows["payload"]["data"])
         self._log.write_images(rows)
+        self._pictures.forget(len(rows))
         self._first_step = stop
+
+
+def observation_keeper(
+    space: spaces.Space[Any], columns: StepColumns, images: Mapping[Leaf, ImageColumn]
+) -> Keeper:
+    """A function that keeps observations of a space."""
+    leaves = observation_leaves(space)
+    keepers = [
+        images[leaf].keeper(leaf) if leaf in images else columns.keeper(leaf) for leaf in leaves
+    ]
+    if not leaves[0].path:
+        return keepers[0]
+    parts = [(_part(leaf), keep) for leaf, keep in zip(leaves, keepers, strict=True)]
+
+    def keep_all(observation: Any) -> None:
+        for part, keep in parts:
+            keep(part(observation))
+
+    return keep_all
 
 
 def converters(space: spaces.Space[Any]) -> list[Converter]:
     """For each leaf, the function that takes its value out of an observation."""
     return [_converter(leaf) for leaf in observation_leaves(space)]
-
-
-def writers(
-    space: spaces.Space[Any], columns: StepColumns, images: Mapping[Leaf, ImageColumn]
-) -> list[Writer]:
-    """For each leaf, the function that puts its value at a step."""
-    return [
-        images[leaf].put if leaf in images else columns.writer(leaf)
-        for leaf in observation_leaves(space)
-    ]
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
@@ -206,15 +294,10 @@ def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
 
 
 def _converter(leaf: Leaf) -> Converter:
-    shape, dtype, path = leaf.shape, leaf.dtype, leaf.path
+    shape, dtype, part = leaf.shape, leaf.dtype, _part(leaf)
 
     def convert(observation: Any) -> NDArray[Any]:
-        value = observation
-        if path:
-            try:
-                value = leaf.of(observation)
-            except (KeyError, IndexError, TypeError) as error:
-                raise SpaceError(f"{_where(leaf)} is missing") from error
+        value = part(observation)
         if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
             return value
         return as_declared(value, leaf)
@@ -222,10 +305,18 @@ def _converter(leaf: Leaf) -> Converter:
     return convert
 
 
+def _part(leaf: Leaf) -> Callable[[Any], Any]:
+    """A function that takes a leaf's value out of an observation, as it is."""
+
+    def part(observation: Any) -> Any:
+        try:
+            return leaf.of(observation)
+        except (KeyError, IndexError, TypeError) as error:
+            raise SpaceError(f"{_where(leaf)} is missing") from error
+
+    return part
+
+
 def _where(leaf: Leaf) -> str:
     role = "action" if leaf.name == "action" else "observation"
     return role + "".join(f"['{key}']" for key in leaf.path)
-
-
-def _flat(value: NDArray[Any]) -> NDArray[Any]:
-    return value if value.ndim <= 1 else value.reshape(-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, ClassVar
 
 _HELD = (signal.SIGINT, signal.SIGTERM)
 
@@ -13,16 +13,21 @@ _HELD = (signal.SIGINT, signal.SIGTERM)
 class HoldSignals:
     """A `with` block that lets signals wait; they are handled as usual when it ends.
 
-    Only the main thread can hold them; in any other thread no handler runs anyway.
+    Only the main thread can hold them; in any other thread no handler runs anyway. A block within
+    another adds nothing to it.
     """
+
+    _is_held: ClassVar[bool] = False
 
     def __enter__(self) -> None:
         """Begin to hold."""
         self._handlers: dict[int, Any] = {}
         self._waiting: list[tuple[int, FrameType | None]] = []
-        if threading.current_thread() is not threading.main_thread():
+        self._holds = threading.current_thread() is threading.main_thread() and not self._is_held
+        if not self._holds:
             return
         try:
+            HoldSignals._is_held = True
             for number in _HELD:
                 handler = signal.getsignal(number)
                 # None: not installed from Python, so it cannot be put back.
@@ -52,5 +57,7 @@ class HoldSignals:
         self._waiting.append((number, frame))
 
     def _restore(self) -> None:
+        if self._holds:
+            HoldSignals._is_held = False
         for number, handler in self._handlers.items():
             signal.signal(number, handler)

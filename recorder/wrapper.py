@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
-from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
+from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
-from mcaprl.recorder.rows import ImageColumn, StepColumns, converters, writers
+from mcaprl.recorder.rows import ImageColumn, StepColumns, observation_keeper
 from mcaprl.recorder.signals import HoldSignals
 
 
@@ -111,8 +110,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             for leaf in log.image_leaves
         }
         self._images = list(images.values())
-        self._converters = converters(env.observation_space)
-        self._writers = writers(env.observation_space, self._columns, images)
+        self._keep_observation = observation_keeper(env.observation_space, self._columns, images)
         self._full_at = 0
         self._open: OpenEpisode | None = None
 
@@ -133,10 +131,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._recording.check_can_begin([seed])
         self._interrupt()
         observation, info = self.env.reset(seed=seed, options=options)
-        values = [convert(observation) for convert in self._converters]
         with HoldSignals():
-            self._begin(OpenEpisode(self.policy, self.epsilon, seed, options))
-            self._observe(0, values)
+            self._begin(OpenEpisode(self.policy, self.epsilon, seed, options), observation)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -151,24 +147,33 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
-        step = episode.steps
-        # Before the environment can change it.
-        self._columns.act(step, action, self.behavior_prob)
-        self.behavior_prob = math.nan
+        columns, step = self._columns, episode.steps + 1
+        try:
+            # Before the environment can change it.
+            columns.keep_action(action)
+            columns.keep_behavior_prob(self.behavior_prob)
+            self.behavior_prob = math.nan
+        except SpaceError:
+            raise
+        except BaseException:
+            self._interrupt()
+            raise
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
-            values = [convert(observation) for convert in self._converters]
-            self._columns.reward(step, float(reward))
-            if terminated or truncated or step + 1 >= self._full_at:
+            self._keep_observation(observation)
+            columns.keep_reward(float(reward))
+            if terminated or truncated or step >= self._full_at:
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
-                    self._make_room(step + 1)
-                    self._observe(step + 1, values)
+                    self._make_room(step)
+                    self._count(episode, step)
                     if terminated or truncated:
                         reason = reason_of(info.get("reason"), bool(terminated))
                         self._end(bool(terminated), bool(truncated), reason)
+            elif self._display.shows_steps:
+                self._count(episode, step)
             else:
-                self._observe(step + 1, values)
+                episode.steps = step
         except BaseException:
             # The environment may be a step ahead of the log: nothing may be joined to it.
             self._interrupt()
@@ -185,14 +190,16 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         finally:
             super().close()
 
-    def _begin(self, episode: OpenEpisode) -> None:
+    def _begin(self, episode: OpenEpisode, observation: Any) -> None:
         recording = self._recording
         start_ns, step_ns = recording.next_start_ns, recording.step_ns
         self._columns.begin(recording.episodes, start_ns, step_ns)
         for image in self._images:
             image.begin(start_ns, step_ns)
         self._full_at = self._next_full()
+        self._keep_observation(observation)
         recording.begin(self._display, episode.policy)
+        self._count(episode, 0)
         self._open = episode
 
     def _make_room(self, step: int) -> None:
@@ -207,13 +214,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """The first step for whose observation there is no room."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
-    def _observe(self, step: int, values: list[NDArray[Any]]) -> None:
-        for write, value in zip(self._writers, values, strict=True):
-            write(step, value)
-        self._display.observe(step)
-        assert self._open is not None
+    def _count(self, episode: OpenEpisode, step: int) -> None:
+        if self._display.shows_steps:
+            self._display.observe(step)
         # From here on the step counts.
-        self._open.steps = step
+        episode.steps = step
 
     def _interrupt(self) -> None:
         """Keep an episode that is broken off; one without a transition leaves no trace."""

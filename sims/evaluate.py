@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, Policy, rollout
-
-RESAMPLES = 2000
-CONFIDENCE = 0.95
+from mcaprl.sims.statistics import (
+    bootstrap_interval,
+    improvement_interval,
+    improvement_probability,
+    interquartile_mean,
+    median,
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class PolicyScore:
     def to_json(self) -> dict[str, Any]:
         """As `mcaprl evaluate --json` prints it."""
         returns = self.returns
+        middle = {"median": median, "interquartile_mean": interquartile_mean}
         return {
             "policy": self.policy,
             "episodes": int(returns.size),
@@ -57,6 +63,11 @@ class PolicyScore:
             "interval": list(self.interval),
             "normalized_score": self.normalized_score,
             "normalized_interval": self.normalized_interval and list(self.normalized_interval),
+            **{name: float(statistic(returns)) for name, statistic in middle.items()},
+            **{
+                f"{name}_interval": list(bootstrap_interval(returns, statistic))
+                for name, statistic in middle.items()
+            },
             "seed_means": returns.mean(axis=1).tolist(),
             "mean_length": float(np.mean([e.length for seed in self.results for e in seed])),
             "ends": self.ends,
@@ -113,21 +124,36 @@ def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None
     )
 
 
-def bootstrap_interval(returns: NDArray[np.float64], *, seed: int = 0) -> tuple[float, float]:
-    """95 % percentile interval of the mean return.
+@dataclass(frozen=True)
+class Improvement:
+    """How often an episode of one policy returns more than one of another.
 
-    Training seeds are drawn with replacement, and episodes within each, so that the interval
-    covers both what another training run and what other episodes would have given.
-
-    Args:
-        returns: (seeds, episodes).
-        seed: of the resampling.
+    Attributes:
+        better: the policy that may be better.
+        than: the other.
+        probability: 0.5 for equals.
+        interval: its 95 % bootstrap interval.
     """
-    random = np.random.default_rng(seed)
-    seeds, episodes = returns.shape
-    rows = random.integers(seeds, size=(RESAMPLES, seeds, 1))
-    columns = random.integers(episodes, size=(RESAMPLES, seeds, episodes))
-    means = returns[rows, columns].mean(axis=(1, 2))
-    tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(means, [tail, 100 - tail])
-    return float(low), float(high)
+
+    better: str
+    than: str
+    probability: float
+    interval: tuple[float, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """As `mcaprl evaluate --json` prints it."""
+        return {**vars(self), "interval": list(self.interval)}
+
+
+def improvements(scores: Sequence[PolicyScore]) -> list[Improvement]:
+    """Compare each policy with all that have a lower mean."""
+    ordered = sorted(scores, key=lambda score: -score.mean_return)
+    return [
+        Improvement(
+            first.policy,
+            second.policy,
+            improvement_probability(first.returns, second.returns),
+            improvement_interval(first.returns, second.returns),
+        )
+        for first, second in itertools.combinations(ordered, 2)
+    ]

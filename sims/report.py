@@ -1,4 +1,7 @@
-"""Pictures of an evaluation: how the policies compare, and where they went. Extra: `report`."""
+"""An evaluation at a glance: how policies compare, where they went, what to look at next.
+
+Extra: `report`.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.errors import ReportError, import_extra
-from mcaprl.sims.evaluate import PolicyScore
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
+from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.sims.evaluate import Improvement, PolicyScore
+from mcaprl.sims.rollout import EpisodeResult
 from mcaprl.sims.scene import Shape
+from mcaprl.sims.statistics import interquartile_mean, median
 
-_INK, _PALE = "#1d2733", "#b9c2cc"
-_COLORS = ("#2f6fb7", "#d9622b", "#2a9d6f", "#8a63c9", "#b08d1e", "#c04a7c")
 _MAX_PATHS = 30
+_PAIRS = "How often an episode of one policy returns more than one of another; ties count half."
 # What is lower than this is ground, not something to drive around.
 _FLAT_M = 1.0
 
 
-def comparison_picture(
-    path: Path,
+def comparison_figure(
     scores: Sequence[PolicyScore],
     title: str,
     behavior: tuple[float, float, float] | None,
-) -> None:
+) -> Any:
     """Mean returns with their intervals, a dot for each training seed.
 
     Args:
-        path: of the PNG to write.
         scores: from top to bottom.
         title: over the picture.
         behavior: mean, low and high of the logged episodes' returns, drawn as a band.
@@ -36,43 +39,40 @@ def comparison_picture(
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure, axes = _axes(figsize=(8, 0.62 * len(scores) + 1.8))
+    figure, axes = new_figure((8, 0.62 * len(scores) + 1.8))
     if behavior is not None:
         mean, low, high = behavior
-        axes.axvspan(low, high, color=_PALE, alpha=0.45, lw=0)
-        axes.axvline(mean, color=_INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
+        axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)
+        axes.axvline(mean, color=INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
     for row, score in enumerate(scores):
         low, high = score.interval
-        color = _COLORS[row % len(_COLORS)]
+        color = COLORS[row % len(COLORS)]
         axes.barh(row, score.mean_return, color=color, alpha=0.85, height=0.62)
-        axes.plot([low, high], [row, row], color=_INK, lw=2, solid_capstyle="butt")
+        axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
         means = score.returns.mean(axis=1)
         if len(means) > 1:
-            axes.plot(means, np.full(len(means), row), "o", color="white", mec=_INK, ms=4.5)
+            axes.plot(means, np.full(len(means), row), "o", color="white", mec=INK, ms=4.5)
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
         # Behind the longest of bar, interval and dots.
         end = max(high, 0.0, float(means.max()))
-        box = {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1}
-        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center", bbox=box)
+        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
     axes.set_yticks(range(len(scores)), [score.policy for score in scores])
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
     axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
-    axes.set_title(title, loc="left", color=_INK)
+    axes.set_title(title)
     if behavior is not None:
-        axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-    axes.spines[["top", "right"]].set_visible(False)
-    _save(figure, path)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
-def trajectory_picture(path: Path, scores: Sequence[PolicyScore], world: Sequence[Shape]) -> None:
+def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> Any:
     """Where each policy went, on the map seen from above; a cross where an episode ended early.
 
     Args:
-        path: of the PNG to write.
-        scores: a panel each; those without positions are left out.
+        scores: a panel each; those without positions are left out. None if none has any.
         world: what stands still, to be drawn beneath.
 
     Raises:
@@ -80,29 +80,133 @@ def trajectory_picture(path: Path, scores: Sequence[PolicyScore], world: Sequenc
     """
     shown = [score for score in scores if score.results[0][0].positions.size]
     if not shown:
-        return
+        return None
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
-    figure, grid = _axes(figsize=(4.2 * columns, 5.6 * rows), rows=rows, columns=columns)
-    panels = np.atleast_1d(grid).ravel()
+    figure, panels = new_figure((4.2 * columns, 5.6 * rows), rows, columns, grid=True)
+    panels = panels.ravel()
     for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
         _draw_world(axes, world)
-        color = _COLORS[row % len(_COLORS)]
+        color = COLORS[row % len(COLORS)]
         episodes = [episode for seed in score.results for episode in seed]
         stride = -(-len(episodes) // _MAX_PATHS)
         for episode in episodes[::stride]:
             x, y = episode.positions.T
             axes.plot(x, y, color=color, lw=1.1, alpha=0.75)
             if episode.reason != "time_limit":
-                axes.plot(x[-1], y[-1], "x", color=_INK, ms=5, mew=1.3)
+                axes.plot(x[-1], y[-1], "x", color=INK, ms=5, mew=1.3)
         ends = ", ".join(f"{count} {reason}" for reason, count in score.ends.items())
-        axes.set_title(f"{score.policy}\n{ends}", loc="left", fontsize=10, color=_INK)
+        axes.set_title(f"{score.policy}\n{ends}")
         axes.set_aspect("equal")
         axes.set_xlabel("x, m")
         axes.set_ylabel("y, m")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
-    _save(figure, path)
+    return figure
+
+
+def evaluation_page(
+    folder: Path,
+    title: str,
+    scores: Sequence[PolicyScore],
+    compared: Sequence[Improvement],
+    world: Sequence[Shape],
+    behavior: tuple[float, float, float] | None,
+    recorded: tuple[Path, int] | None,
+) -> None:
+    """Write FOLDER/index.html, comparison.png and trajectories.png.
+
+    Args:
+        folder: made if it is not there.
+        title: of the page.
+        scores: of the policies.
+        compared: the policies with each other.
+        world: what stands still.
+        behavior: mean, low and high of the logged episodes' returns, if there are such.
+        recorded: the log with the episodes, and of how many of the first `scores` it has them.
+
+    Raises:
+        MissingExtraError: matplotlib or jinja2 is not installed.
+        ReportError: a file cannot be written.
+    """
+    comparison = comparison_figure(scores, "mean return", behavior)
+    ways = trajectory_figure(scores, world)
+    save_png(comparison, folder / "comparison.png")
+    if ways is not None:
+        save_png(ways, folder / "trajectories.png")
+    figures = [Figure.of("line: 95 % interval; dots: training seeds", comparison)]
+    sections = [
+        Section("Scores", figures=figures, table=_score_table(scores)),
+        Section("Against each other", _PAIRS, table=_improvement_table(compared)),
+    ]
+    if ways is not None:
+        sections.append(Section("Where they went", figures=[Figure.of("", ways)]))
+    cards = _cards(scores, world, recorded)
+    sections.append(Section("Best and worst episodes", cards=cards))
+    episodes = sum(score.returns.size for score in scores)
+    write_page(folder / "index.html", title, f"{episodes} episodes, greedy actions", sections)
+
+
+def _score_table(scores: Sequence[PolicyScore]) -> Table:
+    rows = [
+        (
+            score.policy,
+            f"{score.mean_return:.2f}",
+            f"{score.interval[0]:.2f} to {score.interval[1]:.2f}",
+            f"{float(interquartile_mean(score.returns)):.2f}",
+            f"{float(median(score.returns)):.2f}",
+            "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
+            ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
+        )
+        for score in scores
+    ]
+    names = ("policy", "mean return", "95 % interval", "middle half", "median", "score", "ends")
+    return Table(names, rows)
+
+
+def _improvement_table(compared: Sequence[Improvement]) -> Table:
+    rows = [
+        (
+            one.better,
+            one.than,
+            f"{one.probability:.2f}",
+            f"{one.interval[0]:.2f} to {one.interval[1]:.2f}",
+        )
+        for one in compared
+    ]
+    return Table(("policy", "than", "probability", "95 % interval"), rows)
+
+
+def _cards(
+    scores: Sequence[PolicyScore], world: Sequence[Shape], recorded: tuple[Path, int] | None
+) -> list[Card]:
+    """The best and the worst episode of each policy."""
+    cards, first = [], 0
+    for row, score in enumerate(scores):
+        episodes = [episode for seed in score.results for episode in seed]
+        totals = [episode.total_reward for episode in episodes]
+        for kind, index in (("best", int(np.argmax(totals))), ("worst", int(np.argmin(totals)))):
+            episode = episodes[index]
+            command = f"reset(seed={episode.seed})"
+            if recorded is not None and row < recorded[1]:
+                command = f"mcaprl replay {recorded[0]} --episode {first + index}"
+            text = f"return {episode.total_reward:.4g}, {episode.length} steps, {episode.reason}"
+            cards.append(Card(f"{score.policy}: {kind}", text, _thumbnail(episode, world), command))
+        first += len(episodes)
+    return cards
+
+
+def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
+    """An episode's way on the map as a small SVG; empty if it has no positions."""
+    if not episode.positions.size:
+        return ""
+    figure, axes = new_figure((3.2, 2.2))
+    _draw_world(axes, world)
+    axes.plot(*episode.positions.T, color=COLORS[1], lw=1.6)
+    axes.plot(*episode.positions[-1], "x", color=INK, ms=6)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return to_svg(figure)
 
 
 def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
@@ -111,10 +215,10 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
         if shape.frame != "map":
             continue
         if shape.kind == "line":
-            axes.plot(shape.points[:, 0], shape.points[:, 1], color=_PALE, lw=1, zorder=0)
+            axes.plot(shape.points[:, 0], shape.points[:, 1], color=PALE, lw=1, zorder=0)
         elif shape.kind == "box" and shape.size[2] > _FLAT_M:
             corners = _box_corners(shape)
-            axes.fill(corners[:, 0], corners[:, 1], color=_PALE, alpha=0.6, lw=0, zorder=0)
+            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0, zorder=0)
 
 
 def _box_corners(shape: Shape) -> Any:
@@ -122,17 +226,3 @@ def _box_corners(shape: Shape) -> Any:
     local = np.array([(half_x, half_y), (-half_x, half_y), (-half_x, -half_y), (half_x, -half_y)])
     cos, sin = np.cos(shape.yaw_rad), np.sin(shape.yaw_rad)
     return local @ np.array([(cos, sin), (-sin, cos)]) + np.array(shape.position[:2])
-
-
-def _axes(*, figsize: tuple[float, float], rows: int = 1, columns: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and leaves no global state."""
-    figure = import_extra("matplotlib.figure", "report").Figure(figsize=figsize, dpi=130)
-    return figure, figure.subplots(rows, columns)
-
-
-def _save(figure: Any, path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, bbox_inches="tight", facecolor="white")
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror}") from error

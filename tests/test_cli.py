@@ -80,6 +80,40 @@ def test_info_report_and_strict(cartpole: Path, capsys: pytest.CaptureFixture[st
     assert "was cut off" in facts["problems"][0]
 
 
+def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--updates", "30", "--batch-size", "16", "--hidden", "8", "--seeds", "2"]
+    assert run(["train-offline", str(cartpole), "--algo", "bc", "--out", "bc", *few]) == 0
+    capsys.readouterr()
+    ask = ["evaluate", "random", "bc", "--data", str(cartpole), "--updates", "5"]
+    result = as_json(capsys, *ask, "--json")
+    assert result["episodes"] == 4
+    assert {estimate["policy"] for estimate in result["estimates"]} == {
+        "random",
+        "bc/seed-0",
+        "bc/seed-1",
+    }
+    for estimate in result["estimates"]:
+        assert estimate.keys() == {
+            "policy",
+            "estimator",
+            "value",
+            "interval",
+            "effective_sample_size",
+            "verdict",
+        }
+        # Four episodes are too few to say anything.
+        assert estimate["verdict"].startswith("refused: ")
+    random = {e["estimator"]: e for e in result["estimates"] if e["policy"] == "random"}
+    assert random["PDIS"]["value"] == pytest.approx(result["behavior_return"]), "random acted"
+    assert result["behavior_calibration"] == pytest.approx([1.0, 0.0])
+    assert result["coverage"]["random"] == pytest.approx(0.5)
+    assert result["ranking"]["trusted"] is False
+    assert run(ask) == 0
+    assert "do not choose by this order" in capsys.readouterr().out
+    line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
+    assert "the pilot reads the sim's state" in line
+
+
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         arguments = ["--policy", "pilot", "--epsilon", "0.3", "--steps", "50", "--seed", "3"]
@@ -302,7 +336,11 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
         (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
-        (["evaluate", "pilot"], 2, "--sim"),
+        (["evaluate", "pilot"], 2, "--sim SIM or --data DATA, one of the two"),
+        (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "one of the two"),
+        (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma is of use"),
+        (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record is of use"),
+        (["evaluate", "random", "--data", "nothing"], 1, "no such file"),
         (["layout", "lane"], 2, "--out"),
         (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "nan"], 2, "0 to 1"),
         (["record", "lane", "--steps", "5", "--out", "x.mcap", "--envs", "2"], 2, "into a folder"),

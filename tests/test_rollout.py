@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mcaprl.sims.evaluate import bootstrap_interval, evaluate, normalize
-from mcaprl.sims.report import comparison_picture, trajectory_picture
+from mcaprl.sims.evaluate import evaluate, improvements, normalize
+from mcaprl.sims.report import evaluation_page
 from mcaprl.sims.rollout import EpsilonGreedy, episode_seed, rollout
 from mcaprl.sims.scene import Shape
 
@@ -73,25 +73,6 @@ def test_steps_are_counted_exactly(env: gym.Env[Any, Any]) -> None:
         rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0)
 
 
-def test_bootstrap_interval_covers_as_often_as_it_says() -> None:
-    """Of 95 % intervals of the mean of 30 normal numbers, about 93 % hold the true mean."""
-    random = np.random.default_rng(0)
-    hits = 0
-    for trial in range(200):
-        low, high = bootstrap_interval(random.normal(size=(1, 30)), seed=trial)
-        hits += low < 0 < high
-    assert 0.88 <= hits / 200 <= 0.99
-
-
-def test_interval_grows_with_differences_between_seeds() -> None:
-    alike = np.tile(np.arange(10.0), (4, 1))
-    apart = alike + np.array([[0.0], [10], [20], [30]])
-    low, high = bootstrap_interval(alike)
-    wide_low, wide_high = bootstrap_interval(apart)
-    assert wide_high - wide_low > 3 * (high - low)
-    assert bootstrap_interval(np.full((1, 5), 2.0)) == (2.0, 2.0)
-
-
 def test_scores_by_hand(env: gym.Env[Any, Any]) -> None:
     left = evaluate(env, [AlwaysLeft()], name="left", episodes=5, seed=0)
     random = evaluate(env, [None], name="random", episodes=5, seed=0)
@@ -102,17 +83,29 @@ def test_scores_by_hand(env: gym.Env[Any, Any]) -> None:
     assert normalize(random, random, left).normalized_score == 0.0
     assert normalize(left, random, left).normalized_score == 1.0
     json.dumps(left.to_json())
+    [compared] = improvements([left, random])
+    assert {compared.better, compared.than} == {"left", "random"}
+    assert 0.5 <= compared.interval[1] <= 1.0
+    json.dumps(compared.to_json())
 
 
-def test_pictures_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    score = evaluate(env, [None], name="random", episodes=3, seed=0)
-    comparison_picture(tmp_path / "a" / "comparison.png", [score], "title", (1.0, 0.5, 2.0))
+def test_reports_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
+    random = evaluate(env, [None], name="random", episodes=3, seed=0)
+    left = evaluate(env, [AlwaysLeft()], name="left", episodes=3, seed=0)
+    compared = improvements([random, left])
+    logged = (1.0, 0.5, 2.0)
+    evaluation_page(
+        tmp_path / "a", "CartPole", [left, random], compared, [], logged, (Path("x.mcap"), 1)
+    )
     assert (tmp_path / "a" / "comparison.png").read_bytes()[:4] == b"\x89PNG"
-    trajectory_picture(tmp_path / "none.png", [score], [])
-    assert not (tmp_path / "none.png").exists(), "CartPole has no map"
+    assert not (tmp_path / "a" / "trajectories.png").exists(), "CartPole has no map"
+    page = (tmp_path / "a" / "index.html").read_text()
+    assert "mcaprl replay x.mcap --episode " in page
+    worst = min(random.results[0], key=lambda episode: episode.total_reward)
+    assert f"reset(seed={worst.seed})" in page, "random was not recorded"
+    assert f"return {worst.total_reward:.4g}, {worst.length} steps, terminated" in page
     lane = gym.make("mcaprl/LaneKeeping-v0")
     driven = evaluate(lane, [None], name="random", episodes=2, seed=0)
     world = [Shape("line", "line", (1, 1, 1, 1), points=np.zeros((2, 3)))]
-    trajectory_picture(tmp_path / "map.png", [driven], world)
-    assert (tmp_path / "map.png").stat().st_size > 5000
+    evaluation_page(tmp_path / "b", "lane", [driven], [], world, None, None)
+    assert (tmp_path / "b" / "trajectories.png").stat().st_size > 5000

@@ -1,0 +1,140 @@
+"""`mcaprl evaluate --data`: what policies are worth, from a log alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mcaprl.cli.policies import policy_names
+from mcaprl.cli.show import print_table, progress
+from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.recorder.reader import open_logs
+
+if TYPE_CHECKING:
+    from mcaprl.offline.off_policy import PolicyEstimates, StochasticPolicy
+    from mcaprl.recorder.dataset import Dataset
+
+
+_STANDARD_ERRORS = 4.0
+"""So far from 1, chance no longer explains it."""
+
+
+def evaluate_from_log(
+    names: Sequence[str],
+    data: str,
+    *,
+    gamma: float = 0.97,
+    epsilon: float = 0.0,
+    updates: int = 10_000,
+    seed: int,
+) -> dict[str, Any]:
+    """Ask every estimator about every policy.
+
+    Args:
+        names: `random`, or paths; of a run with several seeds each is asked about.
+        data: file, folder or glob.
+        gamma: discount of the returns.
+        epsilon: probability with which the policies are to act at random.
+        updates: of the model behind FQE, DR and WDR.
+        seed: of the model and the resampling.
+
+    Returns:
+        What `--json` prints.
+    """
+    from mcaprl.offline.fqe import FQEConfig
+    from mcaprl.offline.off_policy import OffPolicyEvaluator, inverse_probability
+    from mcaprl.offline.ranking import ranking
+
+    dataset = open_logs(data)
+    policies = _policies(names, dataset)
+    config = replace(FQEConfig(), gamma=gamma, updates=updates)
+    evaluator = OffPolicyEvaluator(dataset, config, seed)
+    found: list[PolicyEstimates] = []
+    with progress("learning values", len(policies) * evaluator.updates_of_model) as advance:
+        for name, policy in policies.items():
+            found.append(evaluator.evaluate(policy, name, epsilon=epsilon, on_update=advance))
+    estimates = [estimate for one in found for estimate in one.estimates]
+    actions = int(getattr(dataset.action_space, "n", 0))
+    return {
+        "data": data,
+        "episodes": len(dataset.episodes),
+        "gamma": gamma,
+        "epsilon": epsilon,
+        "behavior_return": evaluator.behavior_return,
+        "behavior_interval": list(evaluator.behavior_interval),
+        "behavior_calibration": inverse_probability(dataset.behavior_probs, actions),
+        "coverage": {one.policy: one.coverage for one in found},
+        "estimates": [estimate.to_json() for estimate in estimates],
+        "ranking": ranking(estimates) if len(policies) > 1 else None,
+    }
+
+
+def print_estimates(result: dict[str, Any]) -> None:
+    """Show the result of `evaluate_from_log` as tables."""
+    rows = [
+        [
+            estimate["policy"],
+            estimate["estimator"],
+            "" if estimate["value"] is None else f"{estimate['value']:.3f}",
+            _interval(estimate["interval"]),
+            f"{estimate['effective_sample_size']:.1f}",
+            estimate["verdict"],
+        ]
+        for estimate in result["estimates"]
+    ]
+    print_table(
+        f"{result['data']}: {result['episodes']} episodes, mean return discounted by"
+        f" {result['gamma']}: {result['behavior_return']:.3f}"
+        f" ({_interval(result['behavior_interval'])})",
+        ["policy", "estimator", "value", "95 % interval", "effective episodes", "verdict"],
+        rows,
+    )
+    coverage = ", ".join(f"{share:.0%} by {name}" for name, share in result["coverage"].items())
+    click.echo(f"logged actions that the policies would take: {coverage}")
+    calibration, error = result["behavior_calibration"]
+    if calibration > 1 + _STANDARD_ERRORS * error:
+        click.echo(
+            f"the log's behavior_prob cannot be right: 1 / behavior_prob is {calibration:.2f} times"
+            " the number of actions in the mean, and 1 at most if it is"
+        )
+    if result["ranking"] is not None:
+        order = result["ranking"]
+        click.echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
+        if not order["trusted"]:
+            click.echo("no estimator has a verdict on all of them: do not choose by this order")
+
+
+def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
+    """The policies by the names that tables show, each made sure to fit the log."""
+    shown = policy_names(names)
+    found: dict[str, StochasticPolicy | None] = {}
+    for name in dict.fromkeys(names):
+        if name == "random":
+            found[name] = None
+            continue
+        if name == "pilot":
+            raise UsageError(
+                "the pilot reads the sim's state, which no log has: pass --sim instead"
+            )
+        if not Path(name).exists():
+            raise UnknownNameError("policy", name, ["random", "the path of a trained run"])
+        from mcaprl.offline.policy import load_policies
+
+        loaded = load_policies(Path(name))
+        for policy in loaded:
+            for role in ("observation_space", "action_space"):
+                if getattr(policy, role) != getattr(dataset, role):
+                    raise PolicyError(
+                        f"{name} was trained on {role} {getattr(policy, role)};"
+                        f" the log has {getattr(dataset, role)}"
+                    )
+            found[policy.name if len(loaded) > 1 else shown[name]] = policy
+    return found
+
+
+def _interval(interval: Sequence[float] | None) -> str:
+    return "" if interval is None else f"{interval[0]:.3f} to {interval[1]:.3f}"

@@ -1,0 +1,121 @@
+"""The algorithms by name: their settings, and Stable-Baselines3's classes that do the work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, cast
+
+from gymnasium import spaces
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from mcaprl.errors import SpaceError, UnknownNameError
+from mcaprl.online.config import (
+    A2CConfig,
+    DoubleDQNConfig,
+    DQNConfig,
+    OnlineConfig,
+    PPOConfig,
+)
+from mcaprl.online.double_dqn import DoubleDQN
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One of them.
+
+    Attributes:
+        config_type: the dataclass of its settings.
+        model_type: SB3's class.
+    """
+
+    config_type: type[OnlineConfig]
+    model_type: type[BaseAlgorithm]
+
+
+ALGORITHMS: Final[dict[str, Algorithm]] = {
+    "dqn": Algorithm(DQNConfig, DQN),
+    "double-dqn": Algorithm(DoubleDQNConfig, DoubleDQN),
+    "ppo": Algorithm(PPOConfig, PPO),
+    "a2c": Algorithm(A2CConfig, A2C),
+}
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """Find an algorithm by its name.
+
+    Raises:
+        UnknownNameError: no algorithm has that name.
+    """
+    if name not in ALGORITHMS:
+        raise UnknownNameError("algorithm", name, ALGORITHMS)
+    return ALGORITHMS[name]
+
+
+def check_spaces(
+    algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> None:
+    """Make sure that an algorithm can learn in an environment with these spaces.
+
+    Raises:
+        UnknownNameError: no algorithm has that name.
+        SpaceError: it cannot.
+    """
+    find_algorithm(algo)
+    if not isinstance(action_space, spaces.Discrete):
+        raise SpaceError(f"{algo} needs discrete actions, got {action_space}")
+    parts = observation_space.values() if isinstance(observation_space, spaces.Dict) else ()
+    for space in parts or (observation_space,):
+        if not isinstance(space, spaces.Box):
+            raise SpaceError(f"{algo} needs Box observations, or a Dict of them, got {space}")
+
+
+def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
+    """Make the algorithm with fresh weights, and seed Python, NumPy and torch."""
+    algorithm = find_algorithm(algo)
+    last_rate = config.learning_rate * config.final_learning_rate_fraction
+    policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
+    if algorithm.model_type is not A2C:
+        policy_kwargs["optimizer_kwargs"] = {"fused": True}
+    # SB3's classes share no constructor, so their types cannot tell these arguments.
+    model_type: Any = algorithm.model_type
+    model: BaseAlgorithm = model_type(
+        _policy_name(env.observation_space),
+        env,
+        learning_rate=LinearSchedule(config.learning_rate, last_rate, 1.0),
+        policy_kwargs=policy_kwargs,
+        seed=seed,
+        device="auto",
+        **config.arguments(),
+    )
+    if isinstance(config, DQNConfig) and config.exploration_decay:
+        cast(DQN, model).exploration_schedule = ExponentialSchedule(
+            config.exploration_initial_eps,
+            config.exploration_final_eps,
+            config.exploration_decay,
+            config.steps,
+        )
+    return model
+
+
+@dataclass(frozen=True)
+class ExponentialSchedule:
+    """Falls by a factor with each step, to a last value; called with what remains, from 1 to 0."""
+
+    first: float
+    last: float
+    factor: float
+    steps: int
+
+    def __call__(self, remaining: float) -> float:
+        """The value when that part of the steps is left."""
+        return max(self.last, self.first * float(self.factor ** ((1 - remaining) * self.steps)))
+
+
+def _policy_name(space: spaces.Space[Any]) -> str:
+    if isinstance(space, spaces.Dict):
+        return "MultiInputPolicy"
+    is_picture = isinstance(space, spaces.Box) and len(space.shape) == 3
+    return "CnnPolicy" if is_picture else "MlpPolicy"

@@ -1,0 +1,44 @@
+"""Double DQN on SB3's DQN: the learning network chooses the action that the target one judges.
+
+    https://arxiv.org/abs/1509.06461    target r + gamma Q'(s', argmax_a Q(s', a))
+
+With `n_steps` n the target is the sum of n discounted rewards and gamma^n times that value; SB3's
+replay buffer gives both, fewer steps where the episode ended sooner.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from stable_baselines3 import DQN
+from torch.nn import functional
+
+
+class DoubleDQN(DQN):
+    """SB3's DQN in all but the target; its `.zip` files load as `DQN`, too."""
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Make gradient steps on batches from the replay buffer."""
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses, mean_values = [], []
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            discounts = self.gamma if batch.discounts is None else batch.discounts
+            with torch.no_grad():
+                chosen = self.q_net(batch.next_observations).argmax(1, keepdim=True)
+                judged = self.q_net_target(batch.next_observations).gather(1, chosen)
+                targets = batch.rewards + (1 - batch.dones) * discounts * judged
+            values = self.q_net(batch.observations).gather(1, batch.actions.long())
+            loss = functional.smooth_l1_loss(values, targets)
+            self.policy.optimizer.zero_grad()
+            torch.autograd.backward(loss)
+            torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+            losses.append(loss.detach().item())
+            mean_values.append(values.detach().mean().item())
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", np.mean(losses))
+        self.logger.record("train/mean_q", np.mean(mean_values))

@@ -1,0 +1,238 @@
+"""Policies in `.zip` files of Stable-Baselines3, ready to act; no code from a file is run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import (
+    ActorCriticCnnPolicy,
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.vec_env import VecTransposeImage
+from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
+
+from mcaprl.errors import PolicyError, SpaceError
+from mcaprl.online.sb3_data import description_of
+from mcaprl.online.zip_file import read_model, write_model
+from mcaprl.recorder.spaces import space_from_json, space_to_json
+
+BEST_NAME = "best_model.zip"
+FORMAT_VERSION = 1
+_POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
+    "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
+    "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
+}
+"""SB3's classes for vectors, pictures and dicts; a file can ask for no other."""
+_ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
+    "ReLU": torch.nn.ReLU,
+    "Tanh": torch.nn.Tanh,
+    "ELU": torch.nn.ELU,
+    "LeakyReLU": torch.nn.LeakyReLU,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class OnlinePolicy:
+    """A trained policy; NumPy in, NumPy out. B is the number of observations, A of actions.
+
+    Attributes:
+        name: of the file, or the folders of the run and of the seed.
+        algo: that trained it.
+        observation_space: of one observation; None where the file does not say its bounds.
+        action_space: of one action.
+        env_id: of the environment it learned in; empty if unknown.
+        env_kwargs: arguments to make that environment.
+        network: SB3's policy.
+    """
+
+    name: str
+    algo: str
+    observation_space: spaces.Space[Any] | None
+    action_space: spaces.Space[Any]
+    env_id: str
+    env_kwargs: dict[str, Any]
+    network: BasePolicy
+
+    def act(self, observations: Any) -> NDArray[np.int64]:
+        """The best actions (B,), values of `action_space`.
+
+        Raises:
+            PolicyError: the observations do not fit the network.
+        """
+        return cast(NDArray[np.int64], self._tried(self.network.predict, observations)[0])
+
+    def q_values(self, observations: Any) -> NDArray[np.float32]:
+        """The values (B, A) of all actions, in the order of the action space.
+
+        Raises:
+            PolicyError: the policy has none, or the observations do not fit the network.
+        """
+        if not isinstance(self.network, DQNPolicy):
+            raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
+        return cast(NDArray[np.float32], self._tried(self._outputs, observations))
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
+        """The probabilities (B, A) of all actions; those of a Q-network are 0 but for the best.
+
+        Raises:
+            PolicyError: the observations do not fit the network.
+        """
+        outputs = self._tried(self._outputs, observations)
+        if not isinstance(self.network, DQNPolicy):
+            return cast(NDArray[np.float32], outputs)
+        probabilities: NDArray[np.float32] = np.zeros_like(outputs)
+        probabilities[np.arange(len(outputs)), outputs.argmax(1)] = 1.0
+        return probabilities
+
+    def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:
+        """Q-values, or probabilities."""
+        tensor = self.network.obs_to_tensor(observations)[0]
+        with torch.inference_mode():
+            if isinstance(self.network, DQNPolicy):
+                outputs = self.network.q_net(cast(Any, tensor))
+            else:
+                assert isinstance(self.network, ActorCriticPolicy)
+                outputs = cast(Any, self.network.get_distribution(tensor).distribution).probs
+        return cast(NDArray[np.float32], outputs.numpy())
+
+    def _tried(self, forward: Callable[..., Any], observations: Any) -> Any:
+        try:
+            return forward(observations, deterministic=True)
+        except (ValueError, RuntimeError, KeyError, AttributeError) as error:
+            raise PolicyError(f"{self.name} does not take these observations: {error}") from error
+
+
+def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
+    """Write a model's file, with what is needed to load it without unpickling.
+
+    Args:
+        path: of the `.zip` to replace.
+        model: of SB3.
+        description: what the run knows: `algo`, `net_arch`, `env_id`, `env_kwargs`, `spaces`.
+    """
+    q_network = isinstance(model.policy, DQNPolicy)
+    own = {
+        "format_version": FORMAT_VERSION,
+        "network": "q-network" if q_network else "actor-critic",
+        "activation": "ReLU" if q_network else "Tanh",
+        "steps": model.num_timesteps,
+        **description,
+    }
+    write_model(path, model, own)
+
+
+def describe_run(
+    algo: str,
+    hidden: tuple[int, ...],
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    env_id: str,
+    env_kwargs: dict[str, Any],
+) -> dict[str, Any]:
+    """What a run knows of its policies, as plain JSON types."""
+    return {
+        "algo": algo,
+        "net_arch": list(hidden),
+        "observation_space": json.loads(space_to_json(observation_space)),
+        "action_space": json.loads(space_to_json(action_space)),
+        "env_id": env_id,
+        "env_kwargs": env_kwargs,
+    }
+
+
+def load_policies(path: Path) -> list[OnlinePolicy]:
+    """Load one policy from a `.zip`, or those of all seeds from a run's folder.
+
+    Raises:
+        PolicyError: there are none, or a file is broken.
+    """
+    return [load_policy(found) for found in policy_files(path)]
+
+
+def policy_files(path: Path) -> list[Path]:
+    """The best models of a run in the order of its seeds, or of one seed; a file is itself."""
+    if path.is_file():
+        return [path]
+    if (path / BEST_NAME).exists():
+        return [path / BEST_NAME]
+    numbered = {
+        int(number): folder / BEST_NAME
+        for folder in path.glob("seed-*")
+        if (number := folder.name.removeprefix("seed-")).isdigit() and (folder / BEST_NAME).exists()
+    }
+    return [numbered[number] for number in sorted(numbered)]
+
+
+def load_policy(path: Path) -> OnlinePolicy:
+    """Load the policy in a `.zip` of this package or of plain SB3.
+
+    Raises:
+        PolicyError: there is none, or it is broken.
+    """
+    own, data, weights = read_model(path)
+    try:
+        if own and own.get("format_version") != FORMAT_VERSION:
+            raise ValueError(f"format_version {own.get('format_version')} is not known")
+        return _build(path, own or description_of(data, weights), weights, exact=bool(own))
+    except (ValueError, TypeError, KeyError, RuntimeError, AssertionError, SpaceError) as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise PolicyError(f"cannot load the policy in {path}: {reason}") from error
+    except PolicyError as error:
+        raise PolicyError(f"cannot load the policy in {path}: {error}") from error
+
+
+def _build(
+    path: Path, description: dict[str, Any], weights: dict[str, Any], *, exact: bool
+) -> OnlinePolicy:
+    observation_space = space_from_json(json.dumps(description["observation_space"]))
+    action_space = space_from_json(json.dumps(description["action_space"]))
+    shown = channels_first(observation_space)
+    policy_type: Any = _policy_type(description["network"], shown)
+    network = policy_type(
+        shown,
+        action_space,
+        lambda _: 0.0,
+        net_arch=description["net_arch"],
+        activation_fn=_ACTIVATIONS[description["activation"]],
+    )
+    network.load_state_dict(weights)
+    network.set_training_mode(False)
+    folder = path.resolve().parent
+    name = f"{folder.parent.name}/{folder.name}" if path.name == BEST_NAME else path.stem
+    return OnlinePolicy(
+        name=name,
+        algo=description["algo"],
+        observation_space=observation_space if exact else None,
+        action_space=action_space,
+        env_id=description.get("env_id", ""),
+        env_kwargs=description.get("env_kwargs", {}),
+        network=network,
+    )
+
+
+def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """The space as SB3's networks have it: pictures with their channels in front."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: channels_first(part) for key, part in space.items()})
+    if is_image_space(space) and not is_image_space_channels_first(cast(spaces.Box, space)):
+        return VecTransposeImage.transpose_space(cast(spaces.Box, space))
+    return space
+
+
+def _policy_type(network: str, space: spaces.Space[Any]) -> type[BasePolicy]:
+    vectors, pictures, dicts = _POLICY_TYPES[network]
+    if isinstance(space, spaces.Dict):
+        return dicts
+    return pictures if is_image_space(space) else vectors

@@ -1,0 +1,126 @@
+"""Batched Gymnasium environments as Stable-Baselines3 takes them, without a process for each.
+
+SB3's own `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` hands all actions to
+one `gymnasium.vector.VectorEnv` at once, which for the sims here is one compiled call.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+from mcaprl.sims.rollout import episode_seed
+
+
+class BatchedVecEnv(VecEnv):
+    """A `gymnasium.vector.VectorEnv` behind SB3's interface.
+
+    At an episode's end `infos[i]` has what SB3 reads there: `terminal_observation`,
+    `TimeLimit.truncated`, and under `episode` what its `Monitor` would say; `reason`, too, where
+    the environment tells one. Between ends the dicts are empty.
+
+    Attributes:
+        before_step: called with the actions (N,) before each step.
+    """
+
+    def __init__(self, env: Any) -> None:
+        """Adapt `env`, which must reset itself in the step that ends an episode.
+
+        Args:
+            env: a `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` takes a
+                list of seeds, as Gymnasium's own do.
+        """
+        assert isinstance(env, VectorEnv)
+        assert env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
+        self.env: Any = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.before_step: Callable[[NDArray[Any]], None] | None = None
+        self._actions: NDArray[Any] = np.zeros(0)
+        self._returns = np.zeros(env.num_envs)
+        self._lengths = np.zeros(env.num_envs, dtype=np.int64)
+        self._began_s = time.time()
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Let the next reset start environment i as `rollout` starts its episode i."""
+        if seed is not None:
+            self._seeds = [episode_seed(seed, i) for i in range(self.num_envs)]
+        return self._seeds
+
+    def reset(self) -> VecEnvObs:
+        """Start all episodes anew."""
+        observations, _ = self.env.reset(seed=None if self._seeds[0] is None else self._seeds)
+        self._reset_seeds()
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        return cast(VecEnvObs, observations)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take note of the actions; `step_wait` does the work."""
+        if self.before_step is not None:
+            self.before_step(actions)
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step all environments; those that end begin their next episode at once."""
+        observations, rewards, terminated, truncated, batch_info = self.env.step(self._actions)
+        self._returns += rewards
+        self._lengths += 1
+        dones = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(dones).tolist():
+            infos[i] = self._end(i, batch_info, bool(truncated[i] and not terminated[i]))
+        return cast(VecEnvObs, observations), rewards.astype(np.float32), dones, infos
+
+    def _end(self, i: int, batch_info: dict[str, Any], timed_out: bool) -> dict[str, Any]:
+        """What SB3 is told of the episode that has ended in environment i."""
+        final_info = batch_info["final_info"]
+        monitor = {
+            "r": float(self._returns[i]),
+            "l": int(self._lengths[i]),
+            "t": time.time() - self._began_s,
+        }
+        self._returns[i], self._lengths[i] = 0.0, 0
+        info = {
+            "terminal_observation": batch_info["final_obs"][i],
+            "TimeLimit.truncated": timed_out,
+            "episode": monitor,
+        }
+        if final_info.get("_reason", np.zeros(self.num_envs, dtype=bool))[i]:
+            info["reason"] = str(final_info["reason"][i])
+        return info
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """An attribute of the batch, once for each environment asked for."""
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of the batch; the environments in it have none of their own."""
+        setattr(self.env, attr_name, value)
+
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Call a method of the batch, once for all environments."""
+        return [getattr(self.env, method_name)(*method_args, **method_kwargs)]
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
+        """No single environment of the batch is wrapped."""
+        return [False] * len(list(self._get_indices(indices)))

@@ -1,0 +1,108 @@
+"""Settings of the online algorithms: help, limits, and what they mean to SB3."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
+from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
+from mcaprl.online.sim_settings import SIM_SETTINGS, settings_for
+from mcaprl.online.task import Task
+from mcaprl.settings import field_help
+from mcaprl.sims import SIMS
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_setting_has_one_line_of_help(name: str) -> None:
+    config_type = ALGORITHMS[name].config_type
+    lines = field_help(config_type)
+    assert list(lines) == [field.name for field in dataclasses.fields(config_type)]
+    assert all(line and "\n" not in line for line in lines.values())
+
+
+@pytest.mark.parametrize(
+    ("envs", "steps_per_update", "train_freq", "gradient_steps"),
+    [(1, 4, 4, 1), (8, 4, 1, 2), (4, 4, 1, 1), (2, 8, 4, 1), (16, 1, 1, 16)],
+)
+def test_steps_per_update_are_steps_of_all_environments(
+    envs: int, steps_per_update: int, train_freq: int, gradient_steps: int
+) -> None:
+    arguments = DQNConfig(envs=envs, steps_per_update=steps_per_update).arguments()
+    assert (arguments["train_freq"], arguments["gradient_steps"]) == (train_freq, gradient_steps)
+
+
+def test_a_buffer_is_not_larger_than_the_run_fills_it() -> None:
+    assert DQNConfig(steps=1_000, envs=8).arguments()["buffer_size"] == 1_008
+    assert DQNConfig(steps=1_000, buffer_size=500).arguments()["buffer_size"] == 500
+
+
+def test_a_rollout_is_shared_by_the_environments() -> None:
+    assert PPOConfig(envs=8, rollout_steps=2_048).arguments()["n_steps"] == 256
+    assert A2CConfig(envs=8, rollout_steps=40).arguments()["n_steps"] == 5
+
+
+@pytest.mark.parametrize(
+    ("config_type", "name", "value"),
+    [
+        (DQNConfig, "steps", 0),
+        (DQNConfig, "envs", 0),
+        (DQNConfig, "learning_rate", 0.0),
+        (DQNConfig, "gamma", 1.1),
+        (DQNConfig, "hidden", (0,)),
+        (DQNConfig, "max_grad_norm", -1.0),
+        (DQNConfig, "eval_interval", 0),
+        (DQNConfig, "n_steps", 0),
+        (DQNConfig, "buffer_size", 7),
+        (DQNConfig, "learning_starts", -1),
+        (DQNConfig, "exploration_fraction", 2.0),
+        (DQNConfig, "exploration_final_eps", -0.1),
+        (DQNConfig, "steps_per_update", 3),
+        (PPOConfig, "rollout_steps", 2_047),
+        (PPOConfig, "epochs", 0),
+        (PPOConfig, "batch_size", 63),
+        (A2CConfig, "rollout_steps", 4),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(
+    config_type: type[OnlineConfig], name: str, value: Any
+) -> None:
+    with pytest.raises(UsageError, match=f"^{name} must be"):
+        config_type(**{name: value})
+
+
+def test_an_unknown_algorithm_is_told_with_those_that_exist() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean dqn"):
+        find_algorithm("dqm")
+
+
+@pytest.mark.parametrize("sim", SIMS)
+def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
+    settings = settings_for(DoubleDQNConfig, sim, {})
+    assert settings == SIM_SETTINGS[SIMS[sim]]
+    assert settings == settings_for(DoubleDQNConfig, SIMS[sim], {"rules": "default"})
+    assert DoubleDQNConfig(**settings).steps == settings["steps"]
+
+
+@pytest.mark.parametrize(
+    ("config_type", "sim", "sim_options"),
+    [
+        (DQNConfig, "CartPole-v1", {}),
+        (DQNConfig, "lane", {"observation": "depth"}),
+        (DQNConfig, "racer", {"rules": "classic"}),
+        (PPOConfig, "lane", {}),
+    ],
+)
+def test_other_tasks_have_sb3s_settings(
+    config_type: type[OnlineConfig], sim: str, sim_options: dict[str, Any]
+) -> None:
+    assert settings_for(config_type, sim, sim_options) == {}
+
+
+def test_what_the_user_gives_goes_first() -> None:
+    config = Task.for_sim("racer", n_steps=5).config
+    assert isinstance(config, DoubleDQNConfig)
+    assert (config.n_steps, config.gamma) == (5, 0.98)

@@ -1,0 +1,153 @@
+"""Double DQN: its target by hand, what it shares with SB3's DQN, and that it learns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DQN
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import Tensor
+
+from mcaprl.online.double_dqn import DoubleDQN
+from mcaprl.online.zip_file import write_model
+
+
+class Table(torch.nn.Module):
+    """Q-values that are weights: a row for each of the observations 0, 1, ..."""
+
+    def __init__(self, rows: list[list[float]]) -> None:
+        super().__init__()
+        self.rows = torch.nn.Parameter(torch.tensor(rows))
+        self.set_training_mode = self.train
+
+    def forward(self, observations: Tensor) -> Tensor:
+        return self.rows[observations[:, 0].long()]
+
+
+class OneBatch:
+    """A replay buffer that always gives the same transitions."""
+
+    def __init__(self, **columns: list[float]) -> None:
+        self.columns = {name: torch.tensor(values)[:, None] for name, values in columns.items()}
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        columns: dict[str, Any] = {"discounts": None, **self.columns}
+        return ReplayBufferSamples(**columns)
+
+
+def model_of(kind: type[DQN], max_grad_norm: float = 10.0, gamma: float = 0.5) -> Any:
+    """A model whose online values of the next state prefer action 1, and target values action 0."""
+    model: Any = kind(
+        "MlpPolicy",
+        gym.make("CartPole-v1"),
+        gamma=gamma,
+        buffer_size=10,
+        max_grad_norm=max_grad_norm,
+        seed=0,
+        learning_rate=0.1,
+        device="cpu",
+        policy_kwargs={"net_arch": [4], "optimizer_class": torch.optim.SGD},
+    )
+    online = Table([[0.0, 0.0], [1.0, 2.0]])
+    model.q_net = model.policy.q_net = online
+    model.q_net_target = model.policy.q_net_target = Table([[0.0, 0.0], [5.0, 3.0]])
+    model.policy.optimizer = torch.optim.SGD(online.parameters(), lr=0.1)
+    model.set_logger(configure(None, []))
+    return model
+
+
+def step_of(model: Any, **columns: list[float]) -> float:
+    """How far one update moves Q(s=0, a=0), which starts at 0."""
+    batch = {
+        "observations": [0.0],
+        "actions": [0.0],
+        "next_observations": [1.0],
+        "dones": [0.0],
+        "rewards": [1.0],
+        **columns,
+    }
+    model.replay_buffer = OneBatch(**batch)
+    model.train(gradient_steps=1, batch_size=1)
+    return float(model.q_net.rows[0, 0].item())
+
+
+@pytest.mark.parametrize(
+    ("columns", "target"),
+    [
+        # The online network chooses action 1 (2 > 1), the target network says 3: 1 + .5 x 3.
+        ({}, 2.5),
+        ({"dones": [1.0]}, 1.0),
+        # Three rewards, summed up by the buffer, then gamma^3.
+        ({"rewards": [1.75], "discounts": [0.125]}, 2.125),
+        ({"rewards": [1.75], "discounts": [0.125], "dones": [1.0]}, 1.75),
+    ],
+)
+def test_the_target_by_hand(columns: dict[str, list[float]], target: float) -> None:
+    # Huber's gradient is -1 beyond an error of 1, and -error below; SGD moves .1 of it.
+    assert step_of(model_of(DoubleDQN), **columns) == pytest.approx(0.1 * min(target, 1.0))
+    small = {**columns, "rewards": [columns.get("rewards", [1.0])[0] - target + 0.5]}
+    assert step_of(model_of(DoubleDQN), **small) == pytest.approx(0.05)
+
+
+def test_with_gamma_0_only_the_reward_counts() -> None:
+    assert step_of(model_of(DoubleDQN, gamma=0.0), rewards=[0.25]) == pytest.approx(0.025)
+
+
+def test_dqn_trusts_the_target_networks_own_choice() -> None:
+    # 1 + .5 x max(5, 3) = 3.5 for DQN; with the reward lowered by 3, its error is .5.
+    assert step_of(model_of(DQN), rewards=[-2.0]) == pytest.approx(0.05)
+    assert step_of(model_of(DoubleDQN), rewards=[-2.0]) == pytest.approx(-0.05)
+
+
+def test_gradients_are_clipped() -> None:
+    assert step_of(model_of(DoubleDQN, max_grad_norm=0.2)) == pytest.approx(0.02)
+
+
+def test_the_batch_changes_nothing_else() -> None:
+    model = model_of(DoubleDQN)
+    step_of(model)
+    assert model.q_net.rows[1].tolist() == [1.0, 2.0]
+    assert model.q_net_target.rows.tolist() == [[0.0, 0.0], [5.0, 3.0]]
+
+
+def cartpole(kind: type[DQN], **kwargs: Any) -> Any:
+    return kind(
+        "MlpPolicy",
+        gym.make("CartPole-v1"),
+        learning_starts=50,
+        buffer_size=1_000,
+        target_update_interval=4,
+        seed=3,
+        device="cpu",
+        policy_kwargs={"net_arch": [16]},
+        **kwargs,
+    )
+
+
+def test_where_both_networks_choose_alike_it_is_dqn_bit_for_bit() -> None:
+    # A target network that is copied after every step is the online one.
+    states = []
+    for kind in (DQN, DoubleDQN):
+        model = cartpole(kind)
+        model.learn(200)
+        assert model._n_updates > 30
+        states.append(model.policy.state_dict())
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+
+
+def test_plain_sb3_loads_it_as_dqn(tmp_path: Path) -> None:
+    model = cartpole(DoubleDQN, n_steps=3)
+    model.learn(100)
+    write_model(tmp_path / "model.zip", model, {})
+    loaded = DQN.load(tmp_path / "model.zip")
+    observations = np.random.default_rng(0).normal(size=(20, 4)).astype(np.float32)
+    np.testing.assert_array_equal(
+        loaded.predict(observations, deterministic=True)[0],
+        model.predict(observations, deterministic=True)[0],
+    )

@@ -1,0 +1,247 @@
+"""Model files of SB3: what is read of them, and that nothing in them is run."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import subprocess
+import sys
+import textwrap
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
+
+from mcaprl.errors import PolicyError
+from mcaprl.online.policy import (
+    BEST_NAME,
+    describe_run,
+    load_policies,
+    load_policy,
+    policy_files,
+    save_policy,
+)
+from mcaprl.online.zip_file import OWN_NAME
+
+
+def small(**kwargs: Any) -> dict[str, Any]:
+    """Arguments of a small model; SB3 writes into `policy_kwargs`, so they are new each time."""
+    return {"device": "cpu", "policy_kwargs": {"net_arch": [8]}, **kwargs}
+
+
+def dqn(**kwargs: Any) -> DQN:
+    return DQN("MlpPolicy", gym.make("CartPole-v1"), buffer_size=10, **small(**kwargs))
+
+
+def ours(path: Path, model: Any, env: gym.Env[Any, Any], algo: str = "dqn") -> Path:
+    """Save a model as a run does."""
+    spaces_ = (env.observation_space, env.action_space)
+    save_policy(path, model, describe_run(algo, (8,), *spaces_, "CartPole-v1", {}))
+    return path
+
+
+def observations_of(space: spaces.Space[Any], count: int = 20) -> Any:
+    space.seed(0)
+    drawn = [space.sample() for _ in range(count)]
+    if isinstance(space, spaces.Dict):
+        return {key: np.stack([one[key] for one in drawn]) for key in space}
+    return np.stack(drawn)
+
+
+def rewrite(path: Path, out: Path, **members: bytes | None) -> Path:
+    """A copy of a zip with other contents; None leaves a member out. `_pth` stands for `.pth`."""
+    changed = {
+        name.replace("_pth", ".pth").replace("_json", ".json"): c for name, c in members.items()
+    }
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(out, "w") as new:
+        for name in old.namelist():
+            content = changed.pop(name, old.read(name))
+            if content is not None:
+                new.writestr(name, content)
+    return out
+
+
+@pytest.mark.parametrize("kind", [DQN, PPO, A2C])
+@pytest.mark.parametrize("written_by", ["us", "sb3"])
+def test_it_acts_as_sb3_does(tmp_path: Path, kind: Any, written_by: str) -> None:
+    env = gym.make("CartPole-v1")
+    model = kind("MlpPolicy", env, seed=1, **small())
+    path = tmp_path / "model.zip"
+    if written_by == "us":
+        ours(path, model, env)
+    else:
+        model.save(path)
+    policy = load_policy(path)
+    observations = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
+    expected = model.predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.act(observations), expected)
+    assert policy.name == "model"
+    probabilities = policy.action_probabilities(observations)
+    np.testing.assert_allclose(probabilities.sum(1), 1, rtol=1e-6)
+    np.testing.assert_array_equal(probabilities.argmax(1), expected)
+    if kind is DQN:
+        np.testing.assert_array_equal(policy.q_values(observations).argmax(1), expected)
+    else:
+        with pytest.raises(PolicyError, match="no Q-values, only probabilities"):
+            policy.q_values(observations)
+
+
+@pytest.mark.parametrize("channel_first", [True, False])
+def test_pictures_are_turned_as_the_network_has_them(tmp_path: Path, channel_first: bool) -> None:
+    env = FakeImageEnv(screen_height=36, screen_width=40, n_channels=1, channel_first=channel_first)
+    model = DQN("CnnPolicy", env, buffer_size=10, **small())
+    observations = observations_of(env.observation_space)
+    expected = model.predict(observations, deterministic=True)[0]
+    exact = load_policy(ours(tmp_path / "ours.zip", model, env))
+    np.testing.assert_array_equal(exact.act(observations), expected)
+    assert exact.observation_space == env.observation_space
+    model.save(tmp_path / "sb3.zip")
+    np.testing.assert_array_equal(load_policy(tmp_path / "sb3.zip").act(observations), expected)
+
+
+def test_dicts_are_understood(tmp_path: Path) -> None:
+    env = SimpleMultiObsEnv(random_start=False)
+    model = DQN("MultiInputPolicy", env, buffer_size=10, **small())
+    policy = load_policy(ours(tmp_path / "model.zip", model, env))
+    observations = observations_of(env.observation_space)
+    expected = model.predict(observations, deterministic=True)[0]
+    np.testing.assert_array_equal(policy.act(observations), expected)
+    model.save(tmp_path / "sb3.zip")
+    with pytest.raises(PolicyError, match="observation space is no Box"):
+        load_policy(tmp_path / "sb3.zip")
+
+
+def test_networks_of_other_shapes_are_built_as_their_file_says(tmp_path: Path) -> None:
+    kwargs = {"net_arch": {"pi": [8, 4], "vf": [6]}, "activation_fn": torch.nn.ReLU}
+    model = PPO("MlpPolicy", gym.make("CartPole-v1"), device="cpu", policy_kwargs=kwargs)
+    model.save(tmp_path / "model.zip")
+    observations = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
+    np.testing.assert_array_equal(
+        load_policy(tmp_path / "model.zip").act(observations),
+        model.predict(observations, deterministic=True)[0],
+    )
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
+    """A pickle that would make a folder, wherever SB3 has pickles."""
+    path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
+    ran = tmp_path / "ran"
+
+    class Bomb:
+        def __reduce__(self) -> Any:
+            return os.mkdir, (str(ran),)
+
+    pickled = base64.b64encode(cloudpickle.dumps(Bomb())).decode()
+    with zipfile.ZipFile(path) as archive:
+        data = json.loads(archive.read("data"))
+    bombed = {
+        key: {**value, ":serialized:": pickled} if isinstance(value, dict) else value
+        for key, value in data.items()
+    }
+    text = json.dumps(bombed).encode()
+    load_policy(rewrite(path, tmp_path / "data.zip", data=text))
+    load_policy(rewrite(path, tmp_path / "bare.zip", data=text, mcaprl_json=None))
+    weights = io.BytesIO()
+    torch.save({"q_net.q_net.0.weight": Bomb()}, weights)
+    with pytest.raises(PolicyError, match="no plain tensors"):
+        load_policy(rewrite(path, tmp_path / "weights.zip", policy_pth=weights.getvalue()))
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({"policy_pth": None}, "is no model of Stable-Baselines3: .*policy.pth"),
+        ({"data": None}, "is no model of Stable-Baselines3: .*data"),
+        ({"data": b"{"}, "cannot read the model"),
+        ({"data": b"[]"}, "its parts are of other kinds"),
+        ({"policy_pth": b"PK"}, "cannot read the model|no plain tensors"),
+        ({"mcaprl_json": b'{"format_version": 9}'}, "format_version 9 is not known"),
+        ({"mcaprl_json": b'{"format_version": 1}'}, "cannot load the policy .* KeyError"),
+        ({"mcaprl_json": None, "data": b"{}"}, "observation space is no Box"),
+    ],
+)
+def test_broken_files_are_told_in_one_line(
+    tmp_path: Path, members: dict[str, bytes | None], message: str
+) -> None:
+    path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
+    broken = rewrite(path, tmp_path / "broken.zip", **members)
+    with pytest.raises(PolicyError, match=message) as caught:
+        load_policy(broken)
+    assert "broken.zip" in str(caught.value)
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
+    with zipfile.ZipFile(path) as archive:
+        own = json.loads(archive.read(OWN_NAME))
+    text = json.dumps({**own, "net_arch": [9]}).encode()
+    with pytest.raises(PolicyError, match="size mismatch"):
+        load_policy(rewrite(path, tmp_path / "other.zip", mcaprl_json=text))
+
+
+def test_files_that_are_no_zip_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "model.zip").write_bytes(b"no zip")
+    with pytest.raises(PolicyError, match="cannot read the model"):
+        load_policy(tmp_path / "model.zip")
+    with pytest.raises(PolicyError, match="does not exist"):
+        load_policy(tmp_path / "none.zip")
+
+
+def test_other_algorithms_are_refused(tmp_path: Path) -> None:
+    SAC("MlpPolicy", gym.make("Pendulum-v1"), buffer_size=10, **small()).save(tmp_path / "sac.zip")
+    with pytest.raises(PolicyError, match="none of DQN, PPO and A2C"):
+        load_policy(tmp_path / "sac.zip")
+
+
+def test_unknown_networks_are_refused(tmp_path: Path) -> None:
+    kwargs = {"net_arch": [8], "features_extractor_kwargs": {}}
+    dqn(policy_kwargs=kwargs).save(tmp_path / "model.zip")
+    with pytest.raises(PolicyError, match="policy_kwargs features_extractor_kwargs"):
+        load_policy(tmp_path / "model.zip")
+
+
+def test_observations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    policy = load_policy(ours(tmp_path / "model.zip", dqn(), gym.make("CartPole-v1")))
+    with pytest.raises(PolicyError, match="does not take these observations"):
+        policy.act(np.zeros((1, 5), dtype=np.float32))
+
+
+def test_a_runs_seeds_come_in_their_order(tmp_path: Path) -> None:
+    for seed in (10, 2):
+        (tmp_path / f"seed-{seed}").mkdir()
+        ours(tmp_path / f"seed-{seed}" / BEST_NAME, dqn(), gym.make("CartPole-v1"))
+    names = [policy.name.split("/")[1] for policy in load_policies(tmp_path)]
+    assert names == ["seed-2", "seed-10"]
+    assert policy_files(tmp_path / "seed-2") == [tmp_path / "seed-2" / BEST_NAME]
+
+
+def test_plain_sb3_needs_nothing_of_this_package(tmp_path: Path) -> None:
+    env = gym.make("CartPole-v1")
+    model = dqn(seed=4)
+    path = ours(tmp_path / "model.zip", model, env)
+    code = f"""
+        import sys
+        sys.modules["mcaprl"] = None
+        from stable_baselines3 import DQN
+        model = DQN.load({str(path)!r})
+        print(int(model.predict([0.1, 0.2, 0.3, 0.4], deterministic=True)[0]))
+    """
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", textwrap.dedent(code)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    action = model.predict(np.array([0.1, 0.2, 0.3, 0.4]), deterministic=True)[0]
+    assert int(done.stdout) == int(action)

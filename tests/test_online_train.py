@@ -1,0 +1,224 @@
+"""Online training runs: what is in the folder, what repeats, and that agents learn."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stable_baselines3 import DQN
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from mcaprl.cli import run
+from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.online.curve import read_curve
+from mcaprl.online.policy import load_policies
+from mcaprl.online.task import Task
+from mcaprl.online.train import train
+from mcaprl.progress import TrainingProgress
+from mcaprl.sims import make_sim
+
+SHORT: dict[str, Any] = {
+    "steps": 600,
+    "hidden": (8,),
+    "eval_interval": 200,
+    "eval_episodes": 3,
+    "final_episodes": 4,
+}
+SHORT_DQN: dict[str, Any] = {**SHORT, "learning_starts": 64, "target_update_interval": 80}
+
+
+def lane(**settings: Any) -> Task:
+    """A short task in the lane sim."""
+    return Task.for_sim("lane", **{**SHORT_DQN, **settings})
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+def test_a_run_leaves_these_files(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    (summary,) = train(lane(), out, seed=2, progress=silent)
+    assert {path.name for path in out.iterdir()} == {
+        "config.json",
+        "scores.json",
+        "curve.png",
+        "seed-2",
+    }
+    names = {path.name.split(".tfevents")[0] for path in (out / "seed-2").iterdir()}
+    assert names == {
+        "best_model.zip",
+        "checkpoint.safetensors",
+        "curve.csv",
+        "progress.csv",
+        "events.out",
+    }
+    assert (summary.folder, summary.seed, summary.steps) == (out / "seed-2", 2, 600)
+    config = json.loads((out / "config.json").read_text())
+    assert (config["algo"], config["sim"], config["config"]["steps"]) == ("double-dqn", "lane", 600)
+
+
+def test_the_curve_has_a_row_for_each_evaluation(tmp_path: Path) -> None:
+    train(lane(), tmp_path / "run", progress=silent)
+    points = read_curve(tmp_path / "run" / "seed-0" / "curve.csv")
+    assert [point.step for point in points] == [200, 400, 600]
+    best = -np.inf
+    for point in points:
+        assert point.lowest_return <= point.mean_return <= point.highest_return
+        assert point.best == (point.mean_return > best)
+        best = max(best, point.mean_return)
+        assert -1 < point.score < 1.5
+
+
+def test_scalars_have_sb3s_names(tmp_path: Path) -> None:
+    train(lane(), tmp_path / "run", progress=silent)
+    board = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+    board.Reload()
+    assert set(board.Tags()["scalars"]) >= {
+        "eval/mean_reward",
+        "eval/mean_ep_length",
+        "eval/score",
+        "rollout/ep_rew_mean",
+        "rollout/ep_len_mean",
+        "rollout/exploration_rate",
+        "train/loss",
+        "train/learning_rate",
+        "time/fps",
+    }
+    assert [event.step for event in board.Scalars("eval/score")] == [200, 400, 600]
+
+
+@pytest.mark.parametrize("envs", [1, 8])
+def test_the_same_seed_gives_the_same_curve(tmp_path: Path, envs: int) -> None:
+    curves = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        train(lane(envs=envs), tmp_path / name, seed=seed, progress=silent)
+        curves.append((tmp_path / name / f"seed-{seed}" / "curve.csv").read_text())
+    assert curves[0] == curves[1] != curves[2]
+
+
+def test_several_seeds_are_each_as_if_alone(tmp_path: Path) -> None:
+    train(lane(), tmp_path / "all", seeds=2, progress=silent)
+    train(lane(), tmp_path / "one", seed=1, progress=silent)
+    curves = [tmp_path / name / "seed-1" / "curve.csv" for name in ("all", "one")]
+    assert curves[0].read_text() == curves[1].read_text()
+    scores = json.loads((tmp_path / "all" / "scores.json").read_text())
+    assert set(scores["seeds"]) == {"seed-0", "seed-1"}
+
+
+def test_the_last_score_is_what_evaluate_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    (summary,) = train(lane(), out, progress=silent)
+    assert run(["evaluate", str(out), "--sim", "lane", "--episodes", "4", "--json"]) == 0
+    (mine, *_) = json.loads(capsys.readouterr().out)["policies"]
+    assert mine["mean_return"] == summary.mean_return
+    assert mine["normalized_score"] == pytest.approx(summary.score, abs=1e-12)
+
+
+def test_the_kept_model_is_the_best_and_plain_sb3s(tmp_path: Path) -> None:
+    (summary,) = train(lane(), tmp_path / "run", progress=silent)
+    model = DQN.load(summary.folder / "best_model.zip")
+    assert model.num_timesteps == summary.best_step
+    (policy,) = load_policies(tmp_path / "run")
+    observations = np.random.default_rng(0).uniform(-1, 1, (30, 12)).astype(np.float32)
+    np.testing.assert_array_equal(
+        policy.act(observations), model.predict(observations, deterministic=True)[0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings"), [("dqn", {}), ("ppo", {"rollout_steps": 192}), ("a2c", {})]
+)
+def test_other_algorithms_and_environments(
+    tmp_path: Path, algo: str, settings: dict[str, Any]
+) -> None:
+    task = Task.for_sim("CartPole-v1", algo, **SHORT, **settings)
+    (summary,) = train(task, tmp_path / "run", progress=silent)
+    assert np.isnan(summary.score)
+    assert 8 <= summary.mean_return <= 500
+    scores = json.loads((tmp_path / "run" / "scores.json").read_text())
+    assert scores["seeds"]["seed-0"]["score"] is None
+
+
+def test_pictures_are_learnt_from(tmp_path: Path) -> None:
+    sizes: dict[str, Any] = {
+        "steps": 80,
+        "eval_interval": 40,
+        "eval_episodes": 1,
+        "final_episodes": 1,
+    }
+    options: dict[str, Any] = {"observation": "depth"}
+    task = Task.for_sim("lane", "dqn", options, **{**SHORT_DQN, **sizes, "batch_size": 4})
+    (summary,) = train(task, tmp_path / "run", progress=silent)
+    (policy,) = load_policies(summary.folder)
+    assert policy.observation_space == make_sim("lane", **options).observation_space
+
+
+def test_an_agent_learns_to_stay_upright(tmp_path: Path) -> None:
+    task = Task.for_sim(
+        "CartPole-v1",
+        "ppo",
+        steps=8_000,
+        rollout_steps=256,
+        batch_size=256,
+        epochs=10,
+        learning_rate=1e-3,
+        gamma=0.98,
+        gae_lambda=0.8,
+        eval_interval=4_000,
+        eval_episodes=5,
+        final_episodes=5,
+    )
+    (summary,) = train(task, tmp_path / "run", progress=silent)
+    assert summary.mean_return > 100
+
+
+def test_a_taken_folder_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "note").write_text("mine")
+    with pytest.raises(OutputExistsError, match="choose another folder"):
+        train(lane(), tmp_path / "run", progress=silent)
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["note"]
+
+
+def test_mistakes_leave_no_folder(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with pytest.raises(UnknownNameError, match="unknown sim"):
+        train(Task.for_sim("lame"), out)
+    with pytest.raises(UnknownNameError, match="unknown algorithm"):
+        Task.for_sim("lane", "double-dqm")
+    with pytest.raises(SpaceError, match="dqn needs discrete actions"):
+        train(Task.for_sim("Pendulum-v1", "dqn", **SHORT), out)
+    with pytest.raises(UsageError, match="seeds must be at least 1"):
+        train(lane(), out, seeds=0)
+    assert not out.exists()
+    out.touch()
+    with pytest.raises(TrainingError, match="cannot write"):
+        train(lane(), out / "below", progress=silent)
+
+
+def test_the_command_trains_and_prints_a_row_for_each_seed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sizes = {"steps": 200, "eval-interval": 100, "eval-episodes": 2, "final-episodes": 2}
+    options = [text for name, size in sizes.items() for text in (f"--{name}", f"{size}")]
+    out = tmp_path / "run"
+    command = ["train-online", "lane", "--algo", "dqn", "--out", str(out), "--seeds", "2"]
+    assert run([*command, *options]) == 0
+    assert "dqn in lane" in capsys.readouterr().out
+    with (out / "seed-1" / "curve.csv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["96", "192"]
+
+
+def test_the_command_knows_which_settings_an_algorithm_has(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = str(tmp_path / "run")
+    assert run(["train-online", "lane", "--algo", "dqn", "--out", out, "--epochs", "3"]) == 2
+    assert "dqn has no setting --epochs; it has --steps" in capsys.readouterr().err

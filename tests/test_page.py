@@ -1,0 +1,159 @@
+"""Reports as a real browser shows them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.figures import new_figure, to_svg
+from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.recorder.lint import lint
+from mcaprl.recorder.report import dataset_page
+from mcaprl.recorder.tracks import tracks_of
+from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.sims import make_sim
+from tests.conftest import need
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+# What the page measures of itself, put where the browser's dump of the document shows it.
+PROBE = """<script>
+window.addEventListener("load", () => {
+  const style = getComputedStyle(document.body);
+  document.title = [document.documentElement.scrollWidth, innerWidth,
+    style.color, style.backgroundColor, getComputedStyle(document.querySelector("svg text")).fill]
+    .join("|");
+});
+</script>"""
+
+
+def browse(page: Path, *flags: str) -> tuple[str, str]:
+    """The document as a browser has it after loading, and what the browser's console said."""
+    need(BROWSER is not None, "Chromium is not installed (Debian: apt-get install chromium)")
+    done = subprocess.run(
+        [
+            str(BROWSER),
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-logging=stderr",
+            f"--user-data-dir={page.parent / 'profile'}",
+            "--virtual-time-budget=2000",
+            *flags,
+            "--dump-dom",
+            page.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return done.stdout, "\n".join(re.findall(r".*CONSOLE.*", done.stderr))
+
+
+@pytest.fixture(scope="module")
+def lane_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a short lane log."""
+    folder = tmp_path_factory.mktemp("page")
+    recorder = RecordMcap(make_sim("lane"), folder / "lane.mcap")
+    for seed in range(4):
+        recorder.reset(seed=seed)
+        for step in range(20):
+            if recorder.step(1 + step % 2)[2]:
+                break
+    recorder.close()
+    data = mcaprl.open(folder / "lane.mcap")
+    page = folder / "index.html"
+    dataset_page(page, data, "lane.mcap", [("steps", str(len(data)))], lint(data))
+    return page
+
+
+def test_a_browser_has_nothing_to_complain_of(lane_page: Path) -> None:
+    document, console = browse(lane_page)
+    assert console == ""
+    assert "Where the steps were" in document
+    assert document.count("mcaprl replay") == 4
+    assert not re.search(r"(src|href)=.(https?:)?//|@import", document), "it needs no network"
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (390, True)])
+def test_it_fits_a_phone_and_the_reader_s_colors(lane_page: Path, width: int, dark: bool) -> None:
+    probed = lane_page.with_name(f"probed-{width}-{dark}.html")
+    probed.write_text(lane_page.read_text() + PROBE)
+    # Chromium's windows are 500 wide or more; a narrower one is a frame in it.
+    outer = lane_page.with_name(f"outer-{width}-{dark}.html")
+    outer.write_text(
+        f'<iframe id="f" src="{probed.name}" width="{width}" height="900"></iframe><script>'
+        "f.onload = () => setTimeout(() => { document.title = f.contentDocument.title }, 100)"
+        "</script>"
+    )
+    flags = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    document, console = browse(outer, "--allow-file-access-from-files", *flags)
+    assert console == ""
+    found = re.search(r"<title>(.*?)</title>", document)
+    assert found is not None, document[:500]
+    needed, offered, ink, back, svg_ink = found[1].split("|")
+    assert int(needed) <= int(offered) == width
+    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
+    assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
+    assert svg_ink == ink, "what is drawn has the color of what is written"
+
+
+def test_text_is_text_and_no_markup(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>"
+    figure, axes = new_figure((2, 1))
+    axes.set_title(evil)
+    section = Section(
+        evil,
+        evil,
+        [Figure(evil, to_svg(figure))],
+        Table([evil], [[evil]]),
+        [Card(evil, evil, command=evil)],
+    )
+    write_page(tmp_path / "evil.html", evil, evil, [section])
+    assert "<script" not in (tmp_path / "evil.html").read_text()
+
+
+def test_columns_of_numbers_go_to_the_right() -> None:
+    rows = [["lane", "1.5", "3", ""], ["12", "-2 to 3.25", "x", "4.5 s"]]
+    assert Table(["a", "b", "c", "d"], rows).kinds == ["text", "number", "text", "number"]
+
+
+def test_the_same_figure_gives_the_same_bytes() -> None:
+    drawn = []
+    for _ in range(2):
+        figure, axes = new_figure((2, 1))
+        axes.plot([1, 2, 3])
+        drawn.append(to_svg(figure))
+    assert drawn[0] == drawn[1]
+
+
+def test_tracks_are_the_places_that_telemetry_told(tmp_path: Path) -> None:
+    recorder = RecordMcap(make_sim("lane"), tmp_path / "lane.mcap")
+    told = []
+    for seed in range(2):
+        recorder.reset(seed=seed)
+        told.append([recorder.unwrapped.telemetry()])  # type: ignore[attr-defined]
+        for _ in range(3):
+            recorder.step(1)
+            told[-1].append(recorder.unwrapped.telemetry())  # type: ignore[attr-defined]
+    recorder.close()
+    tracks = tracks_of(mcaprl.open(tmp_path / "lane.mcap"))
+    for track, places in zip(tracks, told, strict=True):
+        expected = [(place["x_m"], place["y_m"]) for place in places]
+        np.testing.assert_array_equal(track, np.array(expected))
+
+
+def test_without_telemetry_there_are_no_tracks(tmp_path: Path) -> None:
+    recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / "c.mcap")
+    recorder.reset(seed=0)
+    while not recorder.step(0)[2]:
+        pass
+    recorder.close()
+    assert [track.shape for track in tracks_of(mcaprl.open(tmp_path / "c.mcap"))] == [(0, 2)]
