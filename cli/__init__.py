@@ -18,6 +18,7 @@ from mcaprl._version import __version__
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.logs import check, info, layout
 from mcaprl.cli.record import record
+from mcaprl.cli.replay import replay
 from mcaprl.cli.train_offline import train_offline
 from mcaprl.cli.train_online import train_online
 from mcaprl.errors import McaprlError
@@ -29,7 +30,8 @@ def cli() -> None:
     """The robot's log is the dataset: record, learn from and replay MCAP files."""
 
 
-for _command in (record, train_online, train_offline, evaluate, info, check, layout):
+_COMMANDS = (record, train_online, train_offline, evaluate, replay, info, check, layout)
+for _command in _COMMANDS:
     cli.add_command(_command)
 
 

@@ -15,8 +15,12 @@ from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.recorder.reader import open_logs
 
 if TYPE_CHECKING:
-    from mcaprl.offline.off_policy import Estimate, StochasticPolicy
+    from mcaprl.offline.off_policy import PolicyEstimates, StochasticPolicy
     from mcaprl.recorder.dataset import Dataset
+
+
+_STANDARD_ERRORS = 4.0
+"""So far from 1, chance no longer explains it."""
 
 
 def evaluate_from_log(
@@ -49,10 +53,11 @@ def evaluate_from_log(
     policies = _policies(names, dataset)
     config = replace(FQEConfig(), gamma=gamma, updates=updates)
     evaluator = OffPolicyEvaluator(dataset, config, seed)
-    estimates: list[Estimate] = []
+    found: list[PolicyEstimates] = []
     with progress("learning values", len(policies) * evaluator.updates_of_model) as advance:
         for name, policy in policies.items():
-            estimates += evaluator.evaluate(policy, name, epsilon=epsilon, on_update=advance)
+            found.append(evaluator.evaluate(policy, name, epsilon=epsilon, on_update=advance))
+    estimates = [estimate for one in found for estimate in one.estimates]
     actions = int(getattr(dataset.action_space, "n", 0))
     return {
         "data": data,
@@ -62,6 +67,7 @@ def evaluate_from_log(
         "behavior_return": evaluator.behavior_return,
         "behavior_interval": list(evaluator.behavior_interval),
         "behavior_calibration": inverse_probability(dataset.behavior_probs, actions),
+        "coverage": {one.policy: one.coverage for one in found},
         "estimates": [estimate.to_json() for estimate in estimates],
         "ranking": ranking(estimates) if len(policies) > 1 else None,
     }
@@ -87,6 +93,14 @@ def print_estimates(result: dict[str, Any]) -> None:
         ["policy", "estimator", "value", "95 % interval", "effective episodes", "verdict"],
         rows,
     )
+    coverage = ", ".join(f"{share:.0%} by {name}" for name, share in result["coverage"].items())
+    click.echo(f"logged actions that the policies would take: {coverage}")
+    calibration, error = result["behavior_calibration"]
+    if calibration > 1 + _STANDARD_ERRORS * error:
+        click.echo(
+            f"the log's behavior_prob cannot be right: 1 / behavior_prob is {calibration:.2f} times"
+            " the number of actions in the mean, and 1 at most if it is"
+        )
     if result["ranking"] is not None:
         order = result["ranking"]
         click.echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")

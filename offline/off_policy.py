@@ -82,6 +82,23 @@ class Estimate:
         }
 
 
+@dataclass(frozen=True)
+class PolicyEstimates:
+    """What a log says of one policy.
+
+    Attributes:
+        policy: its name.
+        coverage: the mean probability that it has for the logged actions: 1 if the log does just
+            what it would do, 0 if never. Where it is low, estimates rest on few steps or on the
+            model's guesses.
+        estimates: one for each estimator.
+    """
+
+    policy: str
+    coverage: float
+    estimates: tuple[Estimate, ...]
+
+
 class OffPolicyEvaluator:
     """A log, ready to be asked about policies.
 
@@ -129,7 +146,7 @@ class OffPolicyEvaluator:
         *,
         epsilon: float = 0.0,
         on_update: Callable[[], None] = lambda: None,
-    ) -> list[Estimate]:
+    ) -> PolicyEstimates:
         """Estimate a policy's discounted return with every estimator.
 
         Args:
@@ -152,17 +169,15 @@ class OffPolicyEvaluator:
         behavior = self._dataset.behavior_probs.astype(np.float64)
         unknown = int(np.isnan(behavior).sum())
         if unknown:
-            reason = f"behavior_prob of {unknown} of {len(behavior)} steps is unknown"
-            missing = [
-                Estimate(name, estimator, None, None, 0.0, f"refused: {reason}")
-                for estimator in ESTIMATORS
-            ]
-            return [self._fqe_estimate(name, v, own), *missing]
-        table = self._table(own / behavior, q, v, v_last)
-        return [
-            self._fqe_estimate(name, v, own / behavior),
-            *(self._estimate(name, estimator, table) for estimator in ESTIMATORS),
-        ]
+            verdict = f"refused: behavior_prob of {unknown} of {len(behavior)} steps is unknown"
+            found = [Estimate(name, each, None, None, 0.0, verdict) for each in ESTIMATORS]
+            weights = own
+        else:
+            weights = own / behavior
+            table = self._table(weights, q, v, v_last)
+            found = [self._estimate(name, each, table) for each in ESTIMATORS]
+        fqe = self._fqe_estimate(name, v, weights)
+        return PolicyEstimates(name, float(own.mean()), (fqe, *found))
 
     @property
     def updates_of_model(self) -> int:
@@ -279,7 +294,7 @@ class OffPolicyEvaluator:
         return float(low), float(high)
 
 
-def inverse_probability(behavior_probs: NDArray[np.floating], actions: int) -> float:
+def inverse_probability(behavior_probs: NDArray[np.floating], actions: int) -> tuple[float, float]:
     """How well logged probabilities are calibrated: the mean of 1 / (p A), at most 1.
 
     Over actions drawn with probabilities p, the mean of 1 / p is the number of actions that can be
@@ -289,10 +304,14 @@ def inverse_probability(behavior_probs: NDArray[np.floating], actions: int) -> f
     Args:
         behavior_probs: (N,) of the actions taken.
         actions: A.
+
+    Returns:
+        The mean, and its standard error; NaN if probabilities are unknown or 0.
     """
-    if len(behavior_probs) == 0 or not (behavior_probs > 0).all():
-        return math.nan
-    return float((1 / behavior_probs.astype(np.float64)).mean() / actions)
+    if len(behavior_probs) < 2 or not (behavior_probs > 0).all():
+        return math.nan, math.nan
+    inverse = 1 / (behavior_probs.astype(np.float64) * actions)
+    return float(inverse.mean()), float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
 
 
 def _verdict(size: float) -> str:

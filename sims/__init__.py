@@ -2,13 +2,15 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane', 'powerline', 'racer']
+    ['highway-lane', 'lane', 'powerline', 'racer']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any, Final
 
 import gymnasium as gym
@@ -19,24 +21,37 @@ SIMS: Final[dict[str, str]] = {
     "lane": "mcaprl/LaneKeeping-v0",
     "racer": "mcaprl/Racer-v0",
     "powerline": "mcaprl/Powerline-v0",
+    "highway-lane": "mcaprl/HighwayLane-v0",
 }
 """Short name of each sim, and the id that Gymnasium knows it by."""
+ENGINES: Final[dict[str, str]] = dict.fromkeys(SIMS.values(), "numba") | {
+    SIMS["highway-lane"]: "highway_env"
+}
+"""What a sim needs of the extra `sims`, by the sim's id."""
 
 gym.register(
     id=SIMS["lane"],
     entry_point="mcaprl.sims.lane:LaneKeepingEnv",
+    vector_entry_point="mcaprl.sims.lane:BatchedLaneKeepingEnv",
     max_episode_steps=400,
 )
 gym.register(
     id=SIMS["racer"],
     entry_point="mcaprl.sims.racer:RacerEnv",
+    vector_entry_point="mcaprl.sims.racer:BatchedRacerEnv",
     # The classic rules' limit; the default ones end sooner by themselves.
     max_episode_steps=10_000,
 )
 gym.register(
     id=SIMS["powerline"],
     entry_point="mcaprl.sims.powerline:PowerlineEnv",
+    vector_entry_point="mcaprl.sims.powerline:BatchedPowerlineEnv",
     max_episode_steps=400,
+)
+gym.register(
+    id=SIMS["highway-lane"],
+    entry_point="mcaprl.sims.highway_lane:HighwayLaneEnv",
+    max_episode_steps=700,
 )
 
 
@@ -44,7 +59,7 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, `powerline`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: one of `SIMS`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:
@@ -52,11 +67,45 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
         MissingExtraError: the packages that the sim needs are not installed.
         UsageError: the environment takes no such argument, or cannot be made.
     """
+    with _errors_of(name, kwargs):
+        return gym.make(SIMS.get(name, name), **kwargs)
+
+
+def make_sims(
+    name: str, num_envs: int, *, autoreset_mode: str = "NextStep", **kwargs: Any
+) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """Make many environments that are stepped together, in this process.
+
+    Our own sims advance all their vehicles in one array step; other environments are stepped one
+    after the other.
+
+    Args:
+        name: as of `make_sim`.
+        num_envs: how many.
+        autoreset_mode: `NextStep`, `SameStep` or `Disabled`; see
+            `gymnasium.vector.AutoresetMode`.
+        **kwargs: as of `make_sim`.
+
+    Raises:
+        UnknownNameError, MissingExtraError, UsageError: as of `make_sim`.
+    """
     env_id = SIMS.get(name, name)
-    if env_id in SIMS.values():
-        import_extra("numba", "sims")
+    with _errors_of(name, kwargs):
+        if env_id in SIMS.values() and gym.registry[env_id].vector_entry_point:
+            return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
+        mode = gym.vector.AutoresetMode(autoreset_mode)
+        options = {"autoreset_mode": mode}
+        return gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
+
+
+@contextlib.contextmanager
+def _errors_of(name: str, kwargs: dict[str, Any]) -> Iterator[None]:
+    """Tell in a user's terms why a sim cannot be made."""
+    env_id = SIMS.get(name, name)
+    if env_id in ENGINES:
+        import_extra(ENGINES[env_id], "sims")
     try:
-        return gym.make(env_id, **kwargs)
+        yield
     except gym.error.UnregisteredEnv as error:
         known = [*SIMS, "any Gymnasium id"]
         raise UnknownNameError("sim", name, known, gym.registry) from error
@@ -66,4 +115,4 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 
-__all__ = ["SIMS", "make_sim"]
+__all__ = ["SIMS", "make_sim", "make_sims"]

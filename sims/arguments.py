@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaprl.errors import UnknownNameError, UsageError
 
@@ -40,14 +42,37 @@ def check_range(argument: str, value: float, low: float, high: float) -> None:
         raise UsageError(f"{argument} is {low:g} to {high:g}, not {value}")
 
 
-def check_action(action: int | np.integer[Any], count: int) -> None:
-    """Refuse an action that is not 0 to count - 1.
+def check_action(action: int | np.integer[Any], count: int) -> int:
+    """Give an action as an int; refuse one that is not 0 to count - 1.
 
     Raises:
-        UsageError: it is not.
+        UsageError: it is not, or no whole number.
     """
-    if not 0 <= action < count:
+    try:
+        number = operator.index(action)
+    except TypeError:
+        raise UsageError(f"action {action!r} is no whole number") from None
+    if not 0 <= number < count:
         raise UsageError(f"action {action} does not exist: 0 to {count - 1} do")
+    return number
+
+
+def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
+    """Give the actions of many vehicles; refuse any that is not 0 to count - 1.
+
+    Raises:
+        UsageError: it is not; or there is not one whole number for each vehicle.
+    """
+    numbers = np.asarray(actions)
+    if numbers.shape != (vehicles,) or numbers.dtype.kind not in "iu":
+        raise UsageError(
+            f"actions are an array of {vehicles} whole numbers,"
+            f" not {numbers.dtype} of shape {numbers.shape}"
+        )
+    if numbers.min() < 0 or numbers.max() >= count:
+        wrong = numbers[(numbers < 0) | (numbers >= count)][0]
+        raise UsageError(f"action {wrong} does not exist: 0 to {count - 1} do")
+    return numbers.astype(np.int64)
 
 
 def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:

@@ -20,6 +20,8 @@ class Path(NamedTuple):
     """(N + 1,) distance of each corner from the start, along the path."""
     yaw_rad: NDArray[np.float64]
     """(N,) direction of each leg, counter-clockwise from x."""
+    forward: NDArray[np.float64]
+    """(N, 2) the same as unit vectors."""
     length_m: float
 
 
@@ -49,7 +51,8 @@ def closed_path(corners: ArrayLike) -> Path:
     if not np.all(lengths > 0):
         raise ValueError("two neighbouring corners are the same point")
     along = np.concatenate([[0.0], np.cumsum(lengths)])
-    return Path(points, along, np.arctan2(legs[:, 1], legs[:, 0]), float(along[-1]))
+    yaw_rad = np.arctan2(legs[:, 1], legs[:, 0])
+    return Path(points, along, yaw_rad, legs / lengths[:, np.newaxis], float(along[-1]))
 
 
 @compiled
@@ -62,9 +65,13 @@ def wrap_angle(angle_rad: float) -> float:
 def leg_at(path: Path, along_m: float) -> int:
     """Give the index of the leg that holds a distance along the path; any lap will do."""
     rest_m = along_m % path.length_m
-    leg = 0
-    while leg + 1 < len(path.yaw_rad) and path.along_m[leg + 1] <= rest_m:
-        leg += 1
+    leg, beyond = 0, len(path.yaw_rad)
+    while beyond - leg > 1:
+        middle = (leg + beyond) // 2
+        if path.along_m[middle] <= rest_m:
+            leg = middle
+        else:
+            beyond = middle
     return leg
 
 
@@ -73,9 +80,8 @@ def point_at(path: Path, along_m: float) -> tuple[float, float]:
     """Give the point (x, y) at a distance along the path, metres; any lap will do."""
     leg = leg_at(path, along_m)
     rest_m = along_m % path.length_m - path.along_m[leg]
-    share = rest_m / (path.along_m[leg + 1] - path.along_m[leg])
-    start, end = path.points_m[leg], path.points_m[leg + 1]
-    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+    start, forward = path.points_m[leg], path.forward[leg]
+    return start[0] + rest_m * forward[0], start[1] + rest_m * forward[1]
 
 
 @compiled
@@ -87,22 +93,22 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
     """
     leg = leg_at(path, from_m)
     leg_start_m = from_m - (from_m % path.length_m - path.along_m[leg])
-    best = Projection(from_m, math.inf, 0.0)
+    nearest, along_m, leftward, yaw_rad = math.inf, from_m, True, 0.0
     while leg_start_m <= to_m:
         leg_length_m = path.along_m[leg + 1] - path.along_m[leg]
-        yaw_rad = path.yaw_rad[leg]
-        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        cos, sin = path.forward[leg, 0], path.forward[leg, 1]
         dx, dy = x_m - path.points_m[leg, 0], y_m - path.points_m[leg, 1]
         first_m = max(0.0, from_m - leg_start_m)
         last_m = min(leg_length_m, to_m - leg_start_m)
         along_leg_m = min(max(dx * cos + dy * sin, first_m), last_m)
-        distance_m = math.hypot(dx - along_leg_m * cos, dy - along_leg_m * sin)
-        if distance_m < abs(best.offset_m):
-            offset_m = distance_m if cos * dy - sin * dx >= 0.0 else -distance_m
-            best = Projection(leg_start_m + along_leg_m, offset_m, yaw_rad)
+        square = (dx - along_leg_m * cos) ** 2 + (dy - along_leg_m * sin) ** 2
+        if square < nearest:
+            nearest, along_m, yaw_rad = square, leg_start_m + along_leg_m, path.yaw_rad[leg]
+            leftward = cos * dy - sin * dx >= 0.0
         leg_start_m += leg_length_m
         leg = (leg + 1) % len(path.yaw_rad)
-    return best
+    distance_m = math.sqrt(nearest)
+    return Projection(along_m, distance_m if leftward else -distance_m, yaw_rad)
 
 
 @compiled

@@ -2,63 +2,26 @@
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
 from mcaprl.sims import lane_scene
-from mcaprl.sims.arguments import check_action, check_name, pose_from
-from mcaprl.sims.bicycle import Motion
-from mcaprl.sims.camera import level_axes
-from mcaprl.sims.depth import DepthCamera, encode_depth
-from mcaprl.sims.geometry import leg_at, point_at, project
-from mcaprl.sims.lane_camera import lane_camera
-from mcaprl.sims.lane_course import (
-    CAMERA_FORWARD_M,
-    CAMERA_HEIGHT_M,
-    COURSE,
-    LANE_HALF_WIDTH_M,
-)
-from mcaprl.sims.lane_rules import (
-    ACTION_MEANINGS,
-    DECISION_S,
-    DRIVING,
-    MAX_SPEED_M_S,
-    OBSERVATION_LIMIT,
-    OBSERVATION_NAMES,
-    REASONS,
-    Car,
-    located,
-    observe,
-    step_cars,
-    wheel_angle,
-)
+from mcaprl.sims.batched import BatchedEnv
+from mcaprl.sims.lane_fleet import LaneFleet
+from mcaprl.sims.lane_rules import DECISION_S, Car, wheel_angle
 from mcaprl.sims.scene import Frame, Shape
+from mcaprl.sims.vehicle import RENDER_MODES, RenderMode, VehicleEnv
 
 if TYPE_CHECKING:
     from mcaprl.sims.lane_view import LaneView
 
-RULES = ("default",)
-OBSERVATIONS = ("state", "depth")
-STARTS = ("anywhere", "line")
-RENDER_MODES = ("human", "rgb_array")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / DECISION_S)}
-DEPTH_SHAPE = (84, 84, 1)
-START_LINE_M = 2.0
-CLEAR_AFTER_CORNER_M = 2.0
-CLEAR_BEFORE_CORNER_M = 8.0
-"""Random starts keep clear of corners: nearer than that, some cars cannot turn in time."""
-TRAIL_LENGTH = 40
 
 
-class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
+class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
     """A car that learns to keep its lane through a town.
 
     ## Description
@@ -103,6 +66,20 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
     `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth in the log code of
     `mcaprl.sims.depth.encode_depth`; 255 where there is nothing.
 
+    `observation="rays"`: `Box` of 20 float32.
+
+    | Index | Observation | Unit | Limit |
+    |---|---|---|---|
+    | 0 to 15 | distance to the next rail or house | see below | 0 to 1 |
+    | 16 | speed | 30 m/s | 0 to 1 |
+    | 17 | last steering command, left positive | 50 % | 1 |
+    | 18, 19 | path point 20 m ahead: forward, left of the car | 20 m | 4 |
+
+    The rays leave the car's middle at 0, 10, -10, 20, -20, 30, -30, 45, -45, 60, -60, 90, -90, 135,
+    -135 and 180 degrees; left is positive. A distance of d metres is observed as
+    ln(1 + d / 1 m) / ln(101), and as 1 beyond 100 m. Rays show where the streets are, and the path
+    point which one to take.
+
     ## Rewards
 
     ds / 7.5 m (1 - (d / 3.5 m)^2 / 2): progress ds along the path, less at distance d from it.
@@ -124,11 +101,36 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
     `info` has lateral_offset_m, heading_error_rad, speed_m_s and progress_m (along the path since
     the start, growing over the laps).
 
+    ## Classic Rules
+
+    `rules="classic"` and `"classic-code"` are the system as it was published: a decision each
+    second; the reward is (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5) at v m/s, with d to the
+    nearest of the *endless* straight lines through the legs, and -3 beyond 3.5 m. Terminated where
+    the reward is less than -1 (`off_lane` beyond 3.5 m, else `low_reward`); and, by the published
+    text (`"classic"`), at 5 m/s or less without braking (`slow`), or, by the published code
+    (`"classic-code"`), where the car touches a rail or a house while it drives straight ahead,
+    action 1 (`collision`). It starts on the line, with a second straight ahead. `depth` is in the
+    code of `encode_nearness`. Their faults:
+
+    - Speed is measured against 300 m/s, so that its term is near -0.5 for ever: even in the middle
+      of the lane, a fast car earns almost nothing, and 0.3 m beside it loses more than half a point
+      a second. A whole lap scores far below leaving the road at once, which costs 3.
+    - "Reward less than -1" is a second, hidden lane: 1.1 m to each side at rest, growing with the
+      speed, and gone at 10 m/s.
+    - The lines are endless: driving off along the extension of a leg is paid like driving on it.
+    - Braking to a stand never ends, and costs less than many a drive.
+    - By the code, driving through a wall is over only when driving straight ahead.
+    - In a second, nothing can be corrected: 10 m at 10 m/s, three times the width allowed.
+    - The picture's code spends half of its values on 1 to 2 m.
+
+    Ours are the car, the town, and the picture's averaging where the published one interpolates.
+    Rails and houses do not stop a car.
+
     ## Arguments
 
-    - `rules`: `"default"`.
-    - `observation`: `"state"` or `"depth"`.
-    - `start`: `"anywhere"` or `"line"`.
+    - `rules`: `"default"`, `"classic"` or `"classic-code"`.
+    - `observation`: `"state"`, `"depth"` or `"rays"`.
+    - `start`: `"anywhere"` or `"line"`; None is `"anywhere"`, in the classic rules `"line"`.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -137,162 +139,47 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
     """
 
     metadata = METADATA
-    action_meanings: ClassVar[tuple[str, ...]] = ACTION_MEANINGS
-    step_duration_s: ClassVar[float] = DECISION_S
 
     def __init__(
         self,
         rules: str = "default",
         observation: str = "state",
-        start: str = "anywhere",
-        render_mode: Literal["human", "rgb_array"] | None = None,
+        start: str | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
         """See "Arguments" above.
 
         Raises:
             UnknownNameError: an argument has a value that is not in its list.
         """
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
-        check_name("start", start, STARTS)
-        if render_mode is not None:
-            check_name("render_mode", render_mode, RENDER_MODES)
-        self.render_mode = self._render_mode = render_mode
-        self.observation_names = OBSERVATION_NAMES if observation == "state" else ()
-        self.action_space = spaces.Discrete(len(ACTION_MEANINGS))
-        self.observation_space = (
-            spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-            if observation == "state"
-            else spaces.Box(0, 255, DEPTH_SHAPE, np.uint8)
-        )
-        self._start = start
-        self._shows_state = observation == "state"
-        self._car = Car(*[0.0] * len(Car._fields))
-        self._cars = np.zeros((1, len(self._car)))
-        self._actions = np.zeros(1, dtype=np.int64)
-        self._rewards = np.zeros(1)
-        self._ends = np.zeros(1, dtype=np.int64)
-        self._observations = np.zeros((1, len(OBSERVATION_NAMES)), dtype=np.float32)
-        self._started_at_m = 0.0
-        self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
-        self._camera: DepthCamera | None = None
-        self._depth_m: NDArray[np.float32] | None = None
-        self._view: LaneView | None = None
+        super().__init__(LaneFleet(1, rules, observation, start), render_mode)
+        self._has_rays = observation == "rays"
 
     @property
     def car(self) -> Car:
         """The whole state of the car."""
-        return self._car
+        return self.fleet.car(0)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Start an episode; see "Starting State".
-
-        Raises:
-            UsageError: `options` has an unknown key, or a pose that is not on the lane.
-        """
-        super().reset(seed=seed)
-        self._car = self._start_car() if not options else _car_from(options)
-        self._cars[0] = self._car
-        self._rewards[0] = 0.0
-        observe(self._car, self._observations[0])
-        self._started_at_m = self._car.along_m
-        self._trail_m.clear()
-        return self._seen(), self._info()
-
-    def step(
-        self, action: int | np.integer[Any]
-    ) -> tuple[NDArray[Any], float, bool, bool, dict[str, Any]]:
-        """Drive on for 0.25 s.
-
-        Raises:
-            UsageError: the action is not 0 to 5.
-        """
-        check_action(action, len(ACTION_MEANINGS))
-        self._actions[0] = action
-        step_cars(self._cars, self._actions, self._rewards, self._ends, self._observations)
-        self._car = Car._make(self._cars[0].tolist())
-        reward, end, info = self._rewards.item(), self._ends.item(), self._info()
-        if end != DRIVING:
-            info["reason"] = REASONS[end]
-        return self._seen(), reward, end != DRIVING, False, info
-
-    def _start_car(self) -> Car:
-        """Draw a start."""
-        draw = self.np_random.uniform
-        if self._start == "line":
-            along_m, speed_m_s = START_LINE_M, 0.0
-            offset_m, error_rad = draw(-0.3, 0.3), draw(-0.05, 0.05)
-        else:
-            along_m, speed_m_s = self._clear_place_m(), draw(0.0, 10.0)
-            offset_m, error_rad = draw(-1.5, 1.5), draw(-0.2, 0.2)
-        x_m, y_m = point_at(COURSE, along_m)
-        place = project(COURSE, x_m, y_m, along_m, along_m)
-        motion = Motion(
-            x_m - offset_m * math.sin(place.yaw_rad),
-            y_m + offset_m * math.cos(place.yaw_rad),
-            place.yaw_rad + error_rad,
-            speed_m_s,
-        )
-        return located(motion, 0.0, along_m, 0.0)
-
-    def _clear_place_m(self) -> float:
-        """Draw a place on the path that is not close to a corner, metres along it."""
-        while True:
-            along_m = float(self.np_random.uniform(0.0, COURSE.length_m))
-            leg = leg_at(COURSE, along_m)
-            after_m, before_m = along_m - COURSE.along_m[leg], COURSE.along_m[leg + 1] - along_m
-            if after_m >= CLEAR_AFTER_CORNER_M and before_m >= CLEAR_BEFORE_CORNER_M:
-                return along_m
-
-    def _seen(self) -> NDArray[Any]:
-        """Give the observation, and take note of the place for what is drawn."""
-        self._depth_m = None
-        self._trail_m.append((self._car.x_m, self._car.y_m))
-        if self.render_mode == "human":
-            self.render()
-        if self._shows_state:
-            observation: NDArray[np.float32] = self._observations[0].copy()
-            return observation
-        return encode_depth(self.depth_image_m())[:, :, np.newaxis]
-
-    def _info(self) -> dict[str, Any]:
-        car = self._car
-        return {
-            "lateral_offset_m": car.offset_m,
-            "heading_error_rad": car.heading_error_rad,
-            "speed_m_s": car.speed_m_s,
-            "progress_m": car.along_m - self._started_at_m,
-        }
+    @property
+    def place(self) -> tuple[float, ...]:
+        """Where the car is now: x and y in the map."""
+        car = self.car
+        return car.x_m, car.y_m
 
     def telemetry(self) -> dict[str, float]:
         """Give the car's state by name; the units are in the names."""
-        car = self._car
+        car = self.car
         return {
             "x_m": car.x_m,
             "y_m": car.y_m,
             "yaw_rad": car.yaw_rad,
-            "speed_m_s": car.speed_m_s,
-            "lateral_offset_m": car.offset_m,
-            "heading_error_rad": car.heading_error_rad,
-            "progress_m": car.along_m - self._started_at_m,
+            **self.fleet.info(0),
             "steering_rad": wheel_angle(car.steering, car.speed_m_s),
         }
 
     def depth_image_m(self) -> NDArray[np.float32]:
         """Give the front camera's (84, 84) distances along each ray, metres; inf is nothing."""
-        if self._depth_m is None:
-            if self._camera is None:
-                self._camera = lane_camera()
-            car = self._car
-            position = (
-                car.x_m + CAMERA_FORWARD_M * math.cos(car.yaw_rad),
-                car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad),
-                CAMERA_HEIGHT_M,
-            )
-            self._depth_m = self._camera.image_m(position, level_axes(car.yaw_rad))
-        return self._depth_m
+        return self.fleet.depth_image_m(0)
 
     def static_scene(self) -> Sequence[Shape]:
         """Give the shapes that never change, those of the car's body in the frame `car`."""
@@ -300,7 +187,7 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
 
     def scene(self) -> Sequence[Shape]:
         """Give the shapes that change with each step."""
-        return lane_scene.moving_shapes(self._car, self._trail_m)
+        return lane_scene.moving_shapes(self.car, self.trail, self._has_rays)
 
     def static_frames(self) -> Sequence[Frame]:
         """Give the camera's frame in the car: optical axes, z along the view, x right, y down."""
@@ -308,33 +195,18 @@ class LaneKeepingEnv(gym.Env[NDArray[Any], Any]):
 
     def frames(self) -> Sequence[Frame]:
         """Give the car's frame in the map."""
-        return (lane_scene.car_frame(self._car),)
+        return (lane_scene.car_frame(self.car),)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the car from above: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
-        if self._render_mode is None:
-            return None
-        if self._view is None:
-            from mcaprl.sims.lane_view import LaneView
+    def _open_view(self, render_mode: RenderMode) -> LaneView:
+        from mcaprl.sims.lane_view import LaneView
 
-            self._view = LaneView(self._render_mode)
-        image = self._view.draw(self._car, np.array(self._trail_m), float(self._rewards[0]))
-        return image if self.render_mode == "rgb_array" else None
+        return LaneView(render_mode)
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+    def _draw(self, view: LaneView) -> NDArray[np.uint8]:
+        return view.draw(self.car, self.scene(), self.fleet.rewards.item())
 
 
-def _car_from(options: dict[str, Any]) -> Car:
-    """Read a start from the options of `reset`."""
-    pose = pose_from(options, 0.0, MAX_SPEED_M_S)
-    place = project(COURSE, pose.x_m, pose.y_m, 0.0, COURSE.length_m)
-    if abs(place.offset_m) > LANE_HALF_WIDTH_M:
-        raise UsageError(
-            f"pose ({pose.x_m}, {pose.y_m}) is {abs(place.offset_m):.1f} m from the path:"
-            f" at most {LANE_HALF_WIDTH_M} m is on the lane"
-        )
-    return located(Motion(*pose), 0.0, place.along_m, 0.0)
+class BatchedLaneKeepingEnv(BatchedEnv):
+    """Many cars at once; see `LaneKeepingEnv`, whose arguments it has."""
+
+    fleet_type = LaneFleet

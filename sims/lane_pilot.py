@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.bicycle import steering_of
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import in_body_frame, leg_at, point_at
 from mcaprl.sims.lane import LaneKeepingEnv
@@ -16,6 +17,8 @@ from mcaprl.sims.lane_rules import (
     BRAKE,
     DRIVING,
     STEERING,
+    SUBSTEP_S,
+    SUBSTEPS,
     WHEELBASE_M,
     Car,
     drive,
@@ -32,7 +35,7 @@ CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
 """The car is down to the corner speed 2 m before a corner, having slowed by at most 1.5 m/s^2."""
 HORIZON = 12
-"""Decisions (3 s) that a plan must survive."""
+"""Decisions (3 s by default) that a plan must survive."""
 
 
 @compiled
@@ -54,7 +57,7 @@ def pursue(car: Car) -> int:
         x_m - car.x_m, y_m - car.y_m, math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     )
     slip_sine = WHEELBASE_M * left_m / (forward_m**2 + left_m**2)
-    wanted_rad = math.atan(2.0 * math.tan(math.asin(min(max(slip_sine, -1.0), 1.0))))
+    wanted_rad = steering_of(min(max(slip_sine, -1.0), 1.0))
     best, smallest_rad = BRAKE, math.inf
     for action in range(BRAKE + 1, len(STEERING)):
         error_rad = abs(wheel_angle(STEERING[action], car.speed_m_s) - wanted_rad)
@@ -64,11 +67,11 @@ def pursue(car: Car) -> int:
 
 
 @compiled
-def worth(car: Car) -> float:
+def worth(car: Car, substeps: int = SUBSTEPS) -> float:
     """Value pursuing from here: decisions survived, up to the horizon, and a little the reward."""
     total = 0.0
     for survived in range(HORIZON):
-        after = drive(car, pursue(car))
+        after = drive(car, pursue(car), substeps)
         if end_of(after) != DRIVING:
             return survived + 0.1 * total
         total += reward_of(car, after)
@@ -77,18 +80,23 @@ def worth(car: Car) -> float:
 
 
 @compiled
-def choose(car: Car) -> int:
-    """Pursue while that survives; else try all pairs of actions before pursuing."""
-    if worth(car) >= HORIZON:
+def choose(car: Car, substeps: int = SUBSTEPS) -> int:
+    """Pursue while that survives; else try all pairs of actions before pursuing.
+
+    Args:
+        car: now.
+        substeps: of 0.05 s that a decision lasts.
+    """
+    if worth(car, substeps) >= HORIZON:
         return pursue(car)
     best, most = BRAKE, -math.inf
     for first in range(len(STEERING)):
-        middle = drive(car, first)
+        middle = drive(car, first, substeps)
         if end_of(middle) != DRIVING:
             continue
         for second in range(len(STEERING)):
-            after = drive(middle, second)
-            value = worth(after) if end_of(after) == DRIVING else -1.0
+            after = drive(middle, second, substeps)
+            value = worth(after, substeps) if end_of(after) == DRIVING else -1.0
             if value > most:
                 best, most = first, value
     return best
@@ -102,6 +110,7 @@ class LanePilot:
     def __init__(self, sim: LaneKeepingEnv) -> None:
         """Take the wheel of `sim`."""
         self._sim = sim
+        self._substeps = round(sim.step_duration_s / SUBSTEP_S)
 
     def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
         """Give the action, shape (1,), for the car as it is now.
@@ -111,4 +120,4 @@ class LanePilot:
         """
         if len(observations) != 1:
             raise ValueError(f"one pilot drives one environment, not {len(observations)}")
-        return np.array([choose(self._sim.car)], dtype=np.int64)
+        return np.array([choose(self._sim.car, self._substeps)], dtype=np.int64)

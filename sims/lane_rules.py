@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.bicycle import Motion, roll, steering_for_lateral
+from mcaprl.sims.bicycle import Motion, roll, slip_for_lateral, slip_of, steering_of
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import in_body_frame, point_at, project, wrap_angle
 from mcaprl.sims.lane_course import COURSE, LANE_HALF_WIDTH_M
@@ -38,8 +38,9 @@ AHEAD_M = 8.0
 STALL_SPEED_M_S = 1.0
 STALL_TIME_S = 3.0
 FAILURE_REWARD = -5.0
-DRIVING, OFF_LANE, STALL = 0, 1, 2
-REASONS = ("", "off_lane", "stall")
+DRIVING, OFF_LANE, STALL, LOW_REWARD, SLOW, COLLISION = range(6)
+REASONS = ("", "off_lane", "stall", "low_reward", "slow", "collision")
+"""The last three are the classic rules' own."""
 
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 OBSERVATION_NAMES = (
@@ -86,8 +87,15 @@ def car_at(row: NDArray[np.float64]) -> Car:
 
 
 @compiled
-def wheel_angle(steering: float, speed_m_s: float) -> float:
-    """Give the front wheels' angle, radians: the steering command, less at high speed.
+def store_car(car: Car, row: NDArray[np.float64]) -> None:
+    """Write a car into a row of 9 floats."""
+    for i, value in enumerate(car):
+        row[i] = value
+
+
+@compiled
+def slip(steering: float, speed_m_s: float) -> float:
+    """Give the sine of the car's slip angle: that of the steering command, less at high speed.
 
     The command counts for 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at 120 km/h; and
     the car never turns so sharply that it would feel more than 9 m/s^2 sideways.
@@ -101,8 +109,14 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
     else:
         slope = (shares[2] - shares[1]) / (speeds[2] - speeds[1])
         share = shares[1] + slope * (speed_m_s - speeds[1])
-    limit_rad = steering_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
-    return min(max(steering * MAX_STEERING_RAD * share, -limit_rad), limit_rad)
+    limit = slip_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
+    return min(max(slip_of(steering * MAX_STEERING_RAD * share), -limit), limit)
+
+
+@compiled
+def wheel_angle(steering: float, speed_m_s: float) -> float:
+    """Give the front wheels' angle, radians, for a steering command at a speed; see `slip`."""
+    return steering_of(slip(steering, speed_m_s))
 
 
 @compiled
@@ -123,19 +137,20 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 
 
 @compiled
-def drive(car: Car, action: int) -> Car:
-    """Carry out one decision of a quarter second."""
+def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
+    """Carry out an action for so many sub-steps of 0.05 s."""
     motion = Motion(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
     steering = car.steering if action == BRAKE else STEERING[action]
-    for _ in range(SUBSTEPS):
+    for _ in range(substeps):
         speed_m_s = motion.speed_m_s
         if action == BRAKE:
             acceleration_m_s2 = -min(BRAKE_M_S2, speed_m_s / SUBSTEP_S)
         else:
             acceleration_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s / MAX_SPEED_M_S)
-        angle_rad = wheel_angle(steering, speed_m_s)
-        motion = roll(motion, angle_rad, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
-    slow_s = car.slow_s + DECISION_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
+        slip_sine = slip(steering, speed_m_s)
+        motion = roll(motion, slip_sine, acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
+    duration_s = substeps * SUBSTEP_S
+    slow_s = car.slow_s + duration_s if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, car.along_m, slow_s)
 
 
@@ -200,6 +215,4 @@ def step_cars(
         rewards[i] = reward_of(before, after)
         ends[i] = end_of(after)
         observe(after, observations[i])
-        row = cars[i]
-        for j, value in enumerate(after):
-            row[j] = value
+        store_car(after, cars[i])

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from mcaprl.sims import lane_course as course
 from mcaprl.sims.car_parts import part, wheel
 from mcaprl.sims.geometry import point_at
+from mcaprl.sims.lane_obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
+from mcaprl.sims.lane_rays import ray_lines
 from mcaprl.sims.lane_rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
 from mcaprl.sims.scene import Color, Frame, Shape, raised, yaw_rotation
 
@@ -29,6 +31,7 @@ GLASS: Color = (0.12, 0.17, 0.22, 1.0)
 RUBBER: Color = (0.07, 0.07, 0.08, 1.0)
 LAMP: Color = (1.0, 0.96, 0.78, 1.0)
 TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
+RAY: Color = (0.98, 0.80, 0.28, 0.8)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 WALLS: tuple[Color, ...] = (
     (0.80, 0.73, 0.63, 1.0),
@@ -114,7 +117,7 @@ def _wheel(name: str, forward_m: float, left_m: float) -> Shape:
 def _car() -> list[Shape]:
     axle_m, side_m = WHEELBASE_M / 2, TRACK_M / 2
     return [
-        part("body", PAINT, (4.3, 1.75, 0.5), (0.05, 0.0, 0.58)),
+        part("body", PAINT, (BODY_LENGTH_M, BODY_WIDTH_M, 0.5), (BODY_FORWARD_M, 0.0, 0.58)),
         part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
         part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
         part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
@@ -135,12 +138,15 @@ def static_shapes() -> tuple[Shape, ...]:
     return (*_road(), *_surroundings(), *_car())
 
 
-def moving_shapes(car: Car, trail_m: Sequence[tuple[float, float]]) -> tuple[Shape, ...]:
+def moving_shapes(
+    car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
+) -> tuple[Shape, ...]:
     """Give what changes with each step.
 
     Args:
         car: now.
         trail_m: the last positions of the car, (x, y) in the map; at least one.
+        has_rays: whether the car sees by rays.
     """
     trail = np.array([*trail_m, trail_m[-1]])
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
@@ -163,6 +169,15 @@ def moving_shapes(car: Car, trail_m: Sequence[tuple[float, float]]) -> tuple[Sha
             frame="car",
             text=f"{car.speed_m_s:.1f} m/s",
         ),
+        *(_rays(car) if has_rays else ()),
+    )
+
+
+def _rays(car: Car) -> tuple[Shape, ...]:
+    lines_m = ray_lines(car)
+    return (
+        Shape("rays", "segments", RAY, raised(lines_m, 0.5), size=(0.06, 0.0, 0.0)),
+        Shape("hits", "points", LOOK, raised(lines_m[:, 1], 0.75), size=(0.3, 0.3, 0.3)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.follow_view import Body, FollowView
 from mcaprl.sims.lane_rules import DECISION_S, Car
-from mcaprl.sims.lane_scene import moving_shapes, static_shapes
+from mcaprl.sims.lane_scene import static_shapes
+from mcaprl.sims.scene import Shape
 
 VIEW_M = 55.0
 
@@ -26,15 +28,14 @@ class LaneView:
         frames_per_s = round(1.0 / DECISION_S)
         self._view = FollowView(render_mode, "lane", static_shapes(), VIEW_M, frames_per_s)
 
-    def draw(self, car: Car, trail_m: NDArray[np.float64], reward: float) -> NDArray[np.uint8]:
+    def draw(self, car: Car, moving: Sequence[Shape], reward: float) -> NDArray[np.uint8]:
         """Draw the car where it is, and give the picture, (600, 600, 3).
 
         Args:
             car: the car now.
-            trail_m: (K, 2) its last positions, K >= 1.
+            moving: the shapes that change with each step.
             reward: of the last step.
         """
-        moving = moving_shapes(car, [(float(x), float(y)) for x, y in trail_m])
         text = (
             f"{car.speed_m_s:4.1f} m/s   offset {car.offset_m:+.2f} m   "
             f"at {car.along_m:.0f} m   reward {reward:+.2f}"

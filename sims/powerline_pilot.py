@@ -94,5 +94,5 @@ class PowerlinePilot:
         if count != 1:
             raise ValueError(f"one pilot flies one environment, not {count}")
         sim = self._sim
-        action = choose(sim.flight, sim.velocity_step_m_s, sim.rules == "classic")
+        action = choose(sim.flight, sim.fleet.velocity_step_m_s, sim.fleet.classic)
         return np.array([action], dtype=np.int64)

@@ -24,7 +24,7 @@ from mcaprl.sims.powerline_world import (
     wire_distance,
 )
 from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
-from mcaprl.sims.vectors import Vector, norm, plus, times
+from mcaprl.sims.vectors import Vector, minus, norm, plus, times
 
 ACTION_MEANINGS = (
     "faster north (+x)",
@@ -247,6 +247,41 @@ def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
         observation[i] = min(max(observation[i], -limit), limit)
 
 
+class Bearing(NamedTuple):
+    """Where a drone is, seen from the line, in ROS axes."""
+
+    lateral_m: float
+    """Left of the line, seen along it."""
+    vertical_m: float
+    """Above the line."""
+    distance_m: float
+    """From the line."""
+    along_m: float
+    """Of the nearest point, along the line."""
+    speed_m_s: float
+
+
+@compiled
+def bearing_of(drone: Drone) -> Bearing:
+    """Give where a drone is."""
+    place = nearest_on_line(drone.position_m)
+    away = minus(drone.position_m, place.point_m)
+    forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
+    level = math.hypot(forward_x, forward_y)
+    lateral_m = (forward_y * away.x - forward_x * away.y) / level
+    speed_m_s = norm(drone.velocity_m_s)
+    return Bearing(lateral_m, -away.z, place.distance_m, place.along_m, speed_m_s)
+
+
+@compiled
+def take_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
+    """Write the bearings (N, 5) of N drones, (N, 33) rows of `Flight`."""
+    for i in range(len(flights)):
+        bearing = bearing_of(drone_at(flights[i]))
+        for k, value in enumerate(bearing):
+            bearings[i, k] = value
+
+
 @compiled
 def step_flights(
     plant: int,
@@ -265,14 +300,16 @@ def step_flights(
         flights: (N, 33) rows of `Flight`.
         actions: (N,) 0 to 6.
         gust_m_s: standard deviation of the gusts.
-        noise: (N, 3) standard normal numbers, for the gusts.
+        noise: (N, 3) standard normal numbers for the gusts; (N, 0) will do where there are none.
         rewards: (N,) to be filled.
         ends: (N,) to be filled with FLYING, OFF_LINE, COLLISION or FINISHED.
         observations: (N, 18) to be filled.
     """
     for i in range(len(flights)):
         flight = flight_at(flights[i])
-        gust = blown(flight.gust_m_s, gust_m_s, noise[i])
+        gust = flight.gust_m_s
+        if gust_m_s > 0.0:
+            gust = blown(gust, gust_m_s, noise[i])
         before = Flight(flight.drone, flight.command_m_s, flight.wind_m_s, gust, flight.furthest_m)
         after, ends[i] = decide(plant, before, actions[i])
         rewards[i] = reward_of(before, after, ends[i])

@@ -20,7 +20,7 @@ from mcaprl.sims import powerline_world as world
 from mcaprl.sims.powerline_rules import Flight
 from mcaprl.sims.quadrotor import ROTOR_OFFSET_M, Drone
 from mcaprl.sims.scene import Color, Frame, Shape
-from mcaprl.sims.vectors import Vector, minus, norm
+from mcaprl.sims.vectors import Vector, norm
 
 Floats = NDArray[np.float64]
 
@@ -175,7 +175,7 @@ def static_shapes() -> tuple[Shape, ...]:
     return (*ground_shapes(), *_line(), *_drone())
 
 
-def moving_shapes(flight: Flight, trail_m: Sequence[Vector]) -> tuple[Shape, ...]:
+def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple[Shape, ...]:
     """Give what changes with each step.
 
     Args:
@@ -227,24 +227,15 @@ def camera_frame(view: str) -> Frame:
     return Frame("camera", ros(camera.CAMERA_AT_M[view]), rotations[view], parent="drone")
 
 
-def telemetry(flight: Flight, started_at_m: float) -> dict[str, float]:
-    """Give the drone's state by name, in ROS axes; the units are in the names."""
+def telemetry(flight: Flight) -> dict[str, float]:
+    """Give what `info` does not tell of a drone, in ROS axes; the units are in the names."""
     drone = flight.drone
-    place = world.nearest_on_line(drone.position_m)
     x_m, y_m, z_m = ros(drone.position_m)
-    away = minus(drone.position_m, place.point_m)
-    forward_x, forward_y, _ = world.TANGENTS[place.leg]
-    level = math.hypot(forward_x, forward_y)
     tilt_cosine = 1.0 - 2.0 * (drone.attitude.x**2 + drone.attitude.y**2)
     return {
         "x_m": x_m,
         "y_m": y_m,
         "z_m": z_m,
-        "speed_m_s": norm(drone.velocity_m_s),
-        "lateral_offset_m": float(forward_y * away.x - forward_x * away.y) / level,
-        "vertical_offset_m": -away.z,
-        "line_distance_m": place.distance_m,
-        "progress_m": place.along_m - started_at_m,
         "tilt_rad": math.acos(min(1.0, max(-1.0, tilt_cosine))),
         "wire_distance_m": world.wire_distance(drone.position_m),
         "height_m": z_m - world.ground_height(drone.position_m.x, drone.position_m.y),

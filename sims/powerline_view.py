@@ -28,7 +28,7 @@ from mcaprl.sims.powerline_world import (
     point_on_line,
     towers,
 )
-from mcaprl.sims.vectors import Vector, norm
+from mcaprl.sims.vectors import norm
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,9 @@ class PowerlineView:
         above = scene.static_shapes()[len(floor) :]
         self._view = FollowView(render_mode, "powerline", above, VIEW_M, frames_per_s, floor)
 
-    def draw(self, flight: Flight, trail_m: Sequence[Vector], reward: float) -> NDArray[np.uint8]:
+    def draw(
+        self, flight: Flight, trail_m: Sequence[tuple[float, ...]], reward: float
+    ) -> NDArray[np.uint8]:
         """Draw the drone where it is, and give the picture, (600, 600, 3).
 
         Args:

@@ -2,56 +2,28 @@
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import UsageError
 from mcaprl.sims import racer_scene
-from mcaprl.sims.arguments import check_action, check_name, pose_from
-from mcaprl.sims.geometry import leg_at, point_at
-from mcaprl.sims.racer_car import Racer, placed, racer_at
-from mcaprl.sims.racer_rules import (
-    ACTION_MEANINGS,
-    CRASH,
-    DRIVING,
-    MAX_SPEED_PX,
-    OBSERVATION_NAMES,
-    REASONS,
-    STEP_S,
-    observe,
-    step_racers,
-    walls_hit,
-)
-from mcaprl.sims.racer_track import (
-    HALF_WIDTH_PX,
-    METRES_PER_PX,
-    PICTURE_HEIGHT_PX,
-    Track,
-    make_track,
-)
+from mcaprl.sims.batched import BatchedEnv
+from mcaprl.sims.racer_car import Racer
+from mcaprl.sims.racer_fleet import RacerFleet
+from mcaprl.sims.racer_rules import STEP_S
+from mcaprl.sims.racer_track import Track
 from mcaprl.sims.scene import Frame, Shape
+from mcaprl.sims.vehicle import RENDER_MODES, RenderMode, VehicleEnv
 
 if TYPE_CHECKING:
     from mcaprl.sims.racer_view import RacerView
 
-RULES = ("default", "classic")
-OBSERVATIONS = ("rays",)
-STARTS = ("anywhere", "line")
-RENDER_MODES = ("human", "rgb_array")
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / STEP_S)}
-ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
-MAX_SPEED_M_S = MAX_SPEED_PX * METRES_PER_PX / STEP_S
-TRAIL_LENGTH = 40
 
 
-class RacerEnv(gym.Env[NDArray[np.float32], Any]):
+class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     """A car that learns to race around a track by the lengths of its rays.
 
     ## Description
@@ -154,7 +126,6 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
     """
 
     metadata = METADATA
-    step_duration_s: ClassVar[float] = STEP_S
 
     def __init__(
         self,
@@ -164,7 +135,7 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
         actions: int = 9,
         drift: bool = False,
         track_seed: int | None = None,
-        render_mode: Literal["human", "rgb_array"] | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
         """See "Arguments" above.
 
@@ -172,137 +143,29 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
             UnknownNameError: an argument has a value that is not in its list.
             UsageError: the track's seed is not a whole number of 0 or more.
         """
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
-        check_name("start", start, (None, *STARTS))
-        check_name("number of actions", actions, tuple(ACTION_SETS))
-        check_name("drift", drift, (False, True))
-        check_name("render_mode", render_mode, (None, *RENDER_MODES))
-        self.render_mode = self._render_mode = render_mode
-        self.classic = rules == "classic"
-        self.actions = ACTION_SETS[actions]
-        self.track = _track_of(track_seed)
-        self.action_meanings = tuple(ACTION_MEANINGS[action] for action in self.actions)
-        self.observation_names = OBSERVATION_NAMES
-        self.action_space = spaces.Discrete(len(self.actions))
-        self.observation_space = spaces.Box(-1.0, 1.0, (len(OBSERVATION_NAMES),), np.float32)
-        self._start = start or ("line" if self.classic else "anywhere")
-        self._drift = bool(drift)
-        self._car = Racer(*[0.0] * len(Racer._fields))
-        self._cars = np.zeros((1, len(self._car)))
-        self._actions = np.zeros(1, dtype=np.int64)
-        self._rewards = np.zeros(1)
-        self._ends = np.zeros(1, dtype=np.int64)
-        self._observations = np.zeros((1, len(OBSERVATION_NAMES)), dtype=np.float32)
-        self._started_at_m = 0.0
-        self._last_action = 0
-        self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
-        self._view: RacerView | None = None
+        fleet = RacerFleet(1, rules, observation, start, actions, drift, track_seed)
+        super().__init__(fleet, render_mode)
 
     @property
     def car(self) -> Racer:
         """The whole state of the car."""
-        return self._car
+        return self.fleet.car(0)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; see "Starting State".
+    @property
+    def track(self) -> Track:
+        """What it drives on."""
+        return self.fleet.track
 
-        Raises:
-            UsageError: `options` has an unknown key, or a pose that is not on the track.
-        """
-        super().reset(seed=seed)
-        self._car = self._start_car() if not options else self._car_from(options)
-        self._cars[0] = self._car
-        self._rewards[0], self._last_action = 0.0, 0
-        observe(self.track, self._car, self.classic, self._observations[0])
-        self._started_at_m = self._car.along_m
-        self._trail_m.clear()
-        return self._seen(), self._info()
-
-    def step(
-        self, action: int | np.integer[Any]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Drive on for one step.
-
-        Raises:
-            UsageError: there is no such action.
-        """
-        check_action(action, len(self.actions))
-        self._last_action = self._actions[0] = self.actions[action]
-        step_racers(
-            self.track,
-            self._cars,
-            self._actions,
-            self._rewards,
-            self._ends,
-            self._observations,
-            self.classic,
-            self._drift,
-        )
-        self._car = racer_at(self._cars[0])
-        reward, end, info = self._rewards.item(), self._ends.item(), self._info()
-        if end != DRIVING:
-            info["reason"] = REASONS[end]
-        return self._seen(), reward, end == CRASH, end not in (DRIVING, CRASH), info
-
-    def _start_car(self) -> Racer:
-        """Draw a start."""
-        x_px, y_px, heading_rad = self.track.start_px
-        if self._start == "line" and self.classic:
-            return placed(self.track, x_px, y_px, heading_rad, 0.0, 0.0)
-        draw, path = self.np_random.uniform, self.track.path
-        along_m, speed_px, left_px, left_rad = 0.0, 0.0, draw(-3.0, 3.0), draw(-0.05, 0.05)
-        if self._start == "anywhere":
-            along_m, speed_px = draw(0.0, path.length_m), draw(0.0, 6.0)
-            left_px, left_rad = draw(-12.0, 12.0), draw(-0.2, 0.2)
-            x_px, y_px = _to_picture(*point_at(path, along_m))
-            heading_rad = -path.yaw_rad[leg_at(path, along_m)]
-        x_px += left_px * math.sin(heading_rad)
-        y_px -= left_px * math.cos(heading_rad)
-        return placed(self.track, x_px, y_px, heading_rad - left_rad, speed_px, along_m)
-
-    def _car_from(self, options: dict[str, Any]) -> Racer:
-        """Read a start from the options of `reset`."""
-        pose = pose_from(options, -MAX_SPEED_M_S, MAX_SPEED_M_S)
-        x_px, y_px = _to_picture(pose.x_m, pose.y_m)
-        speed_px = pose.speed_m_s * STEP_S / METRES_PER_PX
-        car = placed(self.track, x_px, y_px, -pose.yaw_rad, speed_px, 0.0)
-        half_width_m = HALF_WIDTH_PX * METRES_PER_PX
-        if abs(car.offset_m) > half_width_m or walls_hit(self.track, car):
-            raise UsageError(
-                f"pose ({pose.x_m}, {pose.y_m}) is {abs(car.offset_m):.1f} m from the middle of the"
-                f" track: the whole car must be inside the walls, {half_width_m} m from it"
-            )
-        return car
-
-    def _seen(self) -> NDArray[np.float32]:
-        """Give the observation, and take note of the place for what is drawn."""
-        place = self._place()
-        self._trail_m.append((place["x_m"], place["y_m"]))
-        if self.render_mode == "human":
-            self.render()
-        observation: NDArray[np.float32] = self._observations[0].copy()
-        return observation
-
-    def _info(self) -> dict[str, Any]:
-        car = self._car
-        return {
-            "lateral_offset_m": car.offset_m,
-            "heading_error_rad": car.heading_error_rad,
-            "speed_m_s": car.speed_px * METRES_PER_PX / STEP_S,
-            "progress_m": car.along_m - self._started_at_m,
-            "gates_passed": int(car.gates),
-        }
-
-    def _place(self) -> dict[str, float]:
-        x_m, y_m, _ = racer_scene.car_frame(self._car).position
-        return {"x_m": x_m, "y_m": y_m, "yaw_rad": -self._car.heading_rad}
+    @property
+    def place(self) -> tuple[float, ...]:
+        """Where the car is now: x and y in the map."""
+        return racer_scene.car_frame(self.car).position[:2]
 
     def telemetry(self) -> dict[str, float]:
         """Give the car's state by name; the units are in the names."""
-        return {**self._place(), **{name: float(value) for name, value in self._info().items()}}
+        x_m, y_m = self.place
+        told = {name: float(value) for name, value in self.fleet.info(0).items()}
+        return {"x_m": x_m, "y_m": y_m, "yaw_rad": -self.car.heading_rad, **told}
 
     def static_scene(self) -> Sequence[Shape]:
         """Give the shapes that never change, those of the car's body in the frame `car`."""
@@ -310,7 +173,7 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
 
     def scene(self) -> Sequence[Shape]:
         """Give the shapes that change with each step."""
-        return racer_scene.moving_shapes(self.track, self._car, self._trail_m)
+        return racer_scene.moving_shapes(self.track, self.car, self.trail)
 
     def static_frames(self) -> Sequence[Frame]:
         """Give no frames: nothing is fixed to the car but its body."""
@@ -318,32 +181,18 @@ class RacerEnv(gym.Env[NDArray[np.float32], Any]):
 
     def frames(self) -> Sequence[Frame]:
         """Give the car's frame in the map."""
-        return (racer_scene.car_frame(self._car),)
+        return (racer_scene.car_frame(self.car),)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the track from above: give (600, 1000, 3) uint8 for `rgb_array`, or show it."""
-        if self._render_mode is None:
-            return None
-        if self._view is None:
-            from mcaprl.sims.racer_view import RacerView
+    def _open_view(self, render_mode: RenderMode) -> RacerView:
+        from mcaprl.sims.racer_view import RacerView
 
-            self._view = RacerView(self._render_mode, self.track)
-        image = self._view.draw(self._car, self._trail_m, self._last_action)
-        return image if self.render_mode == "rgb_array" else None
+        return RacerView(render_mode, self.track)
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+    def _draw(self, view: RacerView) -> NDArray[np.uint8]:
+        return view.draw(self.car, self.trail, self.fleet.last_actions.item())
 
 
-def _track_of(seed: int | None) -> Track:
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
-        raise UsageError(f"track_seed is None or a whole number of 0 or more, not {seed!r}")
-    return make_track(seed)
+class BatchedRacerEnv(BatchedEnv):
+    """Many cars at once; see `RacerEnv`, whose arguments it has."""
 
-
-def _to_picture(x_m: float, y_m: float) -> tuple[float, float]:
-    """Give the picture coordinates of a map point."""
-    return x_m / METRES_PER_PX, PICTURE_HEIGHT_PX - y_m / METRES_PER_PX
+    fleet_type = RacerFleet

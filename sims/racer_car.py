@@ -64,6 +64,13 @@ def racer_at(row: NDArray[np.float64]) -> Racer:
 
 
 @compiled
+def store_racer(car: Racer, row: NDArray[np.float64]) -> None:
+    """Write a car into a row of 12 floats."""
+    for i, value in enumerate(car):
+        row[i] = value
+
+
+@compiled
 def placed(
     track: Track, x_px: float, y_px: float, heading_rad: float, speed_px: float, near_m: float
 ) -> Racer:

@@ -61,7 +61,6 @@ class RacerPilot:
     def __init__(self, sim: RacerEnv) -> None:
         """Take the wheel of `sim`."""
         self._sim = sim
-        self._allowed = np.array(sim.actions, dtype=np.int64)
 
     def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
         """Give the action, shape (1,), for the car as it is now.
@@ -71,6 +70,6 @@ class RacerPilot:
         """
         if len(observations) != 1:
             raise ValueError(f"one pilot drives one environment, not {len(observations)}")
-        sim = self._sim
-        chosen = choose(sim.track, sim.car, self._allowed, sim.classic)
-        return np.array([sim.actions.index(chosen)], dtype=np.int64)
+        fleet = self._sim.fleet
+        chosen = choose(fleet.track, self._sim.car, fleet.actions, fleet.classic)
+        return np.flatnonzero(fleet.actions == chosen)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.racer_car import Racer, corner_at
+from mcaprl.sims.racer_track import METRES_PER_PX
+from mcaprl.sims.ray_code import FAR_M
 
-FAR_PX = 1000.0
-"""How far a ray reaches."""
-LOG_SCALE_PX = 10.0
+FAR_PX = FAR_M / METRES_PER_PX
 JOINT = 1e-9
 """Walls are longer by this share at both ends, so that no ray slips through between two."""
 CENTRE_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
@@ -142,12 +142,6 @@ def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
         hit = (x_px + length_px * math.cos(angle_rad), y_px + length_px * math.sin(angle_rad))
         ends.append(((x_px, y_px), hit))
     return np.array(ends)
-
-
-@compiled
-def log_code(length_px: float) -> float:
-    """Pack a length into 0 to 1: ln(1 + d / 10 px) / ln(1 + 1000 px / 10 px)."""
-    return math.log1p(length_px / LOG_SCALE_PX) / math.log1p(FAR_PX / LOG_SCALE_PX)
 
 
 @compiled

@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import project, wrap_angle
-from mcaprl.sims.racer_car import Racer, corner_at, racer_at
+from mcaprl.sims.racer_car import Racer, corner_at, racer_at, store_racer
 from mcaprl.sims.racer_rays import (
     RAY_NAMES,
     RAYS,
     classic_code,
     crossing,
     floored_distance,
-    log_code,
     measure,
 )
 from mcaprl.sims.racer_track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track
+from mcaprl.sims.ray_code import log_code
 
 ACTION_MEANINGS = (
     "none",
@@ -43,6 +43,7 @@ STEP_S = 0.1
 TURN_RAD = math.radians(15.0)
 SPEED_CHANGE_PX = 2.0
 MAX_SPEED_PX = 10.0
+MAX_SPEED_M_S = MAX_SPEED_PX * METRES_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
 """A drifting car's course turns by at most this at its top speed, and more when it is slower."""
 
@@ -56,6 +57,7 @@ MAX_STEPS = 1_000
 MAX_STEPS_CLASSIC = 10_000
 DRIVING, CRASH, NO_GATE, TIME_LIMIT = 0, 1, 2, 3
 REASONS = ("", "crash", "no_gate", "time_limit")
+TRUNCATES = (False, False, True, True)
 
 
 OBSERVATION_NAMES = (*RAY_NAMES, "speed")
@@ -180,7 +182,9 @@ def observe(track: Track, car: Racer, classic: bool, observation: NDArray[np.flo
     lengths_px = np.empty(RAYS)
     measure(track.walls_px, car, classic, lengths_px)
     for i in range(RAYS):
-        observation[i] = classic_code(lengths_px[i]) if classic else log_code(lengths_px[i])
+        length_px = lengths_px[i]
+        code = classic_code(length_px) if classic else log_code(METRES_PER_PX * length_px)
+        observation[i] = code
     observation[RAYS] = (-car.speed_px if classic else car.speed_px) / MAX_SPEED_PX
 
 
@@ -212,6 +216,4 @@ def step_racers(
         after = drive(track, before, actions[i], classic, drift)
         rewards[i], ends[i] = judge(track, before, after, classic)
         observe(track, after, classic, observations[i])
-        row = cars[i]
-        for j, value in enumerate(after):
-            row[j] = value
+        store_racer(after, cars[i])

@@ -115,7 +115,7 @@ def static_shapes(track: Track) -> tuple[Shape, ...]:
 
 
 def moving_shapes(
-    track: Track, car: Racer, trail_m: Sequence[tuple[float, float]]
+    track: Track, car: Racer, trail_m: Sequence[tuple[float, ...]]
 ) -> tuple[Shape, ...]:
     """Give what changes with each step.
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaprl.sims.bicycle import Motion, roll, steering_for_lateral
+from mcaprl.sims.bicycle import Motion, roll, slip_for_lateral, slip_of, steering_of
 from mcaprl.sims.geometry import (
     Projection,
     closed_path,
@@ -157,7 +157,7 @@ def test_a_constant_steering_drives_a_circle() -> None:
     motion = Motion(0.0, 0.0, 0.0, 5.0)
     points = []
     for _ in range(4000):
-        motion = roll(motion, angle_rad, 0.0, wheelbase_m, 0.001)
+        motion = roll(motion, slip_of(angle_rad), 0.0, wheelbase_m, 0.001)
         points.append((motion.x_m, motion.y_m))
     centre = (-radius_m * math.sin(slip_rad), radius_m * math.cos(slip_rad))
     np.testing.assert_allclose(
@@ -167,13 +167,20 @@ def test_a_constant_steering_drives_a_circle() -> None:
 
 
 @given(st.floats(4.0, 30.0), st.floats(0.5, 9.0))
-def test_steering_for_a_sideways_acceleration_gives_it(
+def test_the_slip_for_a_sideways_acceleration_gives_it(
     speed_m_s: float, lateral_m_s2: float
 ) -> None:
-    angle_rad = steering_for_lateral(lateral_m_s2, speed_m_s, 2.7)
-    moved = roll(Motion(0.0, 0.0, 0.0, speed_m_s), angle_rad, 0.0, 2.7, 1e-3)
+    slip_sine = slip_for_lateral(lateral_m_s2, speed_m_s, 2.7)
+    moved = roll(Motion(0.0, 0.0, 0.0, speed_m_s), slip_sine, 0.0, 2.7, 1e-3)
     assert moved.yaw_rad / 1e-3 * speed_m_s == pytest.approx(lateral_m_s2)
 
 
-def test_a_slow_car_may_turn_its_wheels_freely() -> None:
-    assert steering_for_lateral(9.0, 1.0, 2.7) == pytest.approx(math.pi / 2)
+def test_a_slow_car_may_slip_freely() -> None:
+    assert slip_for_lateral(9.0, 1.0, 2.7) == 1.0
+    assert steering_of(1.0) == pytest.approx(math.pi / 2)
+
+
+@given(st.floats(-1.2, 1.2))
+def test_slip_and_steering_belong_together(steering_rad: float) -> None:
+    assert slip_of(steering_rad) == pytest.approx(math.sin(math.atan(math.tan(steering_rad) / 2)))
+    assert steering_of(slip_of(steering_rad)) == pytest.approx(steering_rad)

@@ -79,9 +79,9 @@ def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
-        ({"rules": "classic"}, "unknown rules 'classic': known: default"),
+        ({"rules": "classics"}, "did you mean classic or classic-code\\?"),
         ({"observation": "stat"}, "did you mean state\\?"),
-        ({"start": "pole"}, "known: anywhere, line"),
+        ({"start": "pole"}, "known: None, anywhere, line"),
     ],
 )
 def test_an_unknown_value_is_refused(kwargs: dict[str, str], words: str) -> None:

@@ -30,6 +30,7 @@ def test_the_moving_shapes_keep_their_names_and_stay_few(sim: LaneKeepingEnv) ->
 
 
 def test_the_trail_ends_at_the_car(sim: LaneKeepingEnv) -> None:
+    assert sim.trail == [(131.0, -60.0)]
     sim.step(1)
     trail = next(shape for shape in sim.scene() if shape.name == "trail")
     place = sim.telemetry()

@@ -16,7 +16,12 @@ from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.fqe import FQE, FQEConfig, reachable
 from mcaprl.offline.importance import ESTIMATORS
 from mcaprl.offline.losses import expected_sarsa
-from mcaprl.offline.off_policy import Estimate, OffPolicyEvaluator, inverse_probability
+from mcaprl.offline.off_policy import (
+    Estimate,
+    OffPolicyEvaluator,
+    PolicyEstimates,
+    inverse_probability,
+)
 from mcaprl.recorder.dataset import Dataset
 from tests import two_state_task as task
 
@@ -63,8 +68,8 @@ def log(episodes: int, seed: int = 0, acting: NDArray[np.float64] = task.BEHAVIO
     )
 
 
-def by_name(estimates: list[Estimate]) -> dict[str, Estimate]:
-    return {estimate.estimator: estimate for estimate in estimates}
+def by_name(found: PolicyEstimates) -> dict[str, Estimate]:
+    return {estimate.estimator: estimate for estimate in found.estimates}
 
 
 def test_expected_sarsa_by_hand() -> None:
@@ -111,12 +116,13 @@ def test_fitted_q_evaluation_learns_the_true_values() -> None:
 
 def test_every_estimator_finds_the_true_value() -> None:
     evaluator = OffPolicyEvaluator(log(1_500), FAST)
-    estimates = evaluator.evaluate(Table(task.EVALUATED), "better")
-    assert [estimate.estimator for estimate in estimates] == ["FQE", *ESTIMATORS]
-    for estimate in estimates:
+    evaluated = evaluator.evaluate(Table(task.EVALUATED), "better")
+    found = by_name(evaluated)
+    assert list(found) == ["FQE", *ESTIMATORS]
+    for estimate in found.values():
         assert estimate.trusted
         assert estimate.value == pytest.approx(task.true_value(), rel=0.12)
-    found = by_name(estimates)
+    assert 0.4 < evaluated.coverage < 0.65, "the policy's probabilities are .35 to .65"
     widths = {
         name: estimate.interval[1] - estimate.interval[0]
         for name, estimate in found.items()
@@ -177,8 +183,10 @@ def test_unknown_probabilities_leave_the_model_alone() -> None:
 
 def test_a_model_that_saw_too_little_of_the_horizon_says_so() -> None:
     config = FQEConfig(updates=100, target_interval=25, hidden=(4,), gamma=0.9)
-    estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")[0]
-    assert estimate.verdict.startswith("refused: 4 target copies are too few for gamma 0.9")
+    estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")
+    assert estimate.estimates[0].verdict.startswith(
+        "refused: 4 target copies are too few for gamma 0.9"
+    )
 
 
 def test_a_single_episode_is_refused() -> None:
@@ -203,9 +211,11 @@ def test_the_same_seed_gives_the_same_estimates() -> None:
 
 def test_inverse_probabilities_by_hand() -> None:
     # Six actions, uniform: 1 / p is 6 at each step.
-    assert inverse_probability(np.full(10, 1 / 6), 6) == pytest.approx(1.0)
+    assert inverse_probability(np.full(10, 1 / 6), 6) == pytest.approx((1.0, 0.0))
     # One action for certain: of two actions one never comes.
-    assert inverse_probability(np.ones(10), 2) == pytest.approx(0.5)
+    assert inverse_probability(np.ones(10), 2) == pytest.approx((0.5, 0.0))
     # Probabilities of which none can be true: half of what they are.
-    assert inverse_probability(np.full(10, 1 / 12), 6) == pytest.approx(2.0)
-    assert math.isnan(inverse_probability(np.array([0.5, math.nan]), 2))
+    assert inverse_probability(np.full(10, 1 / 12), 6) == pytest.approx((2.0, 0.0))
+    # 1 / (2 p) is 1 and 2: mean 1.5, standard deviation sqrt(.5), over sqrt(2) steps.
+    assert inverse_probability(np.array([0.5, 0.25]), 2) == pytest.approx((1.5, 0.5))
+    assert math.isnan(inverse_probability(np.array([0.5, math.nan]), 2)[0])

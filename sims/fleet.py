@@ -1,0 +1,90 @@
+"""N vehicles of one sim, held as arrays: what its single and its batched environment share."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+GOING_ON = 0
+"""In `Fleet.ends`: the episode is not over."""
+
+
+class Fleet(ABC):
+    """N vehicles that do not meet each other; each starts by itself.
+
+    Attributes:
+        count: N.
+        observation_space: of one vehicle.
+        observation_names: of the numbers in a vector that is observed; none for pictures.
+        action_meanings: what each action does.
+        step_duration_s: simulated time of one step.
+        rewards: (N,) of the last step; 0 at a start.
+        ends: (N,) how the last step ended the episodes: `GOING_ON` or an index of `reasons`.
+        noise: (N, K) standard normal numbers for the next step, which the environment draws before
+            it; K is 0 where nothing in a step is random.
+    """
+
+    reasons: ClassVar[tuple[str, ...]]
+    """Why an episode ends, by the codes in `ends`."""
+    truncates: ClassVar[tuple[bool, ...]]
+    """Of each of them, whether it only breaks the episode off."""
+
+    def __init__(
+        self,
+        count: int,
+        observation_space: spaces.Space[Any],
+        observation_names: tuple[str, ...],
+        action_meanings: tuple[str, ...],
+        step_duration_s: float,
+        noise_size: int = 0,
+    ) -> None:
+        """Make the arrays that all fleets have."""
+        self.count = count
+        self.observation_space = observation_space
+        self.observation_names = observation_names
+        self.action_meanings = action_meanings
+        self.step_duration_s = step_duration_s
+        self.rewards = np.zeros(count)
+        self.ends = np.zeros(count, dtype=np.int64)
+        self.noise = np.zeros((count, noise_size))
+
+    @abstractmethod
+    def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
+        """Start an episode of vehicle i.
+
+        Args:
+            i: 0 to N - 1.
+            random: all that is drawn is drawn from it.
+            options: of `reset`.
+
+        Raises:
+            UsageError: `options` has an unknown key, or a pose that cannot be started from.
+        """
+
+    @abstractmethod
+    def advance(self, actions: NDArray[np.int64]) -> None:
+        """Take one step with each vehicle.
+
+        Args:
+            actions: (N,) valid ones.
+        """
+
+    @abstractmethod
+    def observation(self, i: int) -> Any:
+        """Give what vehicle i observes, the caller's own."""
+
+    @abstractmethod
+    def observations(self) -> Any:
+        """Give what all observe, with a leading dimension of N, the caller's own."""
+
+    @abstractmethod
+    def info(self, i: int) -> dict[str, Any]:
+        """Give the `info` of vehicle i, without the reason of an end."""
+
+    @abstractmethod
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Give the same of all, each an array (N,), the caller's own."""

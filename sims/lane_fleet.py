@@ -1,0 +1,168 @@
+"""N cars of the lane sim as arrays: starts, steps and observations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.sims.arguments import check_name
+from mcaprl.sims.camera import level_axes
+from mcaprl.sims.depth import DepthCamera, encode_depth, encode_nearness
+from mcaprl.sims.fleet import GOING_ON, Fleet
+from mcaprl.sims.lane_camera import IMAGE_SHAPE, lane_camera
+from mcaprl.sims.lane_classic import (
+    CLASSIC_DECISION_S,
+    step_classic,
+)
+from mcaprl.sims.lane_course import CAMERA_FORWARD_M, CAMERA_HEIGHT_M
+from mcaprl.sims.lane_rays import (
+    RAY_OBSERVATION_LIMIT,
+    RAY_OBSERVATION_NAMES,
+    observe_all_rays,
+)
+from mcaprl.sims.lane_rules import (
+    ACTION_MEANINGS,
+    DECISION_S,
+    OBSERVATION_LIMIT,
+    OBSERVATION_NAMES,
+    REASONS,
+    Car,
+    observe,
+    step_cars,
+    store_car,
+)
+from mcaprl.sims.lane_start import car_from, start_car
+
+RULES = ("default", "classic", "classic-code")
+STARTS = ("anywhere", "line")
+OBSERVATIONS = ("state", "depth", "rays")
+ALONG = Car._fields.index("along_m")
+_NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES, "depth": ()}
+
+
+class LaneFleet(Fleet):
+    """N cars on the course; see `LaneKeepingEnv`, whose arguments it has."""
+
+    reasons: ClassVar[tuple[str, ...]] = REASONS
+    truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
+
+    def __init__(
+        self,
+        count: int,
+        rules: str = "default",
+        observation: str = "state",
+        start: str | None = None,
+    ) -> None:
+        """Make N cars; each is to be started by `begin`.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+        """
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("start", start, (None, *STARTS))
+        self.observation_kind = observation
+        self._classic, self._by_code = rules != "default", rules == "classic-code"
+        self._on_line = start == "line" or (self._classic and start is None)
+        super().__init__(
+            count,
+            _space(observation),
+            _NAMES[observation],
+            ACTION_MEANINGS,
+            CLASSIC_DECISION_S if self._classic else DECISION_S,
+        )
+        self._cars = np.zeros((count, len(Car._fields)))
+        self._started_at_m = np.zeros(count)
+        self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
+        self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
+        self._seen = self._rays if observation == "rays" else self._states
+        self._encode = encode_nearness if self._classic else encode_depth
+        self._camera: DepthCamera | None = None
+        self._depth_m: dict[int, NDArray[np.float32]] = {}
+
+    def car(self, i: int) -> Car:
+        """Give the whole state of a car."""
+        return Car._make(self._cars[i].tolist())
+
+    def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
+        """Start car i; see "Starting State" of `LaneKeepingEnv`."""
+        row, state = self._cars[i], self._states[i]
+        if options:
+            car = car_from(options)
+            store_car(car, row)
+            observe(car, state)
+        else:
+            start_car(random.random(4), self._on_line, self._classic, row, state)
+        self._started_at_m[i] = row[ALONG]
+        self.rewards[i], self.ends[i] = 0.0, GOING_ON
+        if self._seen is self._rays:
+            observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
+        self._depth_m.pop(i, None)
+
+    def advance(self, actions: NDArray[np.int64]) -> None:
+        """Drive on for a decision."""
+        if self._classic:
+            step_classic(self._cars, actions, self.rewards, self.ends, self._states, self._by_code)
+        else:
+            step_cars(self._cars, actions, self.rewards, self.ends, self._states)
+        if self._seen is self._rays:
+            observe_all_rays(self._cars, self._rays)
+        self._depth_m.clear()
+
+    def observation(self, i: int) -> NDArray[Any]:
+        """Give the numbers or the picture that car i sees."""
+        if self.observation_kind == "depth":
+            return self._encode(self.depth_image_m(i))[:, :, np.newaxis]
+        seen: NDArray[np.float32] = self._seen[i].copy()
+        return seen
+
+    def observations(self) -> NDArray[Any]:
+        """Give what all cars see."""
+        if self.observation_kind == "depth":
+            return np.stack([self.observation(i) for i in range(self.count)])
+        return self._seen.copy()
+
+    def depth_image_m(self, i: int) -> NDArray[np.float32]:
+        """Give car i's (84, 84) distances along each ray, metres; inf is nothing."""
+        if i not in self._depth_m:
+            if self._camera is None:
+                self._camera = lane_camera()
+            x_m, y_m, yaw_rad, *_ = self._cars[i].tolist()
+            x_m += CAMERA_FORWARD_M * math.cos(yaw_rad)
+            y_m += CAMERA_FORWARD_M * math.sin(yaw_rad)
+            position_m = (x_m, y_m, CAMERA_HEIGHT_M)
+            self._depth_m[i] = self._camera.image_m(position_m, level_axes(yaw_rad))
+        return self._depth_m[i]
+
+    def info(self, i: int) -> dict[str, Any]:
+        """Give the `info` of car i."""
+        return _described(self._cars[i].tolist(), self._started_at_m.item(i))
+
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Give the `info` of all cars."""
+        return _described(self._cars.T.copy(), self._started_at_m)
+
+
+def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
+    """Name what is told of a car, or of all: 9 numbers, or as many columns."""
+    _, _, _, speed_m_s, _, along_m, offset_m, heading_error_rad, _ = car
+    return {
+        "lateral_offset_m": offset_m,
+        "heading_error_rad": heading_error_rad,
+        "speed_m_s": speed_m_s,
+        "progress_m": along_m - started_at_m,
+    }
+
+
+def _space(observation: str) -> spaces.Box:
+    if observation == "depth":
+        return spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
+    if observation == "state":
+        return spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    low = -RAY_OBSERVATION_LIMIT
+    low[:-3] = 0.0
+    return spaces.Box(low, RAY_OBSERVATION_LIMIT)

@@ -1,0 +1,147 @@
+"""N cars of the racer sim as arrays: starts, steps and observations."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.sims.arguments import check_name
+from mcaprl.sims.fleet import GOING_ON, Fleet
+from mcaprl.sims.racer_car import Racer, store_racer
+from mcaprl.sims.racer_rules import (
+    ACTION_MEANINGS,
+    OBSERVATION_NAMES,
+    REASONS,
+    STEP_S,
+    TRUNCATES,
+    observe,
+    step_racers,
+)
+from mcaprl.sims.racer_start import racer_from, start_anywhere, start_exactly, start_on_line
+from mcaprl.sims.racer_track import METRES_PER_PX, Track, make_track
+
+RULES = ("default", "classic")
+OBSERVATIONS = ("rays",)
+STARTS = ("anywhere", "line")
+ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
+
+
+class RacerFleet(Fleet):
+    """N cars on one track; see `RacerEnv`, whose arguments it has."""
+
+    reasons: ClassVar[tuple[str, ...]] = REASONS
+    truncates: ClassVar[tuple[bool, ...]] = TRUNCATES
+
+    def __init__(
+        self,
+        count: int,
+        rules: str = "default",
+        observation: str = "rays",
+        start: str | None = None,
+        actions: int = 9,
+        drift: bool = False,
+        track_seed: int | None = None,
+    ) -> None:
+        """Make N cars; each is to be started by `begin`.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+            UsageError: the track's seed is not a whole number of 0 or more.
+        """
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("start", start, (None, *STARTS))
+        check_name("number of actions", actions, tuple(ACTION_SETS))
+        check_name("drift", drift, (False, True))
+        self.classic = rules == "classic"
+        self.track = _track_of(track_seed)
+        self.actions = np.array(ACTION_SETS[actions], dtype=np.int64)
+        super().__init__(
+            count,
+            spaces.Box(-1.0, 1.0, (len(OBSERVATION_NAMES),), np.float32),
+            OBSERVATION_NAMES,
+            tuple(ACTION_MEANINGS[action] for action in self.actions),
+            STEP_S,
+        )
+        self.last_actions = np.zeros(count, dtype=np.int64)
+        self._on_line = start == "line" or (self.classic and start is None)
+        self._drift = bool(drift)
+        self._cars = np.zeros((count, len(Racer._fields)))
+        self._started_at_m = np.zeros(count)
+        self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
+
+    def car(self, i: int) -> Racer:
+        """Give the whole state of a car."""
+        return Racer._make(self._cars[i].tolist())
+
+    def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
+        """Start car i; see "Starting State" of `RacerEnv`."""
+        if options:
+            car = racer_from(self.track, options)
+        elif not self._on_line:
+            car = start_anywhere(self.track, random.random(4))
+        elif self.classic:
+            car = start_exactly(self.track)
+        else:
+            car = start_on_line(self.track, random.random(2))
+        store_racer(car, self._cars[i])
+        self._started_at_m[i] = car.along_m
+        self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
+        observe(self.track, car, self.classic, self._seen[i])
+
+    def advance(self, actions: NDArray[np.int64]) -> None:
+        """Drive on for one step."""
+        self.last_actions = self.actions[actions]
+        step_racers(
+            self.track,
+            self._cars,
+            self.last_actions,
+            self.rewards,
+            self.ends,
+            self._seen,
+            self.classic,
+            self._drift,
+        )
+
+    def observation(self, i: int) -> NDArray[np.float32]:
+        """Give the numbers that car i sees."""
+        seen: NDArray[np.float32] = self._seen[i].copy()
+        return seen
+
+    def observations(self) -> NDArray[np.float32]:
+        """Give what all cars see."""
+        return self._seen.copy()
+
+    def info(self, i: int) -> dict[str, Any]:
+        """Give the `info` of car i."""
+        described = _described(self._cars[i].tolist(), self._started_at_m.item(i))
+        described["gates_passed"] = int(described["gates_passed"])
+        return described
+
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Give the `info` of all cars."""
+        described = _described(self._cars.T.copy(), self._started_at_m)
+        described["gates_passed"] = described["gates_passed"].astype(np.int64)
+        return described
+
+
+def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
+    """Name what is told of a car, or of all: 12 numbers, or as many columns."""
+    _, _, _, _, speed_px, _, gates, _, _, along_m, offset_m, heading_error_rad = car
+    return {
+        "lateral_offset_m": offset_m,
+        "heading_error_rad": heading_error_rad,
+        "speed_m_s": speed_px * METRES_PER_PX / STEP_S,
+        "progress_m": along_m - started_at_m,
+        "gates_passed": gates,
+    }
+
+
+def _track_of(seed: int | None) -> Track:
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+        raise UsageError(f"track_seed is None or a whole number of 0 or more, not {seed!r}")
+    return make_track(seed)

@@ -1,0 +1,132 @@
+"""The single environments: one vehicle of a fleet, and what viewers show of it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import deque
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.sims.arguments import check_action, check_name
+from mcaprl.sims.fleet import GOING_ON, Fleet
+
+RenderMode = Literal["human", "rgb_array"]
+RENDER_MODES = ("human", "rgb_array")
+
+
+class View(Protocol):
+    """What draws a sim."""
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+
+
+AnyFleet = TypeVar("AnyFleet", bound=Fleet)
+AnyView = TypeVar("AnyView", bound=View)
+
+
+class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
+    """An environment of one vehicle: seeds, steps, ends and pictures, the same for all sims."""
+
+    trail_length: int = 40
+
+    def __init__(self, fleet: AnyFleet, render_mode: RenderMode | None) -> None:
+        """Take over a fleet of one.
+
+        Raises:
+            UnknownNameError: there is no such render mode.
+        """
+        check_name("render_mode", render_mode, (None, *RENDER_MODES))
+        self.fleet = fleet
+        self.render_mode = self._render_mode = render_mode
+        self.step_duration_s = fleet.step_duration_s
+        self.action_meanings = fleet.action_meanings
+        self.observation_names = fleet.observation_names
+        self.action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.observation_space = fleet.observation_space
+        self._noise_size = fleet.noise.shape[1]
+        self._actions = np.zeros(1, dtype=np.int64)
+        self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
+        self._is_watched = render_mode == "human"
+        self._view: AnyView | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; see "Starting State".
+
+        Raises:
+            UsageError: `options` has an unknown key, or a pose that cannot be started from.
+        """
+        super().reset(seed=seed)
+        self.fleet.begin(0, self.np_random, options)
+        self._trail.clear()
+        if self._is_watched:
+            self._watch()
+        return self.fleet.observation(0), self.fleet.info(0)
+
+    def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drive or fly on for one decision.
+
+        Raises:
+            UsageError: there is no such action.
+        """
+        fleet = self.fleet
+        self._actions[0] = check_action(action, len(fleet.action_meanings))
+        if self._noise_size:
+            fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
+        fleet.advance(self._actions)
+        end, info = fleet.ends.item(), fleet.info(0)
+        if self._is_watched:
+            self._watch()
+        if end == GOING_ON:
+            return fleet.observation(0), fleet.rewards.item(), False, False, info
+        info["reason"] = fleet.reasons[end]
+        truncated = fleet.truncates[end]
+        return fleet.observation(0), fleet.rewards.item(), not truncated, truncated, info
+
+    @property
+    @abstractmethod
+    def place(self) -> tuple[float, ...]:
+        """Where the vehicle is now, for its trail."""
+
+    @property
+    def trail(self) -> list[tuple[float, ...]]:
+        """The vehicle's last places, at least one: from when they were first asked for."""
+        self._is_watched = True
+        if not self._trail:
+            self._trail.append(self.place)
+        return list(self._trail)
+
+    @abstractmethod
+    def _open_view(self, render_mode: RenderMode) -> AnyView:
+        """Make what draws the sim; the only place where pygame is imported."""
+
+    @abstractmethod
+    def _draw(self, view: AnyView) -> NDArray[np.uint8]:
+        """Draw the vehicle where it is: (H, W, 3)."""
+
+    def _watch(self) -> None:
+        """Take note of where the vehicle is, and show it."""
+        self._trail.append(self.place)
+        if self.render_mode == "human":
+            self.render()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the sim: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
+        if self._render_mode is None:
+            return None
+        if self._view is None:
+            self._view = self._open_view(self._render_mode)
+        image = self._draw(self._view)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
