@@ -1,6 +1,7 @@
 # One verb per task; `make` alone lists them. Everything is installed into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
+BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # Whatever of these changes, the environments are set up anew.
@@ -29,8 +30,8 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.run
+bench: $(BENCH)/.ready
+	OMP_NUM_THREADS=1 $(BENCH)/bin/python -m benchmarks.run
 
 docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
@@ -39,7 +40,7 @@ wheel: $(VENV)/.dev
 	PYTHON="$(BIN)/python" sh .ci/bare-wheel
 
 clean:
-	rm -rf $(VENV) build dist demo *.egg-info tests/node/node_modules
+	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -55,6 +56,15 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
 	$(PIP) -e '.[sims,offline,online,report,tables]' --group dev
+	@touch $@
+
+# The libraries that we are measured against.
+$(BENCH)/.ready: $(SETTINGS)
+	@echo "installing into $(BENCH)"
+	$(PYTHON) -m venv $(BENCH)
+	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt \
+	  -e '.[sims,offline]' --group bench
 	@touch $@
 
 # Node's MCAP libraries judge our logs; without npm those tests are skipped.

@@ -37,7 +37,16 @@ _WITH_LOSSES = 3
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="That read chunks at a time; pays for large logs.",
+)
+def info(
+    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
+) -> int:
     """Tell what is in DATA: files, folders or globs of logs."""
     paths = find_logs(data)
     if report is not None:
@@ -45,9 +54,10 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
         import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dataset = open_logs(paths)
+        dataset = open_logs(paths, threads=threads)
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
+    facts["storage"] = dataset.storage
     findings = lint(dataset)
     facts["problems"] = [str(warning.message) for warning in caught] + [
         str(finding) for finding in findings if finding.severity == "problem"
@@ -181,6 +191,7 @@ def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
         ("simulated time", f"{facts['duration_s']:.1f} s"),
         ("mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"),
         ("observations", _short(facts["observations"])),
+        ("kept in", facts["storage"]),
         ("actions", _short(facts["actions"])),
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),

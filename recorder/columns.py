@@ -71,6 +71,11 @@ class Topic:
         return times
 
     @property
+    def channels(self) -> int:
+        """How many channels have messages of it."""
+        return len({part.channel.id for part in self.parts})
+
+    @property
     def channel_ids(self) -> NDArray[np.uint16]:
         """(N,) of each message, likewise."""
         ids = np.array([part.channel.id for part in self.parts], np.uint16)
@@ -80,7 +85,7 @@ class Topic:
     def chunks_rise(self) -> bool:
         """Whether it is one channel, and no chunk begins before the one before it has ended."""
         chunks = [part.span.chunk for part in self.parts]
-        return len({part.channel.id for part in self.parts}) == 1 and all(
+        return self.channels == 1 and all(
             a is not None and b is not None and a.message_end_time <= b.message_start_time
             for a, b in pairwise(chunks)
         )

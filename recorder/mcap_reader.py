@@ -92,6 +92,8 @@ class McapReader:
         self.data_end = 0
         self._counts: dict[int, int] = {}
         self._loose = LooseMessages()
+        # Who asks for a chunk's example asks for all of it next.
+        self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
         footer = self._footer()
         self.complete = footer is not None
@@ -170,10 +172,15 @@ class McapReader:
         Raises:
             CorruptLogError: the chunk is damaged.
         """
-        try:
-            return chunk_records(self.view, chunk.chunk_start_offset)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
+        start = chunk.chunk_start_offset
+        last, records = self._last_chunk
+        if last != start:
+            try:
+                records = chunk_records(self.view, start)
+            except CorruptLogError as error:
+                raise CorruptLogError(f"{self.path}: {error}") from error
+            self._last_chunk = start, records
+        return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Yield log_time and bytes of a topic's messages, one by one.
