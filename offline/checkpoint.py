@@ -15,8 +15,8 @@ from safetensors import SafetensorError
 
 from mcaprl.errors import TrainingError
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.files import read_tensors, write_tensors
 from mcaprl.offline.learner import Learner
+from mcaprl.tensor_files import read_tensors, write_tensors
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 

@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.files import write_json
-from mcaprl.offline.files import write_tensors
 from mcaprl.offline.learner import Learner, Outputs
 from mcaprl.offline.networks import build_network, discrete_actions, observation_tensor
 from mcaprl.recorder.spaces import space_from_json, space_to_json
+from mcaprl.tensor_files import write_tensors
 
 FORMAT_VERSION = 1
 _JSON_NAME = "policy.json"
