@@ -114,6 +114,17 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
     return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
+def telemetry_message(values: Iterable[float]) -> bytes:
+    """A message of `telemetry_schema`.
+
+    Values are rounded to 16 significant bits, more than four digits: a plot shows no more, and the
+    digits behind would be the greater part of what viewers need in a log.
+    """
+    mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
+    rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16).astype("<f4")
+    return ENCAPSULATION.to_bytes(4, "little") + rounded.tobytes()
+
+
 def message_dtype(text: str) -> np.dtype[Any] | None:
     """The memory layout of a ROS 2 message definition, encapsulation header included.
 
