@@ -29,7 +29,7 @@ from mcaprl.progress import TrainingProgress
 SHORT: dict[str, Any] = {
     "steps": 2_000,
     "hidden": (8,),
-    "eval_interval": 500,
+    "eval_interval": 400,
     "eval_episodes": 2,
     "final_episodes": 2,
     "learning_starts": 300,
@@ -76,9 +76,8 @@ def state_of(agent: Agent) -> dict[str, Any]:
         "epsilon": model.exploration_rate,
         "weights": [value.tolist() for value in model.policy.state_dict().values()],
         "moments": [
-            value.tolist()
+            {name: value.tolist() for name, value in moments.items()}
             for moments in model.policy.optimizer.state_dict()["state"].values()
-            for value in moments.values()
         ],
         "buffer": [buffer.pos, buffer.full, buffer.observations.tolist(), buffer.dones.tolist()],
         "torch": torch.rand(3).tolist(),
@@ -109,7 +108,7 @@ def test_a_stopped_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (800, 2_000)
     points = read_curve(summary.folder / "curve.csv")
-    assert [point.step for point in points] == [500, 1_000, 1_500, 2_000]
+    assert [point.step for point in points] == [400, 800, 1_200, 1_600, 2_000]
     names = sorted(path.name for path in summary.folder.glob("progress*"))
     assert names == ["progress-from-800.csv", "progress.csv"]
 
