@@ -67,7 +67,7 @@ def train_online(
     sim_arguments: dict[str, Any],
     **settings: Any,
 ) -> None:
-    """Learn a policy by acting in SIM: lane, powerline, racer, or any Gymnasium id.
+    """Learn a policy by acting in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
     Settings that are not given are the preset's or, without one, those that SIM was seen to be
     learnt with, or else Stable-Baselines3's; with --resume, the run's. The best checkpoint is kept,
