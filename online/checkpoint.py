@@ -36,6 +36,7 @@ _COUNTERS = (
     "_n_calls",
     "_current_progress_remaining",
     "exploration_rate",
+    "learning_starts",
 )
 
 
