@@ -136,8 +136,8 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
     """Shapes as one `visualization_msgs/msg/MarkerArray`.
 
     It begins by deleting what the topic showed before, so that a viewer which jumps to this message
-    shows these shapes and no others. The message's log_time is the markers' time: their stamps are 0,
-    which means "where the frame is now", and does not differ from message to message.
+    shows these shapes and no others. The message's log_time is the markers' time: their stamps are
+    0, which means "where the frame is now", and does not differ from message to message.
     """
     markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
     return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))

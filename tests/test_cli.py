@@ -300,7 +300,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["record", "lane", "--steps", "5"], 2, "Missing option '--out'"),
         (["record", "lane", "--steps", "-1", "--out", "x"], 2, "--steps"),
         (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "2"], 2, "--epsilon"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "known: default"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "classic-code"),
         (["record", "lane", "--steps", "5", "--out", "x", "--observation", "sound"], 2, "depth, "),
         (["record", "lane", "--steps", "5", "--out", "taken/x.mcap"], 1, "cannot write taken/"),
         (["record", "lane", "--steps", "5", "--out", "taken"], 2, "taken exists"),
