@@ -217,7 +217,9 @@ def test_weights_that_mean_other_values_are_refused(tmp_path: Path) -> None:
 
         class Doubled:
             name = "doubled"
-            network = model.q_net
+
+            def __init__(self) -> None:
+                self.network = model.q_net
 
             def q_values(self, observations: Any) -> Any:
                 return 2 * model.q_net(torch.from_numpy(observations)).detach().numpy()
