@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
@@ -46,21 +47,24 @@ def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
     rows = min(len(dataset) // buffer.n_envs, buffer.buffer_size)
     if rows == 0:
         raise UsageError(f"{len(dataset)} transitions are too few for {buffer.n_envs} environments")
-    timeouts = dataset.truncated & ~dataset.terminated
-    columns = {
-        "observations": _channels_first(dataset.observations, dataset.observation_space),
-        "next_observations": _channels_first(dataset.next_observations, dataset.observation_space),
-        "actions": dataset.actions.reshape(len(dataset), -1),
-        "rewards": dataset.rewards,
-        "dones": dataset.terminated | timeouts,
-        "timeouts": timeouts,
-    }
-    for name, values in columns.items():
-        _put(getattr(buffer, name), values, rows)
-    cut = buffer.dones[rows - 1] == 0
-    buffer.timeouts[rows - 1, cut] = buffer.dones[rows - 1, cut] = 1
-    buffer.pos, buffer.full = rows % buffer.buffer_size, rows == buffer.buffer_size
+    last = np.arange(len(dataset) - rows * buffer.n_envs, len(dataset))
+    for steps in last.reshape(buffer.n_envs, rows).T:
+        _add(buffer, dataset, steps, cut=steps[-1] == last[-1])
     return rows * buffer.n_envs
+
+
+def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> None:
+    """Add one transition of each piece of the log."""
+    batch = dataset.batch(steps)
+    timeouts = (batch.truncated | cut) & ~batch.terminated
+    buffer.add(
+        _channels_first(batch.observations, dataset.observation_space),
+        _channels_first(batch.next_observations, dataset.observation_space),
+        batch.actions,
+        batch.rewards,
+        batch.terminated | timeouts,
+        [{"TimeLimit.truncated": bool(flag)} for flag in timeouts],
+    )
 
 
 def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
@@ -110,19 +114,6 @@ def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> N
     own = getattr(model, role)
     if space != own:
         raise SpaceError(f"the logs have {role} {space}, the environment {own}")
-
-
-def _put(column: Any, values: Any, rows: int) -> None:
-    """Write the last transitions into the first rows of a column (rows, envs, ...)."""
-    if isinstance(column, dict):
-        for key, part in column.items():
-            _put(part, values[key], rows)
-        return
-    envs = column.shape[1]
-    last = np.asarray(values)[-rows * envs :]
-    column[:rows] = np.swapaxes(last.reshape(envs, rows, *last.shape[1:]), 0, 1).reshape(
-        rows, *column.shape[1:]
-    )
 
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:

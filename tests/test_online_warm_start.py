@@ -167,11 +167,9 @@ def test_pictures_are_turned_for_the_buffer(tmp_path: Path) -> None:
     with closing(begun):
         begun.start_from(data, None)
         buffer: Any = begun.model.replay_buffer  # type: ignore[attr-defined]
-        assert buffer.observations.shape[2:] == (1, 84, 84)
-        np.testing.assert_array_equal(buffer.observations[:12, 0, 0], data.observations[..., 0])
-        np.testing.assert_array_equal(
-            buffer.next_observations[:12, 0, 0], data.next_observations[..., 0]
-        )
+        frames = buffer.frames[""]
+        assert frames.shape[1:] == (1, 1, 84, 84)
+        np.testing.assert_array_equal(frames[:12, 0, 0], data.observations[..., 0])
 
 
 def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path: Path) -> None:
