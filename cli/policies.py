@@ -42,7 +42,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     if not path.exists():
         raise UnknownNameError("policy", name, [*SCRIPTED, *_neighbours(path)])
     loaded: list[Policy | None] = []
-    for policy in _load(path):
+    for policy in load_trained(path):
         check_fit(policy, env)
         loaded.append(policy)
     return loaded
@@ -57,7 +57,18 @@ def policy_names(names: Sequence[str]) -> dict[str, str]:
     }
 
 
-def _load(path: Path) -> list[Policy]:
+def is_policy(path: Path) -> bool:
+    """Whether a path is a trained policy, and no log."""
+    kept = ("best_model.zip", "policy.json")
+    return path.suffix == ".zip" or (path.is_dir() and any(any(path.rglob(n)) for n in kept))
+
+
+def load_trained(path: Path) -> list[Policy]:
+    """Load the policies of all seeds of a run, or the one of a file.
+
+    Raises:
+        PolicyError: there are none, or a file is broken.
+    """
     if path.is_file() or any(path.rglob("best_model.zip")):
         from mcaprl.online.policy import load_policies as load_online
 

@@ -13,6 +13,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.utils import ConstantSchedule
 
 from mcaprl.online.algorithms import make_model
 from mcaprl.online.callbacks import BetweenRollouts, CopyTargetByEpisodes, EveryInterval
@@ -25,7 +26,9 @@ from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
 from mcaprl.online.recording import describe_actions, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.warm_start import fill_buffer, sample_observations, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims.rollout import episode_seed
 
 LOG_INTERVAL = 1_000
@@ -67,6 +70,7 @@ class Agent:
         """
         self.points: list[CurvePoint] = []
         self.resumed_at = 0
+        self._began_with_policy = False
         self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
         self._records = record is not None
         with ExitStack() as stack:
@@ -89,6 +93,32 @@ class Agent:
             env_id,
             task.sim_options,
         )
+
+    def start_from(self, data: Dataset | None, policy: Any) -> None:
+        """Begin with experience: logged transitions in the replay buffer, a policy's weights.
+
+        Data make the random steps at the beginning needless. A policy's agent explores as it
+        would at the end of its training.
+
+        Args:
+            data: None has none.
+            policy: with Q-values; None has none.
+
+        Raises:
+            UsageError: the algorithm cannot.
+            SpaceError: the spaces differ.
+            PolicyError: the policy's network is another.
+        """
+        model: Any = self.model
+        if data is not None:
+            fill_buffer(model, data)
+            model.learning_starts = 0
+        if policy is not None:
+            space = self._eval_env.observation_space
+            take_weights(model, policy, sample_observations(space))
+            model.learning_starts = 0
+            model.exploration_rate = model.exploration_final_eps
+            self._explore_as_at_the_end()
 
     def close(self) -> None:
         """Close environments and log."""
@@ -143,16 +173,24 @@ class Agent:
 
     def _save(self) -> None:
         points = [asdict(point) for point in self.points]
-        save_checkpoint(self._checkpoint, self.model, self._task, {"points": points})
+        extra = {"points": points, "began_with_policy": self._began_with_policy}
+        save_checkpoint(self._checkpoint, self.model, self._task, extra)
 
     def _load(self, evaluation: Evaluation) -> None:
         extra = load_checkpoint(self._checkpoint, self.model, self._task)
         self.points = [CurvePoint(**point) for point in extra["points"]]
+        if extra["began_with_policy"]:
+            self._explore_as_at_the_end()
         done, envs = self.model.num_timesteps, self._task.config.envs
         evaluation.resume(done // envs, max(p.mean_return for p in self.points))
         # The environments cannot go on where they were, but must not begin as they first did.
         assert self.model.env is not None
         self.model.env.seed(episode_seed(self._seed, done))
+
+    def _explore_as_at_the_end(self) -> None:
+        self._began_with_policy = True
+        model: Any = self.model
+        model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
 
     def _keep_best(self) -> None:
         save_policy(self._folder / BEST_NAME, self.model, self._description)
