@@ -71,9 +71,7 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
     return Side(name, run, share=steps / STEPS)
 
 
-def _batch(
-    name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1
-) -> Side:
+def _batch(name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:
     random = np.random.default_rng(0)
     count = len(env.unwrapped.action_meanings)
     actions = random.integers(count, size=(steps, env.num_envs))
