@@ -122,7 +122,7 @@ def telemetry_message(values: Iterable[float]) -> bytes:
     """
     mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
     rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16).astype("<f4")
-    return ENCAPSULATION.to_bytes(4, "little") + rounded.tobytes()
+    return ENCAPSULATION.to_bytes(4, "little") + bytes(rounded.data)
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:

@@ -191,7 +191,8 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     level, origin = "base_stabilized", np.zeros(3)
     link = np.array([origin, ros(place.point_m) - here])
     ahead = np.array([ros(world.point_on_line(place.along_m + 6.0)) - here])
-    arrow = np.array([origin, np.array(ros(flight.command_m_s)) + [0.0, 0.0, 1e-3]])
+    arrow = np.array([origin, ros(flight.command_m_s)])
+    arrow[1, 2] += 1e-3
     speed_m_s = norm(flight.drone.velocity_m_s)
     return (
         Shape("trail", "line", TRAIL, world.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
