@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
 from mcaprl.recorder.log_file import create, release, reopen
-from mcaprl.recorder.mcap_append import what_is_written
+from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.signals import HoldSignals
 
@@ -82,7 +82,7 @@ class McapWriter:
         self._compress_rows = compressor(compression, _ROWS_LEVEL)
         self._compress_messages = compressor(compression, _MESSAGES_LEVEL)
         # What every file begins with, in this order.
-        self._standing: list[McapRecord] = []
+        self._standing: list[Standing] = []
         if append and Path(path).exists():
             self._continue(Path(path))
         else:
@@ -92,6 +92,16 @@ class McapWriter:
     def closed(self) -> bool:
         """Whether the file is finished."""
         return self._file.closed
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Those announced, by id."""
+        return self._summary.schemas
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Those announced, by id."""
+        return self._summary.channels
 
     @property
     def end_time_ns(self) -> int:
@@ -141,7 +151,7 @@ class McapWriter:
         if all(record.name != name for record in self._summary.attachments):
             self.announce(Attachment(time_ns, time_ns, name, media_type, data))
 
-    def announce(self, record: Metadata | Schema | Channel | Attachment) -> None:
+    def announce(self, record: Standing) -> None:
         """Write a record that stands outside of chunks, in this file and those that follow it."""
         self._write_standing(record)
         self._standing.append(record)
@@ -191,6 +201,17 @@ class McapWriter:
             Message(channel_id, time_ns, data, time_ns, sequence).write(builder)
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
         self._write_chunk(memoryview(builder.end()), indexes, self._compress_messages)
+
+    def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
+        """Write a chunk's records as they are.
+
+        Args:
+            records: Message records of announced channels, their sequence numbers included.
+            indexes: of `chunks.INDEX_ENTRY`, by channel id.
+        """
+        for channel_id, index in indexes.items():
+            self._summary.counts[channel_id] += len(index)
+        self._write_chunk(records, dict(indexes), self._compress_rows)
 
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
