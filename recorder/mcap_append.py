@@ -66,7 +66,8 @@ def what_is_written(path: Path) -> Written:
 
 
 def _take_topics(reader: McapReader, written: Written) -> None:
-    for topic in (*reader.schemas.values(), *reader.channels.values()):
+    topics: list[Standing] = [*reader.schemas.values(), *reader.channels.values()]
+    for topic in topics:
         written.summary.note(topic, 0, 0)
         written.standing.append(topic)
     for channel in reader.channels.values():
