@@ -93,6 +93,21 @@ class ChunkHeader:
     compression: str
     data: slice
 
+    def to_record(self) -> bytes:
+        """The Chunk record up to its data, which follows it."""
+        name, data_bytes = self.compression.encode(), self.data.stop - self.data.start
+        length = _CHUNK_START.size - RECORD_HEADER_BYTES + len(name) + 8 + data_bytes
+        start: bytes = _CHUNK_START.pack(
+            Opcode.CHUNK,
+            length,
+            self.start_time,
+            self.end_time,
+            self.uncompressed_bytes,
+            self.crc,
+            len(name),
+        )
+        return start + name + data_bytes.to_bytes(8, "little")
+
 
 def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
     """Parse the Chunk record at `offset`.

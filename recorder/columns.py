@@ -50,11 +50,13 @@ class Topic:
         """
         self.name = name
         self._reader = reader
-        self.parts = [
-            Part(reader, channel, span)
-            for channel in reader.channels_of(name)
-            for span in reader.spans(channel)
-        ]
+        self.parts: list[Part] = []
+        for channel in reader.channels_of(name):
+            spans = reader.spans(channel)
+            # A channel without messages may be of any type.
+            if spans:
+                type_ = _type_of(reader, channel)
+                self.parts += [Part(reader, channel, type_, span) for span in spans]
         self._counts = [len(part.span.index) for part in self.parts]
         self._stops = np.cumsum(self._counts, dtype=np.int64)
 
@@ -166,14 +168,11 @@ class Part:
         type: of the messages.
     """
 
-    def __init__(self, reader: McapReader, channel: Channel, span: Span) -> None:
-        """Learn their type; none is read.
-
-        Raises:
-            LogError: messages are encoded in a way that is not known.
-        """
-        self.span, self.channel = span, channel
-        self.type = _type_of(reader, channel)
+    def __init__(
+        self, reader: McapReader, channel: Channel, type_: MessageType, span: Span
+    ) -> None:
+        """Point at them; none is read."""
+        self.span, self.channel, self.type = span, channel, type_
         self._reader = reader
 
     @property

@@ -66,7 +66,7 @@ def what_is_written(path: Path) -> Written:
 
 
 def _take_topics(reader: McapReader, written: Written) -> None:
-    topics: list[Schema | Channel] = [*reader.schemas.values(), *reader.channels.values()]
+    topics: list[Standing] = [*reader.schemas.values(), *reader.channels.values()]
     for topic in topics:
         written.summary.note(topic, 0, 0)
         written.standing.append(topic)

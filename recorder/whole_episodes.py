@@ -107,7 +107,9 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
         None if the file has no `/rl/step` of known form, for it is no log then.
     """
     steps = Topic(reader, STEP_TOPIC)
-    if not len(steps) or any(name not in steps.fields for name in _FIELDS):
+    if not len(steps):
+        return EpisodePlan() if described(reader) else None
+    if any(name not in steps.fields for name in _FIELDS):
         return None
     order = np.lexsort((steps.times, steps.channel_ids))
     columns = steps.read(_FIELDS, order)
