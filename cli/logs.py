@@ -16,10 +16,11 @@ from mcaprl.cli.show import print_facts, print_json, size, write_json
 from mcaprl.errors import CorruptLogError, LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.layout import LAYOUT_NAME
 from mcaprl.recorder.lint import Finding, lint
-from mcaprl.recorder.log_reader import describe
+from mcaprl.recorder.log_layout import layout_of_log
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.moments import moments_of
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.scene import DepthSource
@@ -63,6 +64,8 @@ def info(
         str(finding) for finding in findings if finding.severity == "problem"
     ]
     facts["findings"] = [asdict(finding) for finding in findings]
+    moments = [moment for path in paths for moment in moments_of(path)]
+    facts["moments"] = [asdict(moment) for moment in moments]
     if report is not None:
         from mcaprl.recorder.report import dataset_page, dataset_picture
 
@@ -75,6 +78,8 @@ def info(
         print_json(facts)
     else:
         _print_facts(facts, findings, dataset, len(paths))
+        for moment in moments:
+            click.echo(moment)
     return int(strict and bool(facts["problems"]))
 
 
@@ -219,8 +224,7 @@ def _layout_of_file(path: Path) -> dict[str, Any]:
     reader = McapReader(path)
     attached = reader.attachment(LAYOUT_NAME)
     if attached is None:
-        description = describe(reader)
-        return layout_of(description, [channel.topic for channel in reader.channels.values()])
+        return layout_of_log(reader)
     try:
         found: dict[str, Any] = json.loads(attached)
     except ValueError as error:

@@ -45,7 +45,15 @@ _SCENE_PERIOD_NS = 200_000_000
 class Display:
     """Collects an episode's display messages and writes them in chunks of their own."""
 
-    def __init__(self, log: LogWriter, source: object, *, scene: bool, camera: bool) -> None:
+    def __init__(
+        self,
+        log: LogWriter,
+        source: object,
+        *,
+        scene: bool,
+        camera: bool,
+        log_lines: bool = True,
+    ) -> None:
         """Prepare for `source`, an unwrapped environment, with methods of the protocols or without.
 
         Args:
@@ -53,7 +61,9 @@ class Display:
             source: what is to be shown.
             scene: whether to record shapes, frames and telemetry.
             camera: whether to record the depth camera; it is anyway if observations are images.
+            log_lines: whether to tell of episodes' starts and ends.
         """
+        self._log_lines = log_lines
         self._log = log
         self._messages: list[tuple[int, int, bytes]] = []
         self._bytes = 0
@@ -152,7 +162,7 @@ class Display:
         self._static = {}
 
     def _announce(self) -> None:
-        types = {ROSOUT: "rcl_interfaces/msg/Log"}
+        types = {ROSOUT: "rcl_interfaces/msg/Log"} if self._log_lines else {}
         if self._scene is not None:
             self.follow_frame = next((frame.name for frame in self._scene.frames()), "")
             types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
@@ -169,6 +179,8 @@ class Display:
             self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
 
     def _say(self, time_ns: int, text: str) -> None:
+        if not self._log_lines:
+            return
         line = messages.new(
             "rcl_interfaces/msg/Log",
             stamp=messages.stamp(time_ns),

@@ -44,7 +44,7 @@ def layout_of(
     panels: dict[str, dict[str, Any]] = {}
     views = _views(metadata, topics, follow_frame, panels)
     plots = _plots(metadata, topics, telemetry_names, panels)
-    panels["StateTransitions!actions"] = _state_transitions(metadata)
+    panels["StateTransitions!actions"] = _state_transitions(metadata, topics)
     below: list[Node] = ["StateTransitions!actions"]
     if "/rosout" in topics:
         panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/rosout"}
@@ -58,6 +58,11 @@ def layout_of(
         "playbackConfig": {"speed": 1},
         "layout": root,
     }
+
+
+def is_values_topic(topic: str) -> bool:
+    """Whether a topic tells what a policy thinks of the steps."""
+    return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 
 def _views(
@@ -125,7 +130,7 @@ def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dic
     """Of each annotating policy: its values of the actions, its surprise, its doubt."""
     series = {}
     for topic in topics:
-        if topic != VALUES_TOPIC and not topic.startswith(f"{VALUES_TOPIC}/"):
+        if not is_values_topic(topic):
             continue
         title = topic.removeprefix("/rl/")
         q_values = enumerate(metadata.action_names().values())
@@ -163,12 +168,16 @@ def _observation_series(metadata: LogMetadata) -> dict[str, str]:
     return dict(list(paths.items())[:MAX_SERIES])
 
 
-def _state_transitions(metadata: LogMetadata) -> dict[str, Any]:
+def _state_transitions(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, Any]:
     paths = [_state("/rl/step.episode", "episode")]
     names = metadata.action_names()
     if names:
         legend = ", ".join(f"{value} {name}" for value, name in names.items())
         paths.insert(0, _state("/rl/step.action", f"action ({legend})"))
+    for topic in filter(is_values_topic, topics):
+        title = topic.removeprefix("/rl/")
+        paths += [_state(f"{topic}.policy_action", f"{title} would take")]
+        paths += [_state(f"{topic}.agrees", f"{title} agrees")]
     return {"foxglovePanelTitle": "Action and episode", "isSynced": True, "paths": paths}
 
 

@@ -36,6 +36,8 @@ TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
+UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
+"""An arrow of no length points nowhere, and viewers complain."""
 CORNERS_PER_M = 16
 """Corners of surfaces are rounded so: a log holds them in a third of the space."""
 SHADES = 10
@@ -191,8 +193,7 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     level, origin = "base_stabilized", np.zeros(3)
     link = np.array([origin, ros(place.point_m) - here])
     ahead = np.array([ros(world.point_on_line(place.along_m + 6.0)) - here])
-    arrow = np.array([origin, ros(flight.command_m_s)])
-    arrow[1, 2] += 1e-3
+    arrow = np.array([origin, np.array(ros(flight.command_m_s)) + UP_A_LITTLE])
     speed_m_s = norm(flight.drone.velocity_m_s)
     return (
         Shape("trail", "line", TRAIL, world.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
