@@ -21,9 +21,13 @@ from mcaprl.recorder.lint import Finding, lint
 from mcaprl.recorder.log_reader import describe
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.reader import find_logs, open_logs
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim
+
+# What `recover` exits with when something of the old file is missing in the new one.
+_WITH_LOSSES = 3
 
 
 @click.command()
@@ -90,6 +94,34 @@ def check(files: tuple[str, ...], as_json: bool) -> int:
         if not problems:
             click.echo(f"{len(paths)} file{'s' * (len(paths) > 1)} checked, nothing wrong")
     return int(bool(problems))
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--keep-unfinished",
+    is_flag=True,
+    help="Keep episodes whose end is missing, marked truncated, as far as they are there.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
+    """Write what is left of FILE, cut off or damaged, to OUT, which is whole then.
+
+    Exits with 0 if nothing is lost, with 3 if something is, with 1 if nothing can be kept.
+    """
+    found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+    losses = [*map(str, found.damages), *map(str, found.dropped)]
+    losses += [f"{found.strays} messages of episodes that are not kept"] if found.strays else []
+    if as_json:
+        print_json({"ok": not found.has_losses, **asdict(found)})
+    else:
+        ended = f", {found.ended} of them without their end" if found.ended else ""
+        click.echo(f"{out}: {found.episodes} episodes{ended}, {found.messages} messages")
+        for loss in losses:
+            click.echo(f"lost: {loss}")
+    return _WITH_LOSSES if found.has_losses else 0
 
 
 @click.command()

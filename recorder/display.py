@@ -141,6 +141,10 @@ class Display:
             self._static = {}
         self._messages, self._bytes, self._held = [], 0, None
 
+    def forget_what_stands(self) -> None:
+        """Show again what does not move, since another file begins."""
+        self._static = {}
+
     def _announce(self) -> None:
         types = {ROSOUT: "rcl_interfaces/msg/Log"}
         if self._scene is not None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoStepsError, SpaceError
+from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
 from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episodes import (
@@ -68,7 +68,7 @@ class LogReader:
 
         Raises:
             CorruptLogError: records are missing, doubled or out of order.
-            NoStepsError: there is no finished episode.
+            NoEpisodesError: there is no finished episode.
         """
         # What is told is believed only as far as it agrees with what is read then.
         told = told_lengths(self._told) if self._reader.complete else np.empty(0, np.int64)
@@ -137,7 +137,7 @@ class LogReader:
 
     def _check_fields(self, wanted: Sequence[str]) -> None:
         if not len(self._steps):
-            raise NoStepsError(f"{self.path} has no finished episode")
+            raise NoEpisodesError(f"{self.path} has no finished episode")
         fields = self._steps.fields
         missing = [name for name in wanted if name not in fields]
         if missing:
@@ -152,10 +152,10 @@ class LogReader:
         """Tell of records behind the last finished episode.
 
         Raises:
-            NoStepsError: there is no finished one.
+            NoEpisodesError: there is no finished one.
         """
         if not len(lengths):
-            raise NoStepsError(f"{self.path} has no finished episode")
+            raise NoEpisodesError(f"{self.path} has no finished episode")
         behind = len(self._steps) - int(lengths.sum()) - len(lengths)
         if behind or not self._reader.complete:
             warnings.warn(

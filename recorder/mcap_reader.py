@@ -82,7 +82,7 @@ class McapReader:
             LogError: it cannot be opened.
         """
         self.path = Path(path)
-        self.view = _map(self.path)
+        self.view = map_file(self.path)
         if bytes(self.view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
             raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
         self.schemas: dict[int, Schema] = {}
@@ -367,7 +367,13 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
 
 
-def _map(path: Path) -> memoryview:
+def map_file(path: Path) -> memoryview:
+    """The bytes of a file, mapped into memory.
+
+    Raises:
+        NotMcapError: it is empty.
+        LogError: it cannot be read.
+    """
     try:
         with path.open("rb") as file:
             if not file.seek(0, io.SEEK_END):

@@ -127,6 +127,23 @@ def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(first.behavior_probs) == {np.float32(own), np.float32(other)}
 
 
+def test_appended_and_rotated_recordings_are_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["record", "CartPole-v1", "--policy", "random", "--seed", "2"]
+    assert run([*common, "--episodes", "5", "--out", "one.mcap"]) == 0
+    expected = mcaprl.open("one.mcap").fingerprint
+    for episodes in ("3", "2"):
+        assert run([*common, "--episodes", episodes, "--out", "two.mcap", "--append"]) == 0
+    assert mcaprl.open("two.mcap").fingerprint == expected
+    for episodes in ("3", "2"):
+        arguments = ["--episodes", episodes, "--out", "parts/a.mcap", "--rotate-mb", "0.005"]
+        assert run([*common, *arguments, "--append"]) == 0
+    assert len(list(Path("parts").iterdir())) > 1
+    assert mcaprl.open("parts").fingerprint == expected
+    capsys.readouterr()
+    assert run([*common, "--episodes", "2", "--out", "x", "--append", "--envs", "2"]) == 2
+    assert "leave out one" in capsys.readouterr().err
+
+
 def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
     common = ["record", "CartPole-v1", "--policy", "random", "--episodes", "5", "--seed", "2"]
     assert run([*common, "--out", "one.mcap"]) == 0
