@@ -239,7 +239,8 @@ def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.b
         return np.zeros(len(log_times), np.bool_)
     times = log_times.astype(np.int64)
     span = np.searchsorted(plan.spans[:, 0], times, side="right") - 1
-    return (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
+    inside: NDArray[np.bool_] = (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
+    return inside
 
 
 def _write_some(

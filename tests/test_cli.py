@@ -111,7 +111,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert run(ask) == 0
     assert "do not choose by this order" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
-    assert "the pilot reads the sim's state" in line
+    assert "pilot has no network to ask about a log" in line
 
 
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
