@@ -126,7 +126,7 @@ def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
     assert (place.header.frame_id, place.child_frame_id) == ("map", "car")
     panels = json.loads(layout.read_text())["configById"]
     assert panels["3D!scene"]["followTf"] == "car"
-    assert any("lateral_offset_m" in name for name in panels)
+    assert "lateral_offset_m" in json.dumps(panels)
 
 
 def test_what_was_logged_can_be_driven_again(tmp_path: Path) -> None:
