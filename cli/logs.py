@@ -123,6 +123,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     """
     found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
     losses = [*map(str, found.damages), *map(str, found.dropped)]
+    losses += [f"{found.strays} messages of episodes that are not kept"] if found.strays else []
     if as_json:
         print_json({"ok": not found.has_losses, **asdict(found)})
     else:

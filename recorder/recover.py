@@ -39,6 +39,7 @@ class Recovery:
         damages: places that could not be read.
         dropped: episodes that are not in the new file, as far as any of them was read.
         ended: episodes that were not finished, and were kept up to their last whole transition.
+        strays: messages of `/rl/` topics that belonged to none of the kept episodes.
     """
 
     messages: int = 0
@@ -46,11 +47,12 @@ class Recovery:
     damages: list[Damage] = field(default_factory=list)
     dropped: list[DroppedEpisode] = field(default_factory=list)
     ended: int = 0
+    strays: int = 0
 
     @property
     def has_losses(self) -> bool:
         """Whether anything of the old file is missing in the new one."""
-        return bool(self.damages or self.dropped or self.ended)
+        return bool(self.damages or self.dropped or self.ended or self.strays)
 
 
 def recover_log(
@@ -155,7 +157,7 @@ def _note(plan: EpisodePlan, source: Path, recovery: Recovery) -> None:
         NoEpisodesError: none can be kept.
     """
     recovery.episodes, recovery.dropped = plan.episodes, plan.dropped
-    recovery.ended = len(plan.ended)
+    recovery.ended, recovery.strays = len(plan.ended), plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""

@@ -20,7 +20,7 @@ from mcaprl.recorder import messages
 from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
 from mcaprl.recorder.log_reader import described
-from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
+from mcaprl.recorder.log_writer import EPISODE_TOPIC, INTERRUPTED, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_append import what_is_written
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, contents_of
@@ -32,7 +32,6 @@ from mcaprl.recorder.spaces import observation_leaves
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Topics that tell of episodes; the others are kept as they are.
 _OF_EPISODES = "/rl/"
-INTERRUPTED = "interrupted"
 
 Place = tuple[int, int]
 """Where messages stand together: offset of their chunk, id of their channel."""
@@ -78,12 +77,16 @@ class EpisodePlan:
         spans: (E, 2) first and last log_time of the kept episodes, rising.
         dropped: episodes that are not kept.
         ended: those that are kept without their end, as they are told of now.
+        strays: messages of other topics that belong to no kept episode.
+        is_in_order: whether the records are in the order of their times.
     """
 
     fates: dict[Place, NDArray[np.uint8]] = field(default_factory=dict)
     spans: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     dropped: list[DroppedEpisode] = field(default_factory=list)
     ended: list[EpisodeSummary] = field(default_factory=list)
+    strays: int = 0
+    is_in_order: bool = True
 
     @property
     def episodes(self) -> int:
@@ -93,7 +96,7 @@ class EpisodePlan:
     @property
     def changes_anything(self) -> bool:
         """Whether the log is not as it should be already."""
-        return bool(self.dropped or self.ended)
+        return bool(self.dropped or self.ended or self.strays) or not self.is_in_order
 
 
 def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan | None:
@@ -116,6 +119,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     shown = _with_images(reader, columns[LOG_TIME])
     form_is_known = all(map(_form, map(reader.schema_of, reader.channels_of(STEP_TOPIC))))
     plan, fates, spans = EpisodePlan(), np.zeros(len(steps), np.uint8), []
+    plan.is_in_order = bool((np.diff(order) > 0).all())
     for start, stop in _runs(columns, steps.channel_ids[order]):
         begins = columns["step"][start] == 0
         length = int(np.argmin(np.append(shown[start:stop], False)))
@@ -134,6 +138,12 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
             plan.ended.append(_ended(columns, start, last))
     plan.spans = np.array(sorted(map(tuple, spans)), np.int64).reshape(-1, 2)
     plan.fates = dict(_by_place(steps, fates))
+    plan.strays = sum(
+        int((~_is_inside(plan, span.index["log_time"])).sum())
+        for channel in reader.channels.values()
+        if channel.topic.startswith(_OF_EPISODES) and channel.topic != STEP_TOPIC
+        for span in reader.spans(channel)
+    )
     return plan
 
 
@@ -142,7 +152,7 @@ def write_planned(reader: McapReader, writer: McapWriter, plan: EpisodePlan) -> 
     standing = what_is_written(reader.path).standing
     for record in sorted(standing, key=lambda record: not isinstance(record, Metadata)):
         writer.announce(record)
-    for chunk in reader.chunks:
+    for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
         records = reader.chunk_records(chunk)
         indexes = contents_of(records).indexes
         fates = {
@@ -219,10 +229,17 @@ def _fates(
         return plan.fates[place]
     if not channel.topic.startswith(_OF_EPISODES):
         return np.full(len(index), Fate.KEEP, np.uint8)
-    times = index["log_time"].astype(np.int64)
+    inside = _is_inside(plan, index["log_time"])
+    return np.where(inside, np.uint8(Fate.KEEP), np.uint8(Fate.DROP))
+
+
+def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Which times are those of an episode that is kept."""
+    if not plan.episodes:
+        return np.zeros(len(log_times), np.bool_)
+    times = log_times.astype(np.int64)
     span = np.searchsorted(plan.spans[:, 0], times, side="right") - 1
-    is_inside = (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
-    return np.where(is_inside, np.uint8(Fate.KEEP), np.uint8(Fate.DROP))
+    return (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
 
 
 def _write_some(
