@@ -95,7 +95,7 @@ class ChunkHeader:
 
     def to_record(self) -> bytes:
         """The Chunk record up to its data, which follows it."""
-        name, data_bytes = self.compression.encode(), self.data.stop - self.data.start
+        name, data_bytes = self.compression.encode(), int(self.data.stop - self.data.start)
         length = _CHUNK_START.size - RECORD_HEADER_BYTES + len(name) + 8 + data_bytes
         start: bytes = _CHUNK_START.pack(
             Opcode.CHUNK,
