@@ -25,6 +25,7 @@ from mcaprl.recorder.mcap_append import what_is_written
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, contents_of
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.metadata import METADATA_NAME
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import message_dtype
 from mcaprl.recorder.spaces import observation_leaves
@@ -113,7 +114,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     """
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):
-        return EpisodePlan() if described(reader) else None
+        return EpisodePlan() if METADATA_NAME in reader.metadata else None
     if any(name not in steps.fields for name in _FIELDS):
         return None
     order = np.lexsort((steps.times, steps.channel_ids))
