@@ -54,6 +54,7 @@ class Agent:
         scale: Scale,
         *,
         record: Path | None = None,
+        resume: bool = False,
     ) -> None:
         """Make an agent with fresh weights, its environments, and its log.
 
@@ -64,6 +65,8 @@ class Agent:
             seed: of the agent.
             scale: of scores.
             record: log to write; None records nothing, neither training nor evaluations.
+            resume: go on from the folder's checkpoint and behind the log's last episode, where
+                there are such.
 
         Raises:
             SpaceError, OutputExistsError, LogError: the log cannot be written.
@@ -72,12 +75,12 @@ class Agent:
         self.resumed_at = 0
         self._began_with_policy = False
         self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
-        self._records = record is not None
+        self._records, self._resumes = record is not None, resume
         with ExitStack() as stack:
             batch = stack.enter_context(closing(task.batch(task.config.envs)))
             recorder = None
             if record is not None:
-                recorder = recorded(batch, record, algo=task.algo, seed=seed)
+                recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
             env = stack.enter_context(closing(BatchedVecEnv(recorder or batch)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             self._eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
@@ -124,12 +127,11 @@ class Agent:
         """Close environments and log."""
         self._envs.close()
 
-    def learn(self, report: ProgressCallback, *, resume: bool = False) -> None:
+    def learn(self, report: ProgressCallback) -> None:
         """Train to the end, evaluating on the way.
 
         Args:
             report: told how far it is, each `LOG_INTERVAL` steps.
-            resume: go on from the folder's checkpoint, if there is one.
 
         Raises:
             TrainingError: the checkpoint is of another task, or broken.
@@ -143,7 +145,7 @@ class Agent:
             on_new_best=self._keep_best,
             on_point=self._add_point,
         )
-        if resume and self._checkpoint.exists():
+        if self._resumes and self._checkpoint.exists():
             self._load(evaluation)
         done = self.resumed_at = self.model.num_timesteps
         if done >= config.steps:

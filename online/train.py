@@ -156,10 +156,18 @@ class _Run:
         folder.mkdir(exist_ok=True)
         began_s = time.perf_counter()
         env_id = self.env.spec.id if self.env.spec else self.task.sim
-        agent = Agent(self.task, env_id, folder, seed, selection, record=self.logs.get(seed))
+        agent = Agent(
+            self.task,
+            env_id,
+            folder,
+            seed,
+            selection,
+            record=self.logs.get(seed),
+            resume=resume,
+        )
         with closing(agent):
             agent.start_from(self.data, self.policy)
-            agent.learn(report, resume=resume)
+            agent.learn(report)
         score = evaluate(
             self.env,
             [load_policy(folder / BEST_NAME)],

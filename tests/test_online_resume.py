@@ -17,8 +17,10 @@ import pytest
 import torch
 from stable_baselines3 import DQN
 
+import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import TrainingError
+from mcaprl.offline.follow import GrowingLogs
 from mcaprl.online.agent import Agent
 from mcaprl.online.curve import read_curve
 from mcaprl.online.evaluation import Scale
@@ -56,12 +58,10 @@ def stop_at(step: int) -> Callable[[TrainingProgress], None]:
     return report
 
 
-def agent_in(folder: Path, algo: str = "dqn", **settings: Any) -> Agent:
+def agent_in(folder: Path, resume: bool, **settings: Any) -> Agent:
     folder.mkdir(exist_ok=True)
-    if algo in ("dqn", "double-dqn"):
-        settings = {**SHORT, **settings}
-    task = Task.for_sim("lane", algo, **settings)
-    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
+    task = Task.for_sim("lane", "dqn", **{**SHORT, **settings})
+    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), resume=resume)
 
 
 def state_of(agent: Agent) -> dict[str, Any]:
@@ -88,14 +88,14 @@ def state_of(agent: Agent) -> dict[str, Any]:
 
 @pytest.mark.parametrize("settings", [{}, {"n_steps": 3}, {"buffer_size": 1_000}])
 def test_everything_comes_back(tmp_path: Path, settings: dict[str, Any]) -> None:
-    first = agent_in(tmp_path / "run", **settings)
+    first = agent_in(tmp_path / "run", False, **settings)
     with closing(first):
         first.learn(silent)
     before = state_of(first)
-    second = agent_in(tmp_path / "run", **settings)
+    second = agent_in(tmp_path / "run", True, **settings)
     torch.manual_seed(7)
     with closing(second):
-        second.learn(silent, resume=True)
+        second.learn(silent)
     assert second.resumed_at == 2_000
     assert second.points == first.points
     assert state_of(second) == before
@@ -151,9 +151,11 @@ def test_a_killed_run_goes_on(tmp_path: Path) -> None:
             if now.done >= 1_000:
                 time.sleep(60)
 
-        train(Task.for_sim("lane", "dqn", **{SHORT!r}), sys.argv[1], progress=report)
+        task = Task.for_sim("lane", "dqn", **{SHORT!r})
+        train(task, sys.argv[1], record=sys.argv[2], progress=report)
     """
-    command = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path / "run")]
+    log = tmp_path / "log.mcap"
+    command = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path / "run"), str(log)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -161,8 +163,24 @@ def test_a_killed_run_goes_on(tmp_path: Path) -> None:
                 process.send_signal(signal.SIGKILL)
                 break
     task = Task.for_sim("lane", "dqn", **SHORT)
-    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    logged = len(GrowingLogs([log]).dataset)
+    (summary,) = train(task, tmp_path / "run", record=log, resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (800, 2_000)
+    # What was logged before the kill is there, and behind it what was done since.
+    assert 800 < logged <= 1_000
+    assert len(mcaprl.open(log)) == logged + 1_200
+    assert (tmp_path / "log.mcap.damaged").exists()
+
+
+def test_a_log_is_appended_to(tmp_path: Path) -> None:
+    task, log = Task.for_sim("lane", "dqn", **SHORT), tmp_path / "log.mcap"
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", record=log, progress=stop_at(1_000))
+    before = mcaprl.open(log)
+    train(task, tmp_path / "run", record=log, resume=True, progress=silent)
+    after = mcaprl.open(log)
+    assert len(after) == len(before) + 1_200
+    np.testing.assert_array_equal(after.rewards[: len(before)], before.rewards)
 
 
 def test_ppo_goes_on_too(tmp_path: Path) -> None:
