@@ -16,6 +16,7 @@ import click
 
 from mcaprl._version import __version__
 from mcaprl.cli.evaluate import evaluate
+from mcaprl.cli.export import export
 from mcaprl.cli.logs import check, info, layout
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
@@ -30,7 +31,17 @@ def cli() -> None:
     """The robot's log is the dataset: record, learn from and replay MCAP files."""
 
 
-_COMMANDS = (record, train_online, train_offline, evaluate, replay, info, check, layout)
+_COMMANDS = (
+    record,
+    train_online,
+    train_offline,
+    evaluate,
+    export,
+    replay,
+    info,
+    check,
+    layout,
+)
 for _command in _COMMANDS:
     cli.add_command(_command)
 

@@ -50,7 +50,7 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for line in lines:
         arguments = shlex.split(line)[1:]
         if arguments[0] == "train-offline":
-            arguments += ["--updates", "30", "--hidden", "16,16"]
+            arguments += ["--updates", "30", "--hidden", "16,16", "--target-interval", "1"]
         for option, value in SMALLER.items():
             if option in arguments:
                 arguments[arguments.index(option) + 1] = value
