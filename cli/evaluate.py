@@ -29,7 +29,7 @@ RESULT_NAME = "evaluation.json"
 
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
-@click.option("--sim", help="lane, powerline, racer, or any Gymnasium id.")
+@click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
 @click.option("--data", help="Estimate from these logs alone, instead of running a sim.")
 @click.option("--episodes", default=30, show_default=True, type=click.IntRange(1))
 @click.option("--seed", default=1_000_000, show_default=True, type=click.IntRange(0))

@@ -18,8 +18,9 @@ from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.lint import Finding, lint
+from mcaprl.recorder.log_reader import describe
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.reader import describe, find_logs, open_logs
+from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim

@@ -90,7 +90,8 @@ class Recording:
 def record(envs: int, sim_arguments: dict[str, Any], no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 
-    SIM is lane, powerline, racer, or any Gymnasium id. Each finished episode is on disk at once.
+    SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each finished episode is on
+    disk at once.
     """
     whole = Recording(sim_options=sim_arguments, scene=not no_scene, first_episode=0, **request)
     _check_request(whole, envs)

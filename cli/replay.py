@@ -12,7 +12,7 @@ import gymnasium as gym
 from mcaprl.cli.show import progress
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.reader import find_logs, read_log
+from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.verify import verify
 from mcaprl.sims import make_sim
 
@@ -33,7 +33,7 @@ def replay(files: tuple[str, ...], episode: int | None, verifies: bool, sim: str
 
 def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
     """Compare one file with the sim and tell what was found; whether all is the same."""
-    dataset = read_log(path)
+    dataset = open_logs(path)
     check_episode(dataset, episode, path)
     with closing(sim_of(dataset, path, sim)) as env, progress("stepping", len(dataset)) as advance:
         found = verify(dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1)))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from collections.abc import Iterable
 from typing import Any
 
 import click
 
-from mcaprl.errors import UsageError
-from mcaprl.settings import Settings, field_help
+from mcaprl.settings import Settings, field_help, flag
 
 
 def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
@@ -27,31 +25,12 @@ def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
     return list(options.values())
 
 
-def check_settings(algo: str, config: Settings, given: Mapping[str, Any]) -> None:
-    """Refuse settings that the algorithm does not have.
-
-    Raises:
-        UsageError: there is such a one.
-    """
-    known = [field.name for field in fields(config)]
-    for name in given:
-        if name not in known:
-            options = ", ".join(_flag(field) for field in known)
-            raise UsageError(f"{algo} has no setting {_flag(name)}; it has {options}")
-
-
-def plain_settings(found: object) -> dict[str, Any]:
-    """The settings of an earlier session, as its config.json has them."""
-    settings = found if isinstance(found, dict) else {}
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
-
-
 def _option(name: str, line: str, default: Any) -> click.Option:
     if isinstance(default, bool):
-        both = f"{_flag(name)}/--no-{name.replace('_', '-')}"
+        both = f"{flag(name)}/--no-{name.replace('_', '-')}"
         return click.Option([both, name], default=None, help=line)
     return click.Option(
-        [_flag(name), name],
+        [flag(name), name],
         type=_Widths() if isinstance(default, tuple) else type(default),
         help=f"{line}  [default: {_shown(default)}]",
     )
@@ -69,10 +48,6 @@ class _Widths(click.ParamType[tuple[int, ...]]):
             return tuple(int(part) for part in str(value).split(","))
         except ValueError:
             self.fail(f"{value!r} is no list of widths such as 256,256", param, ctx)
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
 
 
 def _shown(default: Any) -> str:

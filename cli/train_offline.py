@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
-from mcaprl.cli.settings import check_settings, plain_settings, setting_options
+from mcaprl.cli.settings import setting_options
 from mcaprl.errors import MissingExtraError
+from mcaprl.settings import check_settings, plain_settings
 
 
 class _TrainCommand(click.Command):

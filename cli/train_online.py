@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import click
 
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.settings import check_settings, setting_options
+from mcaprl.cli.settings import setting_options
 from mcaprl.cli.show import print_table
 
 
@@ -23,13 +24,11 @@ class _TrainCommand(click.Command):
 
 
 @click.command(cls=_TrainCommand)
-@click.argument("sim")
+@click.argument("sim", required=False)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to make.")
+@click.option("--algo", help="dqn, double-dqn, ppo or a2c.  [default: double-dqn]")
 @click.option(
-    "--algo",
-    default="double-dqn",
-    show_default=True,
-    help="dqn, double-dqn, ppo or a2c.",
+    "--preset", help="Published settings: autonomysim-car, autonomysim-drone, ddqn-racer."
 )
 @click.option(
     "--seeds",
@@ -48,47 +47,57 @@ class _TrainCommand(click.Command):
     type=click.IntRange(1),
     help="Of torch; more than one pays only with pictures on an idle machine.",
 )
+@click.option(
+    "--record",
+    type=click.Path(path_type=Path),
+    help="Log every transition while training; with several seeds a folder.",
+)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @sim_options
 def train_online(
-    sim: str,
+    sim: str | None,
     out: Path,
-    algo: str,
+    algo: str | None,
+    preset: str | None,
     seeds: int,
     seed: int,
     threads: int,
+    record: Path | None,
+    resume: bool,
     sim_arguments: dict[str, Any],
     **settings: Any,
 ) -> None:
-    """Learn a policy by acting in SIM: lane, powerline, racer, or any Gymnasium id.
+    """Learn a policy by acting in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
-    Settings that are not given are those that SIM was seen to be learnt with, or else
-    Stable-Baselines3's. The best checkpoint is kept, chosen by episodes of its own and scored on
-    others.
+    Settings that are not given are the preset's or, without one, those that SIM was seen to be
+    learnt with, or else Stable-Baselines3's; with --resume, the run's. The best checkpoint is kept,
+    chosen by episodes of its own and scored on others.
     """
     import torch
 
-    from mcaprl.online.train import default_config, train
+    from mcaprl.online.task import choose_task
+    from mcaprl.online.train import train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}
-    check_settings(algo, default_config(algo, sim, sim_arguments, {}), given)
-    config = default_config(algo, sim, sim_arguments, given)
-    summaries = train(
-        sim, algo, out, config=config, sim_options=sim_arguments, seeds=seeds, seed=seed
+    task = choose_task(
+        sim, algo, sim_arguments, given, preset=preset, resumed=out if resume else None
     )
+    summaries = train(task, out, seeds=seeds, seed=seed, record=record, resume=resume)
     rows = [
         [
             str(summary.folder),
             f"{summary.steps}",
             f"{summary.best_step}",
             f"{summary.mean_return:.2f}",
-            f"{summary.score:.3f}",
+            "" if math.isnan(summary.score) else f"{summary.score:.3f}",
             ", ".join(f"{count} {reason}" for reason, count in summary.ends.items()),
         ]
         for summary in summaries
     ]
     print_table(
-        f"{algo} in {sim}: the best checkpoint of each seed on fresh episodes",
+        f"{task.algo} in {task.sim}: the best checkpoint of each seed on fresh episodes",
         ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
+    click.echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")

@@ -1,7 +1,8 @@
 """Writes what the docs show and nobody should type: `make docs`.
 
 docs/cli.md                    the commands and their options, from the program itself
-docs/images/SIM-frames.png     what the sims look like, from above and to their depth cameras
+docs/images/SIM-pilot.png      an episode of each sim: from above, and to its depth cameras
+docs/images/SIM-random.png     likewise, of random actions
 docs/images/comparison.png     from the last `make demo`, if there was one
 docs/images/trajectories.png   likewise
 """
@@ -9,23 +10,56 @@ docs/images/trajectories.png   likewise
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
+import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
 from mcaprl.cli import cli
+from mcaprl.cli.policies import SCRIPTED
 from mcaprl.sims import make_sim
 from mcaprl.sims.pilots import make_pilot
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"
 DEMO_REPORT = DOCS.parent / "demo" / "report"
-# Columns of a contact sheet, and decisions of each sim's pilot between two of them.
-FRAMES = 6
-FRAME_EVERY = {"lane": 30, "powerline": 40, "racer": 25}
+SEED = 1
+SHEET_WIDTH = 14.4
+# Of the colours of depth pictures, which are logarithmic.
+NEAREST_M, FARTHEST_M = 2.0, 200.0
+
+
+class Sheet(NamedTuple):
+    """A contact sheet: what it shows of an episode.
+
+    Attributes:
+        sim: short name.
+        steps: at most so many.
+        start: where it begins.
+        columns: pictures along it.
+        cameras: arguments that choose a depth camera, a row for each.
+        road: of highway-lane.
+    """
+
+    sim: str
+    steps: int
+    start: str = "line"
+    columns: int = 6
+    cameras: tuple[dict[str, str], ...] = ()
+    road: str | None = None
+
+
+SHEETS = {
+    "lane": Sheet("lane", 175, cameras=({},)),
+    "powerline": Sheet("powerline", 270, cameras=({"camera": "down"}, {"camera": "front"})),
+    "racer": Sheet("racer", 130, columns=4),
+    "highway-lane": Sheet("highway-lane", 580, start="anywhere"),
+    "highway-racetrack": Sheet("highway-lane", 90, road="racetrack-v0"),
+}
 
 
 def command_reference() -> str:
@@ -41,37 +75,64 @@ def command_reference() -> str:
     return "\n".join(parts)
 
 
-def frames_of(sim: str, every: int, **arguments: Any) -> Figure:
-    """A contact sheet of the pilot's drive: from above, and what the depth camera sees, if any.
+def contact_sheet(sheet: Sheet, policy: str) -> Figure:
+    """Pictures along an episode: from above, and below that what the depth cameras see.
 
     Args:
-        sim: short name.
-        every: decisions between two columns.
-        **arguments: of the sim.
+        sheet: what to show.
+        policy: `pilot` or `random`.
     """
-    env = make_sim(sim, render_mode="rgb_array", **arguments)
-    observation, _ = env.reset(seed=1)
-    pilot = make_pilot(env)
-    has_depth = hasattr(env.unwrapped, "depth_image_m")
-    figure = Figure(figsize=(2.4 * FRAMES, 5.2 if has_depth else 2.2), dpi=110)
-    grid = figure.subplots(1 + has_depth, FRAMES, squeeze=False)
-    sim_: Any = env.unwrapped
-    for column in range(FRAMES):
-        seconds = column * every * sim_.step_duration_s
-        title = f"{seconds:.0f} s, {sim_.telemetry()['speed_m_s']:.0f} m/s"
-        _show(grid[0, column], np.asarray(env.render()), title)
-        if has_depth:
-            depth_m = sim_.depth_image_m()
-            _show(grid[1, column], np.log(np.minimum(depth_m, 200.0)), "")
-        for _ in range(every):
-            observation = env.step(pilot.act(np.asarray(observation)[None])[0])[0]
-    env.close()
+    arguments = {"start": sheet.start} | ({"road": sheet.road} if sheet.road else {})
+    # Equal but for the camera: the same seed and actions make them go through the same episode.
+    envs = [
+        make_sim(sheet.sim, render_mode="rgb_array", **arguments, **camera)
+        for camera in sheet.cameras or ({},)
+    ]
+    steps = sum(1 for _ in _episode(envs, policy, sheet.steps)) - 1
+    shown = np.unique(np.linspace(0, steps, sheet.columns).round()).tolist()
+    rows, side = 1 + len(sheet.cameras), SHEET_WIDTH / sheet.columns
+    figure = Figure(figsize=(side * len(shown), side * rows + 0.3), dpi=110)
+    grid = figure.subplots(rows, len(shown), squeeze=False)
+    for step, reason in enumerate(_episode(envs, policy, sheet.steps)):
+        if step not in shown:
+            continue
+        column = grid[:, shown.index(step)]
+        _show(column[0], envs[0].render(), _title(envs[0].unwrapped, step, reason))
+        for axes, env in zip(column[1:], envs, strict=False):
+            depth_m = np.asarray(env.get_wrapper_attr("depth_image_m")())
+            _show(axes, np.log(np.minimum(depth_m, FARTHEST_M)), "")
     figure.tight_layout()
     return figure
 
 
-def _show(axes: Any, picture: np.ndarray[Any, Any], title: str) -> None:
-    axes.imshow(picture, cmap="turbo_r" if picture.ndim == 2 else None)
+def _episode(envs: list[gym.Env[Any, Any]], policy: str, steps: int) -> Iterator[str]:
+    """Run the same episode in all environments; give, for each observation, why it is the last."""
+    pilot, actions = make_pilot(envs[0]), envs[0].action_space
+    actions.seed(SEED)
+    for env in envs:
+        env.reset(seed=SEED)
+    yield ""
+    for _ in range(steps):
+        # Pilots look at the sim itself.
+        action = actions.sample() if policy == "random" else pilot.act(np.zeros((1, 1)))[0]
+        ends = [env.step(action)[2:] for env in envs]
+        terminated, truncated, info = ends[0]
+        yield str(info.get("reason", ""))
+        if terminated or truncated:
+            return
+
+
+def _title(sim: Any, step: int, reason: str) -> str:
+    seconds = step * sim.step_duration_s
+    title = f"{seconds:.1f} s, {sim.telemetry()['speed_m_s']:.0f} m/s"
+    return f"{title}, {reason}" if reason else title
+
+
+def _show(axes: Any, picture: Any, title: str) -> None:
+    if picture.ndim == 2:
+        axes.imshow(picture, cmap="turbo_r", vmin=np.log(NEAREST_M), vmax=np.log(FARTHEST_M))
+    else:
+        axes.imshow(picture)
     axes.set_title(title, fontsize=9)
     axes.set_axis_off()
 
@@ -84,8 +145,10 @@ def main() -> None:
     """Write all of it."""
     IMAGES.mkdir(exist_ok=True)
     (DOCS / "cli.md").write_text(command_reference())
-    for sim, every in FRAME_EVERY.items():
-        frames_of(sim, every, start="line").savefig(IMAGES / f"{sim}-frames.png", facecolor="white")
+    for name, sheet in SHEETS.items():
+        for policy in SCRIPTED:
+            picture = IMAGES / f"{name}-{policy}.png"
+            contact_sheet(sheet, policy).savefig(picture, facecolor="white", bbox_inches="tight")
     for name in ("comparison.png", "trajectories.png"):
         if (DEMO_REPORT / name).exists():
             shutil.copy(DEMO_REPORT / name, IMAGES / name)

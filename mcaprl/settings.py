@@ -9,7 +9,9 @@ from __future__ import annotations
 import ast
 import inspect
 import textwrap
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
 from mcaprl.errors import UsageError
 
@@ -26,6 +28,39 @@ class Settings:
         """
         if not holds:
             raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
+
+
+def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:
+    """Refuse settings that an algorithm does not have.
+
+    Args:
+        algo: the algorithm's name.
+        config: its settings, or their type.
+        given: names of those that were asked for.
+
+    Raises:
+        UsageError: there is such a one.
+    """
+    known = [field.name for field in fields(config)]
+    for name in given:
+        if name not in known:
+            options = ", ".join(map(flag, known))
+            raise UsageError(f"{algo} has no setting {flag(name)}; it has {options}")
+
+
+def plain_settings(found: object) -> dict[str, Any]:
+    """The settings of an earlier session, as JSON has them: lists are tuples again."""
+    settings = found if isinstance(found, dict) else {}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
+
+
+def flag(name: str) -> str:
+    """What the command line calls a setting.
+
+    >>> flag("batch_size")
+    '--batch-size'
+    """
+    return f"--{name.replace('_', '-')}"
 
 
 def field_help(config_type: type) -> dict[str, str]:

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from mcaprl.errors import TrainingError
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.files import read_tensors, write_tensors
 from mcaprl.offline.learner import Learner
+from mcaprl.tensor_files import read_tensors, write_tensors
 
 CHECKPOINT_NAME = "checkpoint.safetensors"
 

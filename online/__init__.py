@@ -2,9 +2,10 @@
 
 Importing this package loads no torch; its modules do.
 
+    from mcaprl.online.task import Task
     from mcaprl.online.train import train
 
-    train("lane", "double-dqn", Path("runs/lane"), seeds=4)
+    train(Task.for_sim("lane", "double-dqn"), "runs/lane", seeds=4)
 
 Raises:
     MissingExtraError: the packages of the `online` extra are not installed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
@@ -90,7 +90,28 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         device="auto",
         **config.arguments(),
     )
+    if isinstance(config, DQNConfig) and config.exploration_decay:
+        cast(DQN, model).exploration_schedule = ExponentialSchedule(
+            config.exploration_initial_eps,
+            config.exploration_final_eps,
+            config.exploration_decay,
+            config.steps,
+        )
     return model
+
+
+@dataclass(frozen=True)
+class ExponentialSchedule:
+    """Falls by a factor with each step, to a last value; called with what remains, from 1 to 0."""
+
+    first: float
+    last: float
+    factor: float
+    steps: int
+
+    def __call__(self, remaining: float) -> float:
+        """The value when that part of the steps is left."""
+        return max(self.last, self.first * float(self.factor ** ((1 - remaining) * self.steps)))
 
 
 def _policy_name(space: spaces.Space[Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,12 +35,14 @@ class OnlineConfig(Settings):
     """environment steps between two evaluations"""
     eval_episodes: int = 30
     """episodes of one evaluation, on an environment of its own; always the same ones"""
+    checkpoint_interval: int = 20_000
+    """environment steps between two checkpoints to resume from"""
     final_episodes: int = 100
     """episodes that score the best checkpoint at the end, none of which it was chosen by"""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
-        for name in ("steps", "envs", "eval_interval", "eval_episodes", "final_episodes"):
+        for name in ("steps", "envs", "eval_interval", "eval_episodes", "checkpoint_interval"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("learning_rate", "max_grad_norm"):
             self._require(name, getattr(self, name) > 0, "above 0")
@@ -66,6 +69,8 @@ class DQNConfig(OnlineConfig):
     """environment steps for each gradient step"""
     target_update_interval: int = 10_000
     """environment steps between two copies of the weights into the target network"""
+    target_update_episodes: int = 0
+    """episodes between two copies, in place of steps; 0 counts steps"""
     n_steps: int = 1
     """rewards that are summed up before the target network's value of what follows"""
     exploration_fraction: float = 0.1
@@ -74,6 +79,8 @@ class DQNConfig(OnlineConfig):
     """probability of a random action at first"""
     exploration_final_eps: float = 0.05
     """probability of a random action at last"""
+    exploration_decay: float = 0.0
+    """factor on that probability at each step, in place of the linear fall; 0 has none"""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
@@ -82,7 +89,8 @@ class DQNConfig(OnlineConfig):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         self._require("buffer_size", self.buffer_size >= self.envs, "at least one row an env")
         self._require("learning_starts", self.learning_starts >= 0, "at least 0")
-        for name in ("fraction", "initial_eps", "final_eps"):
+        self._require("target_update_episodes", self.target_update_episodes >= 0, "at least 0")
+        for name in ("fraction", "initial_eps", "final_eps", "decay"):
             value = getattr(self, f"exploration_{name}")
             self._require(f"exploration_{name}", 0 <= value <= 1, "within [0, 1]")
         even = max(self.steps_per_update, self.envs) % min(self.steps_per_update, self.envs) == 0
@@ -102,6 +110,8 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
+            # Steps that never come: episodes are counted instead.
+            **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`, each of which is a step of every environment.
             "train_freq": max(1, self.steps_per_update // self.envs),

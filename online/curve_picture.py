@@ -81,9 +81,8 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
     axes.set_ylabel("score: random 0, pilot 1" if scored else "mean return")
     dots = "; dots: best checkpoints on fresh episodes" if any(run.finals for run in runs) else ""
     axes.set_xlabel(f"environment steps{dots}")
-    axes.set_title(title, loc="left", color=INK)
-    axes.legend(frameon=False, loc="lower right")
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(title)
+    axes.legend(loc="lower right")
     save_png(figure, path)
 
 

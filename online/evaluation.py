@@ -95,6 +95,10 @@ class Evaluation(EvalCallback):
         self._returns: list[float] = []
         self._lengths: list[int] = []
 
+    def resume(self, calls: int, best_mean_return: float) -> None:
+        """Go on as after so many steps of all environments."""
+        self.n_calls, self.best_mean_reward = calls, best_mean_return
+
     def _on_step(self) -> bool:
         if self.n_calls % self.eval_freq:
             return True

@@ -42,6 +42,13 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
     },
     SIMS["powerline"]: {**_FAR_SIGHTED, "steps": 120_000, "buffer_size": 200_000},
     SIMS["racer"]: {**_FAR_SIGHTED, "steps": 100_000, "buffer_size": 100_000},
+    SIMS["highway-lane"]: {
+        **_STEADY,
+        "steps": 40_000,
+        "gamma": 0.97,
+        "buffer_size": 40_000,
+        "target_update_interval": 1_000,
+    },
 }
 """By the sim's id: what differs from the algorithm's own defaults."""
 

@@ -7,7 +7,7 @@ one `gymnasium.vector.VectorEnv` at once, which for the sims here is one compile
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -26,6 +26,9 @@ class BatchedVecEnv(VecEnv):
     At an episode's end `infos[i]` has what SB3 reads there: `terminal_observation`,
     `TimeLimit.truncated`, and under `episode` what its `Monitor` would say; `reason`, too, where
     the environment tells one. Between ends the dicts are empty.
+
+    Attributes:
+        before_step: called with the actions (N,) before each step.
     """
 
     def __init__(self, env: Any) -> None:
@@ -39,6 +42,7 @@ class BatchedVecEnv(VecEnv):
         assert env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
         self.env: Any = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.before_step: Callable[[NDArray[Any]], None] | None = None
         self._actions: NDArray[Any] = np.zeros(0)
         self._returns = np.zeros(env.num_envs)
         self._lengths = np.zeros(env.num_envs, dtype=np.int64)
@@ -60,6 +64,8 @@ class BatchedVecEnv(VecEnv):
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take note of the actions; `step_wait` does the work."""
+        if self.before_step is not None:
+            self.before_step(actions)
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:

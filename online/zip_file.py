@@ -26,7 +26,13 @@ OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
 _WEIGHTS_NAME = "policy.pth"
 # SB3 makes these anew; saved, they would bind the file to this package's own classes.
-_LEFT_OUT = ("replay_buffer_class", "replay_buffer_kwargs", "_last_obs", "_last_original_obs")
+_LEFT_OUT = (
+    "replay_buffer_class",
+    "replay_buffer_kwargs",
+    "exploration_schedule",
+    "_last_obs",
+    "_last_original_obs",
+)
 
 
 def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:

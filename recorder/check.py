@@ -16,9 +16,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, chunk_records, message_index
+from mcaprl.recorder.log_reader import LogReader
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import parse_record
-from mcaprl.recorder.reader import read_log
 from mcaprl.recorder.rows import add_up
 
 _REWRITE = "read what is left with mcaprl.open and save it anew"
@@ -155,7 +155,7 @@ def _check_contents(path: Path, report: Report) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            dataset = read_log(path)
+            dataset = LogReader(path).read()
     except (LogError, SpaceError) as error:
         report(_without_path(error, path), "/rl/step", "record it again, or open another file")
         return

@@ -57,14 +57,14 @@ def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDAr
     return rows
 
 
-def compressor(compression: str) -> Callable[[Any], bytes]:
-    """A function that compresses a chunk's records: `zstd` (level 1), `lz4`, or `none`.
+def compressor(compression: str, zstd_level: int = 1) -> Callable[[Any], bytes]:
+    """A function that compresses a chunk's records: `zstd`, `lz4`, or `none`.
 
     It keeps its memory between calls, so only one thread may call it.
     """
     match compression:
         case "zstd":
-            return zstandard.ZstdCompressor(level=1).compress
+            return zstandard.ZstdCompressor(level=zstd_level).compress
         case "lz4":
             return lambda data: bytes(lz4.frame.compress(data))
         case _:

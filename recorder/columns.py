@@ -29,6 +29,7 @@ _LAST_NS = np.iinfo(np.int64).max
 
 Columns = dict[str, NDArray[Any]]
 """Arrays of one length, by field name; texts are arrays of `str` objects."""
+LOG_TIME = "log_time"
 Rows = slice | NDArray[np.int64]
 
 
@@ -37,8 +38,7 @@ class Topic:
 
     Attributes:
         name: of the topic.
-        times: (N,) log_time of each message in the order of its channels and of the file.
-        channel_ids: (N,) of each message, likewise.
+        parts: its messages, as they stand together in the file.
     """
 
     def __init__(self, reader: McapReader, name: str) -> None:
@@ -50,25 +50,40 @@ class Topic:
         """
         self.name = name
         self._reader = reader
-        self._parts = [
-            _Part(reader, channel, span)
+        self.parts = [
+            Part(reader, channel, span)
             for channel in reader.channels_of(name)
             for span in reader.spans(channel)
         ]
-        counts = [len(part.span.index) for part in self._parts]
-        self._stops = np.cumsum(counts, dtype=np.int64)
-        self.times = np.empty(sum(counts), np.int64)
-        self.channel_ids = np.empty(sum(counts), np.uint16)
-        for part, stop, count in zip(self._parts, self._stops.tolist(), counts, strict=True):
-            times = part.span.index["log_time"]
-            if times.max() > _LAST_NS:
-                raise CorruptLogError(f"{reader.path}: {name} has a log_time beyond the year 2262")
-            self.times[stop - count : stop] = times
-            self.channel_ids[stop - count : stop] = part.channel.id
+        self._counts = [len(part.span.index) for part in self.parts]
+        self._stops = np.cumsum(self._counts, dtype=np.int64)
 
     def __len__(self) -> int:
         """Messages."""
-        return len(self.times)
+        return sum(self._counts)
+
+    @cached_property
+    def times(self) -> NDArray[np.int64]:
+        """(N,) log_time of each message in the order of its channels and of the file."""
+        times = np.empty(len(self), np.int64)
+        for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
+            times[stop - count : stop] = part.times
+        return times
+
+    @property
+    def channel_ids(self) -> NDArray[np.uint16]:
+        """(N,) of each message, likewise."""
+        ids = np.array([part.channel.id for part in self.parts], np.uint16)
+        return np.repeat(ids, self._counts)
+
+    @property
+    def chunks_rise(self) -> bool:
+        """Whether it is one channel, and no chunk begins before the one before it has ended."""
+        chunks = [part.span.chunk for part in self.parts]
+        return len({part.channel.id for part in self.parts}) == 1 and all(
+            a is not None and b is not None and a.message_end_time <= b.message_start_time
+            for a, b in pairwise(chunks)
+        )
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
@@ -77,7 +92,7 @@ class Topic:
         Raises:
             LogError: its channels do not agree on them.
         """
-        types = list({id(part.type): part.type for part in self._parts}.values())
+        types = list({id(part.type): part.type for part in self.parts}.values())
         if any(other.dtypes != types[0].dtypes for other in types[1:]):
             raise LogError(
                 f"{self._reader.path}: the channels of {self.name} have messages of different types"
@@ -87,7 +102,7 @@ class Topic:
     def read(
         self, wanted: Collection[str], order: NDArray[np.int64] | None = None, *, threads: int = 1
     ) -> Columns:
-        """Read columns.
+        """Read columns: `log_time`, and those of fields.
 
         Args:
             wanted: names of fields.
@@ -102,14 +117,16 @@ class Topic:
         order = np.arange(len(self)) if order is None else order
         parts = list(self._chosen(order))
         if not parts:
-            return {name: np.empty(0, self.fields.get(name)) for name in wanted}
+            return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
         columns = parts[0].part.empty_columns(wanted, len(order))
+        times = np.empty(len(order), np.int64)
 
         def fill(chosen: _Chosen) -> None:
+            times[chosen.rows] = chosen.index["log_time"]
             chosen.part.fill(columns, chosen.index, chosen.rows)
 
         _for_each(fill, parts, threads)
-        return columns
+        return {LOG_TIME: times, **columns}
 
     def _chosen(self, order: NDArray[np.int64]) -> Iterator[_Chosen]:
         """The parts with messages that are wanted, and where those go."""
@@ -117,7 +134,7 @@ class Topic:
         by_place = None if is_rising else np.argsort(order, kind="stable")
         places = order if by_place is None else order[by_place]
         bounds = np.searchsorted(places, [0, *self._stops.tolist()]).tolist()
-        for part, stop, (low, high) in zip(self._parts, self._stops, pairwise(bounds), strict=True):
+        for part, stop, (low, high) in zip(self.parts, self._stops, pairwise(bounds), strict=True):
             if low == high:
                 continue
             index = part.span.index
@@ -130,18 +147,39 @@ class Topic:
 class _Chosen:
     """Messages of a part, and their rows in the columns."""
 
-    part: _Part
+    part: Part
     index: NDArray[Any]
     rows: Rows
 
 
-class _Part:
-    """Messages of one channel that stand together."""
+class Part:
+    """Messages of one channel that stand together.
+
+    Attributes:
+        span: where.
+        channel: which.
+        type: of the messages.
+    """
 
     def __init__(self, reader: McapReader, channel: Channel, span: Span) -> None:
+        """Learn their type; none is read.
+
+        Raises:
+            LogError: messages are encoded in a way that is not known.
+        """
         self.span, self.channel = span, channel
         self.type = _type_of(reader, channel)
         self._reader = reader
+
+    @property
+    def times(self) -> NDArray[np.uint64]:
+        """The log_time of each message."""
+        times: NDArray[np.uint64] = self.span.index["log_time"]
+        if times.max() > _LAST_NS:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} has a log_time beyond the year 2262"
+            )
+        return times
 
     def empty_columns(self, wanted: Collection[str], count: int) -> Columns:
         """Columns with the dtypes and shapes of the first message."""
@@ -181,7 +219,7 @@ class _Part:
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
         """Put messages that have the form of the first; does nothing if one has not."""
-        found = self._gather(records, index, columns)
+        found = self.alike(records, index, columns)
         if found is None:
             return False
         if any(found[name].shape[1:] != column.shape[1:] for name, column in columns.items()):
@@ -190,7 +228,7 @@ class _Part:
             column[rows] = self._texts(found[name]) if column.dtype.kind == "O" else found[name]
         return True
 
-    def _gather(
+    def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
     ) -> NDArray[Any] | None:
         """The messages as one structured array; None if they have not one form."""

@@ -13,15 +13,21 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError
+from mcaprl.recorder.batch import Batch
 from mcaprl.recorder.episode import Episode, shapes
+from mcaprl.recorder.mapped import MappedImages, rows_of
 from mcaprl.recorder.metadata import LogMetadata
-from mcaprl.recorder.spaces import nest, observation_leaves, space_to_json
+from mcaprl.recorder.spaces import leaves_of, nest, space_to_json
 from mcaprl.recorder.statistics import Statistics, describe_columns
 from mcaprl.recorder.transitions import Transitions
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
+
+
+# Rows that are hashed at a time: images on disk need not fit into memory.
+_BLOCK_ROWS = 1024
 
 
 class Dataset:
@@ -42,7 +48,7 @@ class Dataset:
         """Use `mcaprl.open` or `Dataset.from_arrays`."""
         self._transitions = transitions
         self._description = description
-        self._leaves = observation_leaves(description.observation_space)
+        self._leaves = leaves_of(description.observation_space)
         self.metadata = description.to_strings()
         self.sources = sources
 
@@ -128,13 +134,24 @@ class Dataset:
 
     @cached_property
     def observations(self) -> Any:
-        """(N, *shape) in the space's dtype, or nested dicts of such arrays."""
-        return self._frames(self._transitions.frame_of_step())
+        """(N, *shape) in the space's dtype, or nested dicts of such arrays.
+
+        Images that are on disk are read by indexing this, or by `batch`.
+        """
+        return self._frames(self._frame_of_step)
 
     @cached_property
     def next_observations(self) -> Any:
         """Like `observations`, one step on; at an episode's end its last observation."""
-        return self._frames(self._transitions.frame_of_step() + 1)
+        return self._frames(self._frame_of_step + 1)
+
+    @property
+    def storage(self) -> str:
+        """Where the observations are: `memory`, or the files that images are read from."""
+        mapped = [leaf for leaf in self._transitions.frames if isinstance(leaf, MappedImages)]
+        names = list(dict.fromkeys(name for leaf in mapped for name in leaf.names))
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        return f"images on disk in {names[0]}{more}" if names else "memory"
 
     @property
     def frames(self) -> Any:
@@ -231,7 +248,8 @@ class Dataset:
         digest.update(space_to_json(self.action_space).encode())
         names = ("actions", "rewards", "terminated", "truncated", "behavior_probs", "lengths")
         for array in (*columns.frames, *(getattr(columns, name) for name in names)):
-            digest.update(np.ascontiguousarray(array).data)
+            for start in range(0, len(array), _BLOCK_ROWS):
+                digest.update(np.ascontiguousarray(array[start : start + _BLOCK_ROWS]).data)
         return digest.hexdigest()
 
     @cached_property
@@ -242,6 +260,26 @@ class Dataset:
     def filter(self, keep: Callable[[Episode], bool]) -> Dataset:
         """The episodes for which `keep` is true, as a dataset of copies."""
         return self._take([episode.index for episode in self.episodes if keep(episode)])
+
+    def batch(self, steps: NDArray[np.integer[Any]]) -> Batch:
+        """Copy some transitions, by their numbers; images that are on disk are read.
+
+        Args:
+            steps: (B,) which.
+
+        Raises:
+            CorruptLogError: images on disk are damaged.
+        """
+        columns, frames = self._transitions, self._frame_of_step[steps]
+        return Batch(
+            observations=nest(self._leaves, [leaf[frames] for leaf in columns.frames]),
+            actions=columns.actions[steps],
+            rewards=columns.rewards[steps],
+            terminated=columns.terminated[steps],
+            truncated=columns.truncated[steps],
+            next_observations=nest(self._leaves, [leaf[frames + 1] for leaf in columns.frames]),
+            behavior_probs=columns.behavior_probs[steps],
+        )
 
     def split(self, fraction: float, *, seed: int = 0) -> tuple[Dataset, Dataset]:
         """Divide the episodes at random: about `fraction` of them, and the rest.
@@ -303,9 +341,10 @@ class Dataset:
             f"{leaf.name}={shapes(frames)[1:-1]}"
             for leaf, frames in zip(self._leaves, self._transitions.frames, strict=True)
         )
+        where = "" if self.storage == "memory" else f", {self.storage}"
         return (
             f"Dataset({self.env_id or 'unknown environment'}: {len(self._transitions.episodes)}"
-            f" episodes, {len(self)} transitions, {columns}, actions={self.action_space})"
+            f" episodes, {len(self)} transitions, {columns}, actions={self.action_space}{where})"
         )
 
     def _take(self, chosen: Sequence[int]) -> Dataset:
@@ -334,7 +373,11 @@ class Dataset:
         )
 
     def _frames(self, rows: Any) -> Any:
-        return nest(self._leaves, [frames[rows] for frames in self._transitions.frames])
+        return nest(self._leaves, [rows_of(frames, rows) for frames in self._transitions.frames])
+
+    @cached_property
+    def _frame_of_step(self) -> NDArray[np.int64]:
+        return self._transitions.frame_of_step()
 
     def _name(self) -> str:
         return str(self.sources[0]) if self.sources else repr(self)

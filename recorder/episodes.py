@@ -75,17 +75,33 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
     return np.diff(finals, prepend=-1) - 1
 
 
-def told_episodes(topic: Topic) -> list[EpisodeSummary]:
-    """What `/rl/episode` tells, in the order of the file; nothing if it is of another type."""
+def told_lengths(topic: Topic) -> NDArray[np.int64]:
+    """(E,) transitions of each episode by `/rl/episode`; none if it tells them out of order."""
+    names = ("length", "end_time_ns")
+    if not set(names) <= set(topic.fields):
+        return np.empty(0, np.int64)
+    columns = topic.read(names)
+    in_order = (np.diff(columns["end_time_ns"]) > 0).all()
+    return columns["length"].astype(np.int64) if in_order else np.empty(0, np.int64)
+
+
+def told_episodes(topic: Topic, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
+    """What `/rl/episode` tells of the episodes with these last log_times.
+
+    Nothing if it is of another type.
+    """
     known = fields(EpisodeSummary)
     if any(field.default is MISSING and field.name not in topic.fields for field in known):
         return []
     names = [field.name for field in known if field.name in topic.fields]
-    columns = topic.read(names)
+    rows = None
+    if len(ends) < len(topic) // 2:
+        rows = np.flatnonzero(np.isin(topic.read(["end_time_ns"])["end_time_ns"], ends))
+    columns = topic.read(names, rows)
     columns["terminated"] = columns["terminated"].astype(bool)
     columns["truncated"] = columns["truncated"].astype(bool)
-    rows = zip(*(columns[name].tolist() for name in names), strict=True)
-    return [EpisodeSummary.from_fields(dict(zip(names, row, strict=True))) for row in rows]
+    values = zip(*(columns[name].tolist() for name in names), strict=True)
+    return [EpisodeSummary.from_fields(dict(zip(names, row, strict=True))) for row in values]
 
 
 def summaries(

@@ -81,8 +81,8 @@ def _check_names(reader: McapReader, metadata: LogMetadata, columns: Columns) ->
 
 
 def _image_space(reader: McapReader, topic: str) -> spaces.Box:
-    columns = Topic(reader, topic).read(("height", "width", "encoding"), np.zeros(1, np.int64))
-    height, width, encoding = (column[0] for column in columns.values())
+    first = Topic(reader, topic).read(("height", "width", "encoding"), np.zeros(1, np.int64))
+    height, width, encoding = (first[name][0] for name in ("height", "width", "encoding"))
     channels = {name: count for count, name in IMAGE_ENCODINGS.items()}.get(encoding)
     if channels is None:
         raise LogError(

@@ -2,64 +2,161 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns import Topic
-from mcaprl.recorder.log_writer import STEP_TOPIC
+from mcaprl.recorder.chunks import MESSAGE_HEADER, chunk_header
+from mcaprl.recorder.columns import Columns, Part, Topic
+from mcaprl.recorder.episodes import time_order
+from mcaprl.recorder.log_writer import IMAGES_PER_CHUNK, STEP_TOPIC
+from mcaprl.recorder.mapped import Frames, MappedImages, PictureFile
+from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.spaces import Leaf
+from mcaprl.recorder.storage import IMAGE_TYPE, Storage, image_cache, is_mapped
 
-IMAGE_TYPE = "sensor_msgs/msg/Image"
 _FIELDS = ("height", "width", "encoding", "step", "data")
 
 
 def read_images(
-    path: Path, topic: Topic, leaf: Leaf, times: NDArray[np.int64], *, threads: int = 1
-) -> NDArray[np.uint8]:
+    reader: McapReader,
+    leaf: Leaf,
+    times: NDArray[np.int64],
+    *,
+    storage: Storage,
+    threads: int = 1,
+) -> Frames:
     """(F, *shape) pictures of an image leaf, one for each of `times`.
 
     Raises:
         CorruptLogError: one is missing, or is of another size or encoding.
     """
-    order = _order_at(path, topic, times)
-    if not set(_FIELDS) <= set(topic.fields):
-        raise CorruptLogError(f"{path}: messages of {topic.name} are no {IMAGE_TYPE}")
-    columns = topic.read(_FIELDS, order, threads=threads)
-    height, width = leaf.shape[:2]
-    expected = (height, width, leaf.encoding, leaf.size // height)
-    found = [columns[name] for name in _FIELDS[:-1]]
-    wrong = np.logical_or.reduce([a != b for a, b in zip(found, expected, strict=True)])
-    if wrong.any() or columns["data"].shape[1:] != (leaf.size,):
-        row = int(np.argmax(wrong))
-        told = ", ".join(
-            f"{name} {column[row]}" for name, column in zip(_FIELDS, found, strict=False)
-        )
-        raise CorruptLogError(
-            f"{path}: the image on {topic.name} at log_time {times[row]} has {told}"
-            f" and {columns['data'].shape[1]} bytes; the space says {height}x{width}"
-            f" {leaf.encoding}"
-        )
-    return columns["data"].reshape(-1, *leaf.shape)
+    images = _Images(reader, leaf)
+    if not is_mapped(storage, len(times) * leaf.size):
+        return images.read(images.order_at(times), threads)
+    if not images.are_mappable:
+        cache = image_cache(reader, images.topic, images.blocks())
+        images = _Images(cache, leaf)
+    return images.mapped(images.order_at(times))
 
 
-def _order_at(path: Path, topic: Topic, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Which message of a topic is that of each time."""
-    if not len(topic):
-        raise CorruptLogError(f"{path}: no images on {topic.name}")
-    by_time = np.argsort(topic.times, kind="stable")
-    rising = topic.times[by_time]
-    place = np.searchsorted(rising, times)
-    inside = place < len(rising)
-    found = inside & (rising[np.minimum(place, len(rising) - 1)] == times)
-    if not found.all():
-        missing = times[~found]
-        raise CorruptLogError(
-            f"{path}: {len(missing)} records of {STEP_TOPIC} have no image on {topic.name}, the"
-            f" first at log_time {missing[0]}"
+class _Images:
+    """The topic of an image leaf in a file."""
+
+    def __init__(self, reader: McapReader, leaf: Leaf) -> None:
+        self.topic = Topic(reader, leaf.topic)
+        self._reader, self._leaf = reader, leaf
+        if not len(self.topic):
+            raise CorruptLogError(f"{reader.path}: no images on {leaf.topic}")
+        if not set(_FIELDS) <= set(self.topic.fields):
+            raise CorruptLogError(f"{reader.path}: messages of {leaf.topic} are no {IMAGE_TYPE}")
+
+    @property
+    def are_mappable(self) -> bool:
+        """Whether all pictures stand in the file as they are."""
+        return all(
+            part.span.chunk is not None and not part.span.chunk.compression
+            for part in self.topic.parts
         )
-    if (np.diff(rising) == 0).any():
-        raise CorruptLogError(f"{path}: {topic.name} has two images of one log_time")
-    return by_time[place]
+
+    def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which message is that of each time.
+
+        Raises:
+            CorruptLogError: there is none, or there are several.
+        """
+        by_time = time_order(self.topic)
+        rising = self.topic.times if by_time is None else self.topic.times[by_time]
+        place = np.searchsorted(rising, times)
+        found = rising[np.minimum(place, len(rising) - 1)] == times
+        where = f"{self._reader.path}: {self.topic.name}"
+        if not found.all():
+            missing = times[~found]
+            raise CorruptLogError(
+                f"{where} has no image for {len(missing)} records of {STEP_TOPIC}, the first at"
+                f" log_time {missing[0]}"
+            )
+        if (rising[1:] == rising[:-1]).any():
+            raise CorruptLogError(f"{where} has two images of one log_time")
+        return place if by_time is None else by_time[place]
+
+    def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
+        """(F, *shape) the pictures in memory."""
+        columns = self.topic.read(_FIELDS, order, threads=threads)
+        self._check(columns)
+        return columns["data"].reshape(-1, *self._leaf.shape)
+
+    def blocks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+        """All pictures in the order of their times, some at a time."""
+        order = time_order(self.topic)
+        order = np.arange(len(self.topic)) if order is None else order
+        for start in range(0, len(order), IMAGES_PER_CHUNK):
+            part = order[start : start + IMAGES_PER_CHUNK]
+            yield self.topic.times[part], self.read(part)
+
+    def mapped(self, order: NDArray[np.int64]) -> MappedImages:
+        """(F, *shape) the pictures on disk, each checked when it is asked for."""
+        places = np.empty((len(self.topic), 3), np.int64)
+        checks, start = [], 0
+        first = self._data_offset()
+        for number, part in enumerate(self.topic.parts):
+            chunk, index = part.span.chunk, part.span.index
+            assert chunk is not None, "pictures outside of chunks are not mapped"
+            data = chunk_header(self._reader.view, chunk.chunk_start_offset).data
+            stop = start + len(index)
+            places[start:stop, 0], places[start:stop, 1] = 0, number
+            places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
+            checks.append(self._check_of(part, first))
+            start = stop
+        name = str(self._reader.path)
+        file = PictureFile(name, self._reader.view, self._leaf.size, checks)
+        return MappedImages([file], self._leaf.shape, places[order])
+
+    def _data_offset(self) -> int:
+        """Where the first message's picture is, counted from its record."""
+        part = self.topic.parts[0]
+        found = part.alike(self._reader.records_of(part.span), part.span.index[:1], _FIELDS)
+        if found is None:
+            raise CorruptLogError(f"{self._reader.path}: an image on {self.topic.name} is damaged")
+        return _offset_of_data(found.dtype)
+
+    def _check_of(self, part: Part, data_offset: int) -> Callable[[], None]:
+        def check() -> None:
+            found = part.alike(self._reader.records_of(part.span), part.span.index, _FIELDS)
+            if found is None or _offset_of_data(found.dtype) != data_offset:
+                raise CorruptLogError(
+                    f"{self._reader.path}: images on {self.topic.name} are not all of one form;"
+                    " open the log with images='memory'"
+                )
+            self._check({name: found[name] for name in _FIELDS})
+
+        return check
+
+    def _check(self, columns: Columns) -> None:
+        """Make sure that pictures are of the leaf's size and encoding.
+
+        Raises:
+            CorruptLogError: one is not.
+        """
+        height, width = self._leaf.shape[:2]
+        encoding = self._leaf.encoding or ""
+        as_stored = encoding.encode() if columns["encoding"].dtype.kind == "S" else encoding
+        expected = (height, width, as_stored, self._leaf.size // height)
+        found = [columns[name] for name in _FIELDS[:-1]]
+        wrong = np.logical_or.reduce([a != b for a, b in zip(found, expected, strict=True)])
+        if wrong.any() or columns["data"].shape[1:] != (self._leaf.size,):
+            row = int(np.argmax(wrong))
+            told = ", ".join(
+                f"{name} {column[row]}" for name, column in zip(_FIELDS, found, strict=False)
+            )
+            raise CorruptLogError(
+                f"{self._reader.path}: an image on {self.topic.name} has {told} and"
+                f" {columns['data'].shape[1]} bytes; the space says {height}x{width} {encoding}"
+            )
+
+
+def _offset_of_data(message: np.dtype[np.void]) -> int:
+    assert message.fields is not None
+    return MESSAGE_HEADER.itemsize + int(message.fields["data"][1])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,9 @@ from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
+# Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
+# themselves so much that a slower search halves them.
+_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 6
 
 
 class McapWriter:
@@ -66,7 +69,8 @@ class McapWriter:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self.path = Path(path)
         self._compression = compression
-        self._compress = compressor(compression)
+        self._compress_rows = compressor(compression, _ROWS_LEVEL)
+        self._compress_messages = compressor(compression, _MESSAGES_LEVEL)
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
@@ -132,7 +136,7 @@ class McapWriter:
         index = np.empty(len(rows), INDEX_ENTRY)
         index["log_time"] = rows["log_time"]
         index["offset"] = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
-        self._write_chunk(rows.view(np.uint8).data, {channel_id: index})
+        self._write_chunk(rows.view(np.uint8).data, {channel_id: index}, self._compress_rows)
 
     def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
         """Write messages of any channels and lengths as one chunk.
@@ -149,7 +153,7 @@ class McapWriter:
             sequence = int(self._next_sequences(channel_id, 1)[0])
             Message(channel_id, time_ns, data, time_ns, sequence).write(builder)
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
-        self._write_chunk(memoryview(builder.end()), indexes)
+        self._write_chunk(memoryview(builder.end()), indexes, self._compress_messages)
 
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
@@ -180,11 +184,16 @@ class McapWriter:
         self._write(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
         self._file.close()
 
-    def _write_chunk(self, records: memoryview, indexes: dict[int, NDArray[Any]]) -> None:
+    def _write_chunk(
+        self,
+        records: memoryview,
+        indexes: dict[int, NDArray[Any]],
+        compress: Callable[[Any], bytes],
+    ) -> None:
         assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
         start_time = min(int(index["log_time"].min()) for index in indexes.values())
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
-        data = self._compress(records)
+        data = compress(records)
         name = "" if self._compression == "none" else self._compression
         builder = RecordBuilder()
         Chunk(

@@ -30,7 +30,7 @@ from gymnasium import spaces
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError
-from mcaprl.recorder.spaces import observation_leaves, space_from_json, space_to_json
+from mcaprl.recorder.spaces import leaves_of, space_from_json, space_to_json
 
 FORMAT_VERSION = "1"
 METADATA_NAME = "mcaprl.dataset"
@@ -98,7 +98,7 @@ class LogMetadata:
                 "path": leaf.path,
                 **({"topic": leaf.topic} if leaf.encoding else {"field": leaf.name}),
             }
-            for leaf in observation_leaves(self.observation_space)
+            for leaf in leaves_of(self.observation_space)
         ]
         return {
             "format_version": FORMAT_VERSION,

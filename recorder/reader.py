@@ -1,40 +1,31 @@
-"""Reads logs of format version 1 into a Dataset: file -> chunks -> columns -> transitions."""
+"""Opens logs as one Dataset: files -> whole episodes of each -> transitions."""
 
 from __future__ import annotations
 
 import glob
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoStepsError, SpaceError
-from mcaprl.recorder.columns import Columns, Topic
+from mcaprl.errors import LogError, UsageError
 from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.episodes import (
-    COUNTERS,
-    episode_lengths,
-    step_order,
-    summaries,
-    told_episodes,
-)
-from mcaprl.recorder.foreign import inferred_metadata, observation_fields
-from mcaprl.recorder.images import read_images
-from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
-from mcaprl.recorder.schema import is_intact, stored_dtype
-from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves
-from mcaprl.recorder.transitions import Transitions
+from mcaprl.recorder.log_reader import LogReader, Selection
+from mcaprl.recorder.storage import Storage
 
-REQUIRED_FIELDS = ("reward", "action", "terminated", "truncated", *COUNTERS)
+Episodes = int | slice | Sequence[int]
 
 
-def open_logs(data: str | Path | Sequence[str | Path]) -> Dataset:
-    """Read logs into memory.
+def open_logs(
+    data: str | Path | Sequence[str | Path],
+    *,
+    columns: Sequence[str] | None = None,
+    episodes: Episodes | None = None,
+    images: Storage = "auto",
+    threads: int = 1,
+) -> Dataset:
+    """Read logs, or a part of them; what is not asked for is not read.
 
     All chunks read are checked against their CRCs. A log that was cut off, or is still being
     written, gives its finished episodes and a warning.
@@ -42,12 +33,59 @@ def open_logs(data: str | Path | Sequence[str | Path]) -> Dataset:
     Args:
         data: a file, a folder of `.mcap` files, a glob, or a sequence of these. Logs of one call
             must have the same spaces; their episodes follow each other in the order of the files.
+        columns: keys of a Dict observation space, nested ones as `joints/q`; the dataset's
+            observation space has just these then. None of them (`[]`) reads no observations.
+            Actions, rewards and ends are always read. Default: all.
+        episodes: a number, a slice or several numbers, counted over all logs; they come in the
+            order of the logs. Default: all.
+        images: where image observations are kept: in `memory`; `mapped`, which leaves them on disk
+            and reads those that are asked for (in the log itself if it is not compressed, else in a
+            copy beside it that is made once); or `auto`: mapped if they would take more than half
+            of the memory that is free.
+        threads: that read chunks of a file at a time.
 
     Raises:
         LogError: a file is missing, no MCAP, damaged, or has no finished episode.
         SpaceError: the logs' spaces differ.
+        UsageError: there is no such column or episode.
     """
-    return Dataset.concatenate([read_log(path) for path in find_logs(data)])
+    if threads < 1:
+        raise UsageError(f"threads {threads}: give 1 or more")
+    chosen = None if columns is None else tuple(columns)
+    selection = Selection(columns=chosen, images=images, threads=threads)
+    logs = [LogReader(path, selection) for path in find_logs(data)]
+    if episodes is None:
+        return Dataset.concatenate([log.read() for log in logs])
+    return _read_episodes(logs, episodes)
+
+
+def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
+    counts = [len(log.lengths) for log in logs]
+    numbers = _numbers(episodes, sum(counts))
+    parts, first = [], 0
+    for log, count in zip(logs, counts, strict=True):
+        mine = numbers[(first <= numbers) & (numbers < first + count)]
+        if len(mine):
+            parts.append(log.read(mine - first))
+        first += count
+    return Dataset.concatenate(parts)
+
+
+def _numbers(episodes: Episodes, count: int) -> NDArray[np.int64]:
+    """The numbers that are meant, each once, in order.
+
+    Raises:
+        UsageError: one is not there, or none is meant.
+    """
+    if isinstance(episodes, slice):
+        asked = np.arange(count)[episodes]
+    else:
+        asked = np.atleast_1d(np.asarray(episodes, np.int64))
+    outside = asked[(asked < -count) | (asked >= count)]
+    if len(outside) or not len(asked):
+        what = f"no episode {outside[0]}" if len(outside) else "no episodes are asked for"
+        raise UsageError(f"{what}: the logs have {count}, counted from 0")
+    return np.unique(asked % count)
 
 
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
@@ -72,144 +110,3 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     if not found:
         raise LogError(f"{data}: no such file, folder or match")
     return found
-
-
-def read_log(path: Path) -> Dataset:
-    """Read one file. Raises as `open_logs` does."""
-    reader = McapReader(path)
-    steps = _steps_of(reader)
-    metadata = described(reader)
-    wanted = [*REQUIRED_FIELDS, *(name for name in ("behavior_prob",) if name in steps.fields)]
-    wanted += _vector_fields(metadata) if metadata else observation_fields(steps.fields)
-    _check_fields(path, steps, wanted)
-    order = step_order(steps)
-    columns = steps.read(wanted, order)
-    columns["log_time"] = steps.times if order is None else steps.times[order]
-    lengths = episode_lengths(columns, str(path))
-    if not len(lengths):
-        raise NoStepsError(f"{path} has no finished episode")
-    frames = int(lengths.sum()) + len(lengths)
-    if frames < len(steps) or not reader.complete:
-        warnings.warn(
-            f"{path} was cut off or is still being written: {len(lengths)} finished episodes are"
-            f" read, {len(steps) - frames} records behind them are not",
-            stacklevel=3,
-        )
-    columns = {name: column[:frames] for name, column in columns.items()}
-    metadata = metadata or inferred_metadata(reader, columns)
-    transitions = _transitions(reader, metadata, columns, lengths)
-    return Dataset(transitions, metadata, sources=(path,))
-
-
-def describe(reader: McapReader) -> LogMetadata:
-    """The metadata of a log.
-
-    Raises:
-        NoStepsError: the file has no steps.
-        LogError: its metadata is missing, of a later version, or damaged.
-    """
-    _steps_of(reader)
-    return described(reader) or LogMetadata.from_strings({})
-
-
-def described(reader: McapReader) -> LogMetadata | None:
-    """The metadata of a log; None if it has none, for it is not one of ours.
-
-    Raises:
-        LogError: it is of a later version, or damaged.
-    """
-    record = reader.metadata.get(METADATA_NAME)
-    copies = [
-        # The channel's copy stands in the summary, too, under its CRC.
-        channel.metadata
-        for channel in reader.channels_of(STEP_TOPIC)
-        if "format_version" in channel.metadata
-    ]
-    copies += [record] if record is not None else []
-    if not copies:
-        return None
-    if any(copy != copies[0] for copy in copies):
-        raise CorruptLogError(
-            f"{reader.path}: the metadata record and the metadata of {STEP_TOPIC} differ"
-        )
-    try:
-        return LogMetadata.from_strings(copies[0])
-    except (LogError, SpaceError) as error:
-        raise LogError(f"{reader.path}: {error}") from error
-
-
-def _steps_of(reader: McapReader) -> Topic:
-    channels = reader.channels_of(STEP_TOPIC)
-    if not channels:
-        topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
-        raise NoStepsError(
-            f"{reader.path} has no topic {STEP_TOPIC}, so no transitions (topics: {topics})"
-        )
-    for schema in map(reader.schema_of, channels):
-        if not is_intact(schema.name, schema.data):
-            raise CorruptLogError(f"{reader.path}: the schema of {STEP_TOPIC} is damaged")
-    return Topic(reader, STEP_TOPIC)
-
-
-def _vector_fields(metadata: LogMetadata) -> list[str]:
-    leaves = observation_leaves(metadata.observation_space)
-    return [leaf.name for leaf in leaves if leaf.encoding is None]
-
-
-def _check_fields(path: Path, steps: Topic, wanted: Sequence[str]) -> None:
-    if not len(steps):
-        raise NoStepsError(f"{path} has no finished episode")
-    missing = [name for name in wanted if name not in steps.fields]
-    if missing:
-        raise LogError(f"{path}: {STEP_TOPIC} has no field {', '.join(missing)}")
-    odd = [name for name in wanted if steps.fields[name].kind == "O"]
-    if odd:
-        raise LogError(f"{path}: {', '.join(odd)} of {STEP_TOPIC} is neither number nor array")
-
-
-def _transitions(
-    reader: McapReader, metadata: LogMetadata, columns: Columns, lengths: NDArray[np.int64]
-) -> Transitions:
-    actual = ~columns["final"].astype(bool)
-    times = columns["log_time"]
-    action = action_leaf(metadata.action_space)
-    unknown = np.full(len(times), np.nan, np.float32)
-    frames = tuple(
-        read_images(reader.path, Topic(reader, leaf.topic), leaf, times)
-        if leaf.encoding
-        else _as_leaf(reader.path, columns, leaf)
-        for leaf in observation_leaves(metadata.observation_space)
-    )
-    episodes = told_episodes(Topic(reader, EPISODE_TOPIC))
-    return Transitions(
-        frames=frames,
-        log_time_ns=times,
-        actions=_as_leaf(reader.path, columns, action)[actual],
-        rewards=columns["reward"][actual].astype(np.float64, copy=False),
-        terminated=columns["terminated"][actual].astype(bool),
-        truncated=columns["truncated"][actual].astype(bool),
-        behavior_probs=columns.get("behavior_prob", unknown)[actual].astype(np.float32, copy=False),
-        episodes=summaries(reader.path, columns, lengths, episodes),
-    )
-
-
-def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
-    """A field's column with the shape and dtype of its leaf.
-
-    Raises:
-        CorruptLogError: it does not fit the leaf without loss.
-    """
-    column = columns[leaf.name]
-    if column[0].size == leaf.size:
-        shaped = column.reshape(len(column), *leaf.shape)
-        if column.dtype == stored_dtype(leaf.dtype):
-            return shaped.astype(leaf.dtype, copy=False)
-        with np.errstate(all="ignore"):
-            cast = shaped.astype(leaf.dtype)
-        is_float = cast.dtype.kind == shaped.dtype.kind == "f"
-        if np.array_equal(cast, shaped, equal_nan=is_float):
-            return cast
-    raise CorruptLogError(
-        f"{path}: {STEP_TOPIC} does not fit the spaces in the metadata: {leaf.name} is"
-        f" {column.dtype} {column.shape[1:]}, its space {leaf.dtype} {leaf.shape}"
-    )

@@ -111,7 +111,7 @@ def _frame_columns(log: LogWriter, columns: Transitions) -> dict[str, NDArray[An
     leaves = observation_leaves(log.metadata.observation_space)
     for leaf, frames in zip(leaves, columns.frames, strict=True):
         if leaf.encoding is None:
-            fields[leaf.name] = _flat(frames)
+            fields[leaf.name] = _flat(np.asarray(frames))
     return fields
 
 

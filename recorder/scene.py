@@ -33,6 +33,10 @@ MARKER_TYPES = {
 }
 _ADD, _DELETE_ALL = 0, 3
 _FOREVER = (0, 0)
+# What is rounded to binary fractions that no viewer can show takes half the space in a log.
+_POINTS_PER_M = 2**8
+_POSITIONS_PER_M = 2**12
+_ROTATIONS_PER_ONE = 2**16
 
 
 class Shape(Protocol):
@@ -128,14 +132,14 @@ class DepthSource(Protocol):
         """(height, width) distance along the ray in metres; infinite where nothing is."""
 
 
-def marker_array(shapes: Iterable[Shape], time_ns: int) -> bytes:
+def marker_array(shapes: Iterable[Shape]) -> bytes:
     """Shapes as one `visualization_msgs/msg/MarkerArray`.
 
     It begins by deleting what the topic showed before, so that a viewer which jumps to this message
-    shows these shapes and no others.
+    shows these shapes and no others. The message's log_time is the markers' time: their stamps are
+    0, which means "where the frame is now", and does not differ from message to message.
     """
-    markers = [_marker(time_ns, action=_DELETE_ALL)]
-    markers += [_shape_marker(shape, time_ns) for shape in shapes]
+    markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
     return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))
 
 
@@ -148,8 +152,8 @@ def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
             child_frame_id=frame.name,
             transform=messages.new(
                 "geometry_msgs/msg/Transform",
-                translation=_vector(frame.position),
-                rotation=_quaternion(frame.rotation),
+                translation=_vector(_rounded(frame.position, _POSITIONS_PER_M)),
+                rotation=_quaternion(_rounded(frame.rotation, _ROTATIONS_PER_ONE)),
             ),
         )
         for frame in frames
@@ -163,10 +167,9 @@ def depth_millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.where(millimetres <= np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")
 
 
-def _shape_marker(shape: Shape, time_ns: int) -> Any:
+def _shape_marker(shape: Shape) -> Any:
     half = shape.yaw_rad / 2
     return _marker(
-        time_ns,
         frame=shape.frame,
         name=shape.name,
         kind=MARKER_TYPES[shape.kind],
@@ -180,7 +183,6 @@ def _shape_marker(shape: Shape, time_ns: int) -> Any:
 
 
 def _marker(
-    time_ns: int,
     *,
     action: int = _ADD,
     frame: str = "map",
@@ -190,7 +192,7 @@ def _marker(
     rotation: Quad = (0.0, 0.0, 0.0, 1.0),
     size: Vector = (0.0, 0.0, 0.0),
     color: Quad = (0.0, 0.0, 0.0, 0.0),
-    points: Iterable[Iterable[float]] = (),
+    points: NDArray[np.float64] | Sequence[Vector] = (),
     text: str = "",
 ) -> Any:
     sec, nanosec = _FOREVER
@@ -198,7 +200,7 @@ def _marker(
     new = messages.new
     return new(
         "visualization_msgs/msg/Marker",
-        header=messages.header(time_ns, frame),
+        header=messages.header(0, frame),
         ns=name,
         id=0,
         type=kind,
@@ -213,7 +215,7 @@ def _marker(
         lifetime=new("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
         # Moves with its frame between messages, as a body that is described once must.
         frame_locked=True,
-        points=[_point(point) for point in points],
+        points=[_point(point) for point in _rounded(points, _POINTS_PER_M)],
         colors=[],
         texture_resource="",
         texture=new(
@@ -230,6 +232,11 @@ def _marker(
     )
 
 
+def _rounded(numbers: Any, per_one: int) -> Any:
+    """Numbers or arrays of them, as lists, to the nearest 1/per_one."""
+    return (np.rint(np.multiply(numbers, per_one)) / per_one).tolist()
+
+
 def _point(xyz: Iterable[float]) -> Any:
     x, y, z = map(float, xyz)
     return messages.new("geometry_msgs/msg/Point", x=x, y=y, z=z)
@@ -240,6 +247,6 @@ def _vector(xyz: Iterable[float]) -> Any:
     return messages.new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def _quaternion(xyzw: Quad) -> Any:
+def _quaternion(xyzw: Iterable[float]) -> Any:
     x, y, z, w = xyzw
     return messages.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

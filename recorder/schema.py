@@ -99,7 +99,7 @@ def step_schema(
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
-    """Name and definition text of a message of float64 scalars, one per name.
+    """Name and definition text of a message of float32 scalars, one per name: they are to plot.
 
     Raises:
         SpaceError: a name is no ROS field name.
@@ -111,7 +111,7 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
                 f"telemetry '{name}' is no ROS field name: lower case letters, digits and single"
                 " underscores"
             )
-    return _named("Telemetry", [("float64", 0, name) for name in names])
+    return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:

@@ -10,15 +10,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import SpaceError
+from mcaprl.errors import SpaceError, UnknownNameError
 
 # The smallest edge that makes a uint8 array a picture rather than a vector; SB3 draws no line, its
 # Nature CNN needs 36.
@@ -62,7 +62,19 @@ class Leaf:
 
 
 def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the arrays of an observation space, in the space's own order.
+    """List the arrays of an observation space that is to be logged, in the space's own order.
+
+    Raises:
+        SpaceError: there are none, or a part of it is of a kind that a log cannot hold.
+    """
+    found = leaves_of(space)
+    if not found:
+        raise SpaceError("the observation is an empty Dict space; a log needs something to hold")
+    return found
+
+
+def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
+    """List the arrays of an observation space, in the space's own order; none of an empty Dict.
 
     Raises:
         SpaceError: a part of it is of a kind that a log cannot hold.
@@ -75,9 +87,40 @@ def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
         words = path or (("image",) if encoding else ())
         name = _field_name(words if encoding else ("observation", *words), taken)
         found.append(Leaf(name, path, shape, dtype, encoding))
-    if not found:
-        raise SpaceError("the observation is an empty Dict space; a log needs something to hold")
     return tuple(found)
+
+
+def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
+    """The leaves of a Dict space that keys mean: `joints/q`, or `joints` for all below it.
+
+    Args:
+        leaves: to choose from.
+        keys: default: all.
+
+    Raises:
+        UnknownNameError: a key means none.
+    """
+    if keys is None:
+        return list(leaves)
+    names = {leaf: "/".join(leaf.path) for leaf in leaves}
+    for key in keys:
+        if not any(_is_below(name, key) for name in names.values()):
+            raise UnknownNameError("column", key, filter(None, names.values()))
+    return [leaf for leaf, name in names.items() if any(_is_below(name, key) for key in keys)]
+
+
+def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
+    """A Dict space of just these leaves of a Dict space; empty of none."""
+    groups: dict[str, list[Leaf]] = {}
+    for leaf in leaves:
+        groups.setdefault(leaf.path[0], []).append(replace(leaf, path=leaf.path[1:]))
+    return spaces.Dict(
+        [
+            (key, restricted(space[key], inner) if inner[0].path else space[key])
+            for key, inner in groups.items()
+            if isinstance(space, spaces.Dict)
+        ]
+    )
 
 
 def action_leaf(space: spaces.Space[Any]) -> Leaf:
@@ -90,9 +133,9 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
     return Leaf("action", (), shape, dtype)
 
 
-def nest(leaves: tuple[Leaf, ...], arrays: list[NDArray[Any]]) -> Any:
+def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
     """Put the leaves' arrays back into the space's own form: one array, or nested dicts."""
-    if leaves[0].path == ():
+    if leaves and leaves[0].path == ():
         return arrays[0]
     nested: dict[str, Any] = {}
     for leaf, array in zip(leaves, arrays, strict=True):
@@ -122,6 +165,10 @@ def space_from_json(text: str) -> spaces.Space[Any]:
         return _from_plain(json.loads(text))
     except (ValueError, KeyError, TypeError, AssertionError) as error:
         raise SpaceError(f"no description of a space: {text[:80]!r}") from error
+
+
+def _is_below(name: str, key: str) -> bool:
+    return name == key or name.startswith(f"{key}/")
 
 
 def _walk(

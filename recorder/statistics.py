@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.recorder.mapped import Frames
 from mcaprl.recorder.spaces import Leaf
 from mcaprl.recorder.transitions import Transitions
 
@@ -86,10 +86,10 @@ def describe_columns(columns: Transitions, leaves: Sequence[Leaf]) -> Statistics
     )
 
 
-def _describe(leaf: Leaf, frames: NDArray[Any]) -> Column:
+def _describe(leaf: Leaf, frames: Frames) -> Column:
     if leaf.encoding is not None:
         return _describe_image(frames)
-    values = frames.reshape(len(frames), leaf.size).astype(np.float64)
+    values = np.asarray(frames).reshape(len(frames), leaf.size).astype(np.float64)
     finite = np.isfinite(values)
     kept = np.where(finite, values, 0.0)
     # 0 / 0 is NaN: of no finite value there is no mean.
@@ -107,7 +107,7 @@ def _describe(leaf: Leaf, frames: NDArray[Any]) -> Column:
     )
 
 
-def _describe_image(frames: NDArray[Any]) -> Column:
+def _describe_image(frames: Frames) -> Column:
     """From the histogram of the pixels, since copies of images as floats would not fit."""
     counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
     codes = np.arange(256.0)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.log_writer import EpisodeSummary
+from mcaprl.recorder.mapped import Frames, joined, rows_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,7 +33,7 @@ class Transitions:
         episodes: one for each, in order; their lengths say where they are.
     """
 
-    frames: tuple[NDArray[Any], ...]
+    frames: tuple[Frames, ...]
     log_time_ns: NDArray[np.int64]
     actions: NDArray[Any]
     rewards: NDArray[np.float64]
@@ -71,11 +72,11 @@ class Transitions:
 
     def take(self, chosen: Sequence[int]) -> Transitions:
         """Copy some episodes, in the order given."""
-        lengths, first_steps, first_frames = self.lengths, self.first_steps, self.first_frames
-        steps = _ranges([(first_steps[k], lengths[k]) for k in chosen])
-        frames = _ranges([(first_frames[k], lengths[k] + 1) for k in chosen])
+        rows = np.array(chosen, np.int64)
+        steps = spans(self.first_steps[rows], self.lengths[rows])
+        frames = spans(self.first_frames[rows], self.lengths[rows] + 1)
         return Transitions(
-            frames=tuple(leaf[frames] for leaf in self.frames),
+            frames=tuple(rows_of(leaf, frames) for leaf in self.frames),
             log_time_ns=self.log_time_ns[frames],
             actions=self.actions[steps],
             rewards=self.rewards[steps],
@@ -93,14 +94,13 @@ class Transitions:
         names = ("log_time_ns", "actions", "rewards", "terminated", "truncated", "behavior_probs")
         leaves = range(len(parts[0].frames))
         return cls(
-            frames=tuple(np.concatenate([part.frames[leaf] for part in parts]) for leaf in leaves),
+            frames=tuple(joined([part.frames[leaf] for part in parts]) for leaf in leaves),
             episodes=tuple(episode for part in parts for episode in part.episodes),
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
         )
 
 
-def _ranges(spans: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """The indexes of spans, each a start and a length."""
-    if not spans:
-        return np.empty(0, np.int64)
-    return np.concatenate([np.arange(start, start + length) for start, length in spans])
+def spans(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The indexes of spans, one behind the other."""
+    ends = np.cumsum(lengths)
+    return np.repeat(starts - (ends - lengths), lengths) + np.arange(int(lengths.sum()))

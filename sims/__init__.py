@@ -2,7 +2,7 @@
 
     >>> import mcaprl.sims
     >>> sorted(mcaprl.sims.SIMS)
-    ['lane', 'powerline', 'racer']
+    ['highway-lane', 'lane', 'powerline', 'racer']
 
 Importing this package loads no engine: numba and pygame wait until a sim is made or drawn.
 """
@@ -21,8 +21,13 @@ SIMS: Final[dict[str, str]] = {
     "lane": "mcaprl/LaneKeeping-v0",
     "racer": "mcaprl/Racer-v0",
     "powerline": "mcaprl/Powerline-v0",
+    "highway-lane": "mcaprl/HighwayLane-v0",
 }
 """Short name of each sim, and the id that Gymnasium knows it by."""
+ENGINES: Final[dict[str, str]] = dict.fromkeys(SIMS.values(), "numba") | {
+    SIMS["highway-lane"]: "highway_env"
+}
+"""What a sim needs of the extra `sims`, by the sim's id."""
 
 gym.register(
     id=SIMS["lane"],
@@ -43,13 +48,18 @@ gym.register(
     vector_entry_point="mcaprl.sims.powerline:BatchedPowerlineEnv",
     max_episode_steps=400,
 )
+gym.register(
+    id=SIMS["highway-lane"],
+    entry_point="mcaprl.sims.highway_lane:HighwayLaneEnv",
+    max_episode_steps=700,
+)
 
 
 def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
-        name: `lane`, `powerline`, `racer`, or an id such as `CartPole-v1` or `module:Name-v0`.
+        name: one of `SIMS`, or an id such as `CartPole-v1` or `module:Name-v0`.
         **kwargs: for the environment's constructor, such as `observation`, `rules`, `render_mode`.
 
     Raises:
@@ -66,8 +76,8 @@ def make_sims(
 ) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Make many environments that are stepped together, in this process.
 
-    The sims of this package advance all their vehicles in one array step; other environments are
-    stepped one after the other.
+    Our own sims advance all their vehicles in one array step; other environments are stepped one
+    after the other.
 
     Args:
         name: as of `make_sim`.
@@ -81,7 +91,7 @@ def make_sims(
     """
     env_id = SIMS.get(name, name)
     with _errors_of(name, kwargs):
-        if env_id in SIMS.values():
+        if env_id in SIMS.values() and gym.registry[env_id].vector_entry_point:
             return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
         mode = gym.vector.AutoresetMode(autoreset_mode)
         options = {"autoreset_mode": mode}
@@ -91,8 +101,9 @@ def make_sims(
 @contextlib.contextmanager
 def _errors_of(name: str, kwargs: dict[str, Any]) -> Iterator[None]:
     """Tell in a user's terms why a sim cannot be made."""
-    if SIMS.get(name, name) in SIMS.values():
-        import_extra("numba", "sims")
+    env_id = SIMS.get(name, name)
+    if env_id in ENGINES:
+        import_extra(ENGINES[env_id], "sims")
     try:
         yield
     except gym.error.UnregisteredEnv as error:

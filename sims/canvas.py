@@ -69,6 +69,13 @@ class Canvas:
         """Draw a rectangle (left, top, width, height); filled, unless it has an edge."""
         self.pygame.draw.rect(self._picture, color, box_px, edge_px)
 
+    def arrowhead(self, middle_px: tuple[int, int], toward: tuple[int, int], color: Rgb) -> None:
+        """Draw a triangle of 16 pixels that points right (1, 0), down (0, 1), and so on."""
+        (x, y), (dx, dy) = middle_px, toward
+        tip, left, right = (dx, dy), (dy - dx, -dx - dy), (-dy - dx, dx - dy)
+        corners = [(x + 8 * part[0], y + 8 * part[1]) for part in (tip, left, right)]
+        self.pygame.draw.polygon(self._picture, color, corners)
+
     def text(self, text: str, at_px: tuple[int, int], height_px: int, color: Rgb) -> None:
         """Write from (left, top) on."""
         if height_px not in self._fonts:

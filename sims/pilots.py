@@ -15,6 +15,7 @@ PILOTS: Final[dict[str, tuple[str, str]]] = {
     "mcaprl/LaneKeeping-v0": ("mcaprl.sims.lane_pilot", "LanePilot"),
     "mcaprl/Racer-v0": ("mcaprl.sims.racer_pilot", "RacerPilot"),
     "mcaprl/Powerline-v0": ("mcaprl.sims.powerline_pilot", "PowerlinePilot"),
+    "mcaprl/HighwayLane-v0": ("mcaprl.sims.highway_pilot", "HighwayPilot"),
 }
 """Module and class of each sim's pilot, by the sim's id."""
 

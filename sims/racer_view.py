@@ -21,6 +21,8 @@ PANEL_PX = (765, 18)
 KEY_PX = 32
 _KEYS = {"forward": (1, 0), "left": (0, 1), "back": (1, 1), "right": (2, 1)}
 """Column and row of each key."""
+_ARROWS = {"forward": (0, -1), "left": (-1, 0), "back": (0, 1), "right": (1, 0)}
+"""Where the arrow on each key points: right and down."""
 
 
 class RacerView:
@@ -86,3 +88,5 @@ class RacerView:
             if pressed[name]:
                 self._canvas.rectangle(box_px, PRESSED)
             self._canvas.rectangle(box_px, INK, edge_px=2)
+            middle_px = (box_px[0] + KEY_PX // 2, box_px[1] + KEY_PX // 2)
+            self._canvas.arrowhead(middle_px, _ARROWS[name], INK)

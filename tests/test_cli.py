@@ -172,7 +172,8 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
-    small += ["--target-interval", "5", "--dueling"]
+    # Enough copies of the target for the horizon of gamma, or it warns.
+    small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
     capsys.readouterr()
@@ -301,7 +302,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["record", "lane", "--steps", "5"], 2, "Missing option '--out'"),
         (["record", "lane", "--steps", "-1", "--out", "x"], 2, "--steps"),
         (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "2"], 2, "--epsilon"),
-        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "known: default"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "classic-code"),
         (["record", "lane", "--steps", "5", "--out", "x", "--observation", "sound"], 2, "depth, "),
         (["record", "lane", "--steps", "5", "--out", "taken/x.mcap"], 1, "cannot write taken/"),
         (["record", "lane", "--steps", "5", "--out", "taken"], 2, "taken exists"),

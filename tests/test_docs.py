@@ -43,6 +43,16 @@ def test_readme_code_runs(
     assert "Dataset(CartPole-v1: 10 episodes" in capsys.readouterr().out
 
 
+def test_code_about_the_sims_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("numba")
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sims.md").read_text(), re.DOTALL)
+    for block in blocks:
+        exec(compile(block.replace("episodes=100", "episodes=3"), "sims.md", "exec"), {})
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == "straight 0.5 (600, 600, 3)"
+    assert second == "{'finished': 3}"
+
+
 def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = [line for line in README.splitlines() if line.startswith("mcaprl ")]
@@ -50,14 +60,17 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for line in lines:
         arguments = shlex.split(line)[1:]
         if arguments[0] == "train-offline":
-            arguments += ["--updates", "30", "--hidden", "16,16", "--target-interval", "1"]
+            arguments += ["--updates", "30", "--hidden", "16,16"]
+            arguments += ["--gamma", "0.5", "--target-interval", "3"]
         for option, value in SMALLER.items():
             if option in arguments:
                 arguments[arguments.index(option) + 1] = value
         assert run(arguments) == 0, line
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "docs/architecture.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/sims.md"]
+)
 def test_links_and_files_exist(name: str) -> None:
     page = ROOT / name
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):

@@ -11,7 +11,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
 from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
 from mcaprl.online.sim_settings import SIM_SETTINGS, settings_for
-from mcaprl.online.train import default_config
+from mcaprl.online.task import Task
 from mcaprl.settings import field_help
 from mcaprl.sims import SIMS
 
@@ -103,6 +103,6 @@ def test_other_tasks_have_sb3s_settings(
 
 
 def test_what_the_user_gives_goes_first() -> None:
-    config = default_config("double-dqn", "racer", {}, {"n_steps": 5})
+    config = Task.for_sim("racer", n_steps=5).config
     assert isinstance(config, DoubleDQNConfig)
     assert (config.n_steps, config.gamma) == (5, 0.98)

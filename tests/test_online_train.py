@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
-from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
 from mcaprl.online.curve import read_curve
 from mcaprl.online.policy import load_policies
+from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sim
@@ -29,7 +28,12 @@ SHORT: dict[str, Any] = {
     "eval_episodes": 3,
     "final_episodes": 4,
 }
-SHORT_DQN = DoubleDQNConfig(**SHORT, learning_starts=64, target_update_interval=80)
+SHORT_DQN: dict[str, Any] = {**SHORT, "learning_starts": 64, "target_update_interval": 80}
+
+
+def lane(**settings: Any) -> Task:
+    """A short task in the lane sim."""
+    return Task.for_sim("lane", **{**SHORT_DQN, **settings})
 
 
 def silent(_: TrainingProgress) -> None:
@@ -38,7 +42,7 @@ def silent(_: TrainingProgress) -> None:
 
 def test_a_run_leaves_these_files(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    (summary,) = train("lane", "double-dqn", out, config=SHORT_DQN, seed=2, progress=silent)
+    (summary,) = train(lane(), out, seed=2, progress=silent)
     assert {path.name for path in out.iterdir()} == {
         "config.json",
         "scores.json",
@@ -46,14 +50,20 @@ def test_a_run_leaves_these_files(tmp_path: Path) -> None:
         "seed-2",
     }
     names = {path.name.split(".tfevents")[0] for path in (out / "seed-2").iterdir()}
-    assert names == {"best_model.zip", "curve.csv", "progress.csv", "events.out"}
+    assert names == {
+        "best_model.zip",
+        "checkpoint.safetensors",
+        "curve.csv",
+        "progress.csv",
+        "events.out",
+    }
     assert (summary.folder, summary.seed, summary.steps) == (out / "seed-2", 2, 600)
     config = json.loads((out / "config.json").read_text())
     assert (config["algo"], config["sim"], config["config"]["steps"]) == ("double-dqn", "lane", 600)
 
 
 def test_the_curve_has_a_row_for_each_evaluation(tmp_path: Path) -> None:
-    train("lane", "double-dqn", tmp_path / "run", config=SHORT_DQN, progress=silent)
+    train(lane(), tmp_path / "run", progress=silent)
     points = read_curve(tmp_path / "run" / "seed-0" / "curve.csv")
     assert [point.step for point in points] == [200, 400, 600]
     best = -np.inf
@@ -65,7 +75,7 @@ def test_the_curve_has_a_row_for_each_evaluation(tmp_path: Path) -> None:
 
 
 def test_scalars_have_sb3s_names(tmp_path: Path) -> None:
-    train("lane", "double-dqn", tmp_path / "run", config=SHORT_DQN, progress=silent)
+    train(lane(), tmp_path / "run", progress=silent)
     board = EventAccumulator(str(tmp_path / "run" / "seed-0"))
     board.Reload()
     assert set(board.Tags()["scalars"]) >= {
@@ -82,18 +92,18 @@ def test_scalars_have_sb3s_names(tmp_path: Path) -> None:
     assert [event.step for event in board.Scalars("eval/score")] == [200, 400, 600]
 
 
-@pytest.mark.parametrize("config", [SHORT_DQN, replace(SHORT_DQN, envs=1)], ids=["8 envs", "1 env"])
-def test_the_same_seed_gives_the_same_curve(tmp_path: Path, config: OnlineConfig) -> None:
+@pytest.mark.parametrize("envs", [1, 8])
+def test_the_same_seed_gives_the_same_curve(tmp_path: Path, envs: int) -> None:
     curves = []
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        train("lane", "double-dqn", tmp_path / name, config=config, seed=seed, progress=silent)
+        train(lane(envs=envs), tmp_path / name, seed=seed, progress=silent)
         curves.append((tmp_path / name / f"seed-{seed}" / "curve.csv").read_text())
     assert curves[0] == curves[1] != curves[2]
 
 
 def test_several_seeds_are_each_as_if_alone(tmp_path: Path) -> None:
-    train("lane", "double-dqn", tmp_path / "all", config=SHORT_DQN, seeds=2, progress=silent)
-    train("lane", "double-dqn", tmp_path / "one", config=SHORT_DQN, seed=1, progress=silent)
+    train(lane(), tmp_path / "all", seeds=2, progress=silent)
+    train(lane(), tmp_path / "one", seed=1, progress=silent)
     curves = [tmp_path / name / "seed-1" / "curve.csv" for name in ("all", "one")]
     assert curves[0].read_text() == curves[1].read_text()
     scores = json.loads((tmp_path / "all" / "scores.json").read_text())
@@ -104,7 +114,7 @@ def test_the_last_score_is_what_evaluate_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    (summary,) = train("lane", "double-dqn", out, config=SHORT_DQN, progress=silent)
+    (summary,) = train(lane(), out, progress=silent)
     assert run(["evaluate", str(out), "--sim", "lane", "--episodes", "4", "--json"]) == 0
     (mine, *_) = json.loads(capsys.readouterr().out)["policies"]
     assert mine["mean_return"] == summary.mean_return
@@ -112,7 +122,7 @@ def test_the_last_score_is_what_evaluate_says(
 
 
 def test_the_kept_model_is_the_best_and_plain_sb3s(tmp_path: Path) -> None:
-    (summary,) = train("lane", "double-dqn", tmp_path / "run", config=SHORT_DQN, progress=silent)
+    (summary,) = train(lane(), tmp_path / "run", progress=silent)
     model = DQN.load(summary.folder / "best_model.zip")
     assert model.num_timesteps == summary.best_step
     (policy,) = load_policies(tmp_path / "run")
@@ -123,15 +133,13 @@ def test_the_kept_model_is_the_best_and_plain_sb3s(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("algo", "config"),
-    [
-        ("dqn", DQNConfig(**SHORT)),
-        ("ppo", PPOConfig(**SHORT, rollout_steps=192)),
-        ("a2c", A2CConfig(**SHORT)),
-    ],
+    ("algo", "settings"), [("dqn", {}), ("ppo", {"rollout_steps": 192}), ("a2c", {})]
 )
-def test_other_algorithms_and_environments(tmp_path: Path, algo: str, config: OnlineConfig) -> None:
-    (summary,) = train("CartPole-v1", algo, tmp_path / "run", config=config, progress=silent)
+def test_other_algorithms_and_environments(
+    tmp_path: Path, algo: str, settings: dict[str, Any]
+) -> None:
+    task = Task.for_sim("CartPole-v1", algo, **SHORT, **settings)
+    (summary,) = train(task, tmp_path / "run", progress=silent)
     assert np.isnan(summary.score)
     assert 8 <= summary.mean_return <= 500
     scores = json.loads((tmp_path / "run" / "scores.json").read_text())
@@ -145,17 +153,17 @@ def test_pictures_are_learnt_from(tmp_path: Path) -> None:
         "eval_episodes": 1,
         "final_episodes": 1,
     }
-    config = replace(SHORT_DQN, learning_starts=64, batch_size=4, **sizes)
     options: dict[str, Any] = {"observation": "depth"}
-    (summary,) = train(
-        "lane", "double-dqn", tmp_path / "run", config=config, sim_options=options, progress=silent
-    )
+    task = Task.for_sim("lane", "dqn", options, **{**SHORT_DQN, **sizes, "batch_size": 4})
+    (summary,) = train(task, tmp_path / "run", progress=silent)
     (policy,) = load_policies(summary.folder)
     assert policy.observation_space == make_sim("lane", **options).observation_space
 
 
 def test_an_agent_learns_to_stay_upright(tmp_path: Path) -> None:
-    config = PPOConfig(
+    task = Task.for_sim(
+        "CartPole-v1",
+        "ppo",
         steps=8_000,
         rollout_steps=256,
         batch_size=256,
@@ -167,7 +175,7 @@ def test_an_agent_learns_to_stay_upright(tmp_path: Path) -> None:
         eval_episodes=5,
         final_episodes=5,
     )
-    (summary,) = train("CartPole-v1", "ppo", tmp_path / "run", config=config, progress=silent)
+    (summary,) = train(task, tmp_path / "run", progress=silent)
     assert summary.mean_return > 100
 
 
@@ -175,24 +183,24 @@ def test_a_taken_folder_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "note").write_text("mine")
     with pytest.raises(OutputExistsError, match="choose another folder"):
-        train("lane", "double-dqn", tmp_path / "run", config=SHORT_DQN, progress=silent)
+        train(lane(), tmp_path / "run", progress=silent)
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["note"]
 
 
 def test_mistakes_leave_no_folder(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(UnknownNameError, match="unknown sim"):
-        train("lame", "double-dqn", out, config=SHORT_DQN)
+        train(Task.for_sim("lame"), out)
     with pytest.raises(UnknownNameError, match="unknown algorithm"):
-        train("lane", "double-dqm", out)
+        Task.for_sim("lane", "double-dqm")
     with pytest.raises(SpaceError, match="dqn needs discrete actions"):
-        train("Pendulum-v1", "dqn", out, config=DQNConfig(**SHORT))
+        train(Task.for_sim("Pendulum-v1", "dqn", **SHORT), out)
     with pytest.raises(UsageError, match="seeds must be at least 1"):
-        train("lane", "double-dqn", out, config=SHORT_DQN, seeds=0)
+        train(lane(), out, seeds=0)
     assert not out.exists()
     out.touch()
     with pytest.raises(TrainingError, match="cannot write"):
-        train("lane", "double-dqn", out / "below", config=SHORT_DQN, progress=silent)
+        train(lane(), out / "below", progress=silent)
 
 
 def test_the_command_trains_and_prints_a_row_for_each_seed(

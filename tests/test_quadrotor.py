@@ -23,6 +23,7 @@ from mcaprl.sims.quadrotor import (
     VELOCITY_GAIN_PER_S,
     Drone,
     Rotors,
+    advance,
     angular_momentum,
     cruising,
     drone_at,
@@ -32,7 +33,7 @@ from mcaprl.sims.quadrotor import (
     store,
     wanted_acceleration,
 )
-from mcaprl.sims.vectors import Vector, dot, norm, rotate
+from mcaprl.sims.vectors import Vector, dot, minus, norm, plus, rotate, times
 
 ZERO = Vector(0.0, 0.0, 0.0)
 NO_THRUST = Rotors(0.0, 0.0, 0.0, 0.0)
@@ -151,6 +152,33 @@ def test_a_free_spin_keeps_its_momentum_and_energy() -> None:
     rates = drone.rates_rad_s
     assert dot(rates, angular_momentum(rates)) == pytest.approx(energy, rel=0.01)
     assert np.linalg.norm(drone.attitude) == pytest.approx(1.0, abs=1e-12)
+
+
+def energy_j(drone: Drone) -> float:
+    """Give kinetic energy, of flying and turning, and that of height."""
+    rates = drone.rates_rad_s
+    moving = 0.5 * MASS_KG * dot(drone.velocity_m_s, drone.velocity_m_s)
+    turning = 0.5 * dot(rates, angular_momentum(rates))
+    return moving + turning - MASS_KG * GRAVITY_M_S2 * drone.position_m.z
+
+
+def test_energy_is_the_work_of_rotors_and_drag() -> None:
+    """Climbing sideways in wind, to 1 % of the work that the rotors do."""
+    wind, command = Vector(3.0, -2.0, 0.0), Vector(2.0, 3.0, -2.0)
+    drone = resting()
+    before_j, lift_j, drag_j, turn_j = energy_j(drone), 0.0, 0.0, 0.0
+    for _ in range(1500):
+        after = advance(drone, command, wind)
+        mean = times(0.5, plus(drone.velocity_m_s, after.velocity_m_s))
+        lift_n = rotate(after.attitude, Vector(0.0, 0.0, -sum(after.thrusts_n)))
+        drag_n = times(MASS_KG * DRAG_PER_S, minus(wind, mean))
+        lift_j += TIME_STEP_S * dot(lift_n, mean)
+        drag_j += TIME_STEP_S * dot(drag_n, mean)
+        spun = minus(angular_momentum(after.rates_rad_s), angular_momentum(drone.rates_rad_s))
+        turn_j += dot(spun, times(0.5, plus(drone.rates_rad_s, after.rates_rad_s)))
+        drone = after
+    assert lift_j > 50.0
+    assert energy_j(drone) - before_j == pytest.approx(lift_j + drag_j + turn_j, abs=0.01 * lift_j)
 
 
 @pytest.mark.parametrize(

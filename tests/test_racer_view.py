@@ -66,9 +66,11 @@ def test_the_picture_is_the_rules_own() -> None:
 def test_the_keys_light_up(action: int, pressed: list[tuple[int, int]]) -> None:
     picture = picture_after([1, action])
     for key in ((1, 0), (0, 1), (1, 1), (2, 1)):
-        column = PANEL_PX[0] + 115 + key[0] * (KEY_PX + 5) + KEY_PX // 2
-        row = PANEL_PX[1] + key[1] * (KEY_PX + 5) + KEY_PX // 2
+        column = PANEL_PX[0] + 115 + key[0] * (KEY_PX + 5) + 4
+        row = PANEL_PX[1] + key[1] * (KEY_PX + 5) + 4
         assert (tuple(picture[row, column]) == PRESSED) == (key in pressed)
+        middle = picture[row + KEY_PX // 2 - 4, column + KEY_PX // 2 - 4]
+        assert tuple(middle) == INK, "an arrow on each key"
 
 
 def test_score_speed_and_step_are_written() -> None:

@@ -212,7 +212,7 @@ def test_marker_of_each_kind_has_its_place() -> None:
         Shape(name=kind, kind=kind, color=(1, 0, 0, 1), points=np.eye(3), yaw_rad=np.pi / 2)
         for kind in get_args(Kind)
     ]
-    array = messages.decode(marker_array(shapes, 5), "visualization_msgs/msg/MarkerArray")
+    array = messages.decode(marker_array(shapes), "visualization_msgs/msg/MarkerArray")
     for shape, marker in zip(shapes, array.markers[1:], strict=True):
         assert marker.type == MARKER_TYPES[shape.kind]
         assert np.isclose(marker.pose.orientation.z, np.sin(np.pi / 4))

@@ -33,8 +33,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("powerline", {"observation": "depth", "camera": "front"}),
     ("powerline", {"plant": "point", "wind_m_s": 4.0, "gust_m_s": 1.0}),
     ("powerline", {"rules": "classic"}),
+    ("highway-lane", {}),
+    ("highway-lane", {"road": "racetrack-v0"}),
 ]
-ON_THE_GROUND = ("lane", "racer")
+ON_THE_GROUND = ("lane", "racer", "highway-lane")
 LONGEST = 3_000
 every_sim = pytest.mark.parametrize(
     ("name", "kwargs"), CASES, ids=[f"{name}-{'-'.join(kwargs)}" for name, kwargs in CASES]
@@ -175,8 +177,8 @@ def test_the_time_limit_truncates_without_a_reason_of_its_own(
 ) -> None:
     env = make_sim(name, max_episode_steps=2, **kwargs)
     env.reset(seed=0)
-    env.step(1)
-    _, _, terminated, truncated, info = env.step(1)
+    env.step(0)
+    _, _, terminated, truncated, info = env.step(0)
     assert (terminated, truncated) == (False, True)
     assert "reason" not in info
 

@@ -1,0 +1,171 @@
+"""Checkpoints: a killed run goes on from one.
+
+`checkpoint.safetensors` holds weights, target network, optimiser, replay buffer and generators, and
+in its header the counters, the curve so far and the task. They are one file because two could be
+torn apart by a kill between them. The environments begin new episodes: Gymnasium has no way to ask
+one for its state.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from torch import Tensor
+
+from mcaprl.errors import TrainingError
+from mcaprl.online.task import Task
+from mcaprl.tensor_files import read_tensors, write_tensors
+
+# NumPy's stubs do not know of the generator that is shared by all, which SB3 draws from.
+_NUMPY_RANDOM: Any = np.random
+CHECKPOINT_NAME = "checkpoint.safetensors"
+_COUNTERS = (
+    "num_timesteps",
+    "_n_updates",
+    "_episode_num",
+    "_n_calls",
+    "_current_progress_remaining",
+    "exploration_rate",
+)
+
+
+def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[str, Any]) -> None:
+    """Replace a checkpoint by the model's present state.
+
+    Args:
+        path: of the file.
+        model: between two rollouts.
+        task: that it works at.
+        extra: JSON, to be found again.
+    """
+    generators, states = _generators(model)
+    tensors = {
+        **{f"policy.{name}": value for name, value in model.policy.state_dict().items()},
+        **_optimizer_tensors(model.policy.optimizer),
+        **{f"generator.{name}": value for name, value in generators.items()},
+        **{f"buffer.{name}": value for name, value in _buffer_tensors(model).items()},
+    }
+    counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
+    description = {**task.to_json(), "counters": counters, "generators": states, "extra": extra}
+    write_tensors(path, tensors, description)
+
+
+def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, Any]:
+    """Bring a fresh model to the state of a checkpoint.
+
+    Returns:
+        What `save_checkpoint` was given as `extra`.
+
+    Raises:
+        TrainingError: it is of another task, or broken.
+    """
+    try:
+        tensors, description = read_tensors(path)
+        task.check_same(description, path)
+        model.policy.load_state_dict(_below(tensors, "policy"))
+        _load_optimizer(model.policy.optimizer, _below(tensors, "optimizer"))
+        _load_buffer(model, _below(tensors, "buffer"))
+        for name, value in description["counters"].items():
+            setattr(model, name, value)
+        _load_generators(model, _below(tensors, "generator"), description["generators"])
+        return cast(dict[str, Any], description["extra"])
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise TrainingError(
+            f"cannot resume: {path} is broken ({error}); delete it to start this seed anew"
+        ) from error
+
+
+def _optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    return {
+        f"optimizer.{index}.{name}": value
+        for index, moments in optimizer.state_dict()["state"].items()
+        for name, value in moments.items()
+    }
+
+
+def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    moments: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".")
+        moments.setdefault(int(index), {})[name] = value
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": moments, "param_groups": groups})
+
+
+def _buffer_arrays(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
+    """Its columns by name; those of dict observations one by one."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, value in vars(buffer).items():
+        if isinstance(value, np.ndarray):
+            arrays[name] = value
+        elif isinstance(value, dict):
+            parts = {f"{name}.{key}": part for key, part in value.items()}
+            arrays |= {key: part for key, part in parts.items() if isinstance(part, np.ndarray)}
+    return arrays
+
+
+def _buffer_tensors(model: BaseAlgorithm) -> dict[str, Tensor]:
+    """The filled rows of the replay buffer; nothing where the algorithm has none."""
+    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    if buffer is None:
+        return {}
+    rows = buffer.size()
+    place = torch.tensor([buffer.pos, int(buffer.full)])
+    columns = _buffer_arrays(buffer)
+    return {"place": place, **{k: torch.from_numpy(v[:rows]) for k, v in columns.items()}}
+
+
+def _load_buffer(model: BaseAlgorithm, tensors: dict[str, Tensor]) -> None:
+    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    if buffer is None:
+        return
+    place = tensors.pop("place").tolist()
+    buffer.pos, buffer.full = place[0], bool(place[1])
+    for name, column in _buffer_arrays(buffer).items():
+        column[: buffer.size()] = tensors[name].numpy()
+
+
+def _generators(model: BaseAlgorithm) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The generators' states: tensors, and what is plain JSON."""
+    state = _NUMPY_RANDOM.get_bit_generator().state
+    version, words, next_gauss = random.getstate()
+    tensors = {
+        "torch": torch.get_rng_state(),
+        "numpy": torch.from_numpy(state["state"]["key"].astype(np.int64)),
+        "python": torch.tensor(words, dtype=torch.int64),
+    }
+    plain = {
+        "numpy": state["state"]["pos"],
+        "python": [version, next_gauss],
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+    return tensors, plain
+
+
+def _load_generators(
+    model: BaseAlgorithm, tensors: Mapping[str, Tensor], plain: Mapping[str, Any]
+) -> None:
+    torch.set_rng_state(tensors["torch"])
+    key = tensors["numpy"].numpy().astype(np.uint32)
+    _NUMPY_RANDOM.get_bit_generator().state = {
+        "bit_generator": "MT19937",
+        "state": {"key": key, "pos": plain["numpy"]},
+    }
+    version, next_gauss = plain["python"]
+    random.setstate((version, tuple(tensors["python"].tolist()), next_gauss))
+    model.action_space.np_random.bit_generator.state = plain["actions"]
+
+
+def _below(tensors: Mapping[str, Tensor], name: str) -> dict[str, Tensor]:
+    prefix = f"{name}."
+    return {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}

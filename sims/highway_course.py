@@ -1,0 +1,123 @@
+"""Where one can drive on a road of highway-env: its lanes, strung together, in ROS axes.
+
+highway-env's y points down on its pictures. Here y and all angles change sign, so that z is up,
+angles grow counter-clockwise, and left is positive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SAMPLE_M = 1.0
+FLIP = np.array([1.0, -1.0])
+"""Turns (x, y) of highway-env into that of ROS, and back."""
+
+
+class Place(NamedTuple):
+    """The point of a course nearest to a position."""
+
+    along_m: float
+    offset_m: float
+    """Distance from it, positive to the left of the course's direction."""
+    yaw_rad: float
+    """Direction of the course there."""
+
+
+class Course(NamedTuple):
+    """The middle of a lane from one end of the road to the other, or around it."""
+
+    points_m: Floats
+    """(N + 1, 2), about 1 m apart; of a closed one, the last is the first again."""
+    along_m: Floats
+    """(N + 1,) distance of each point from the first."""
+    lengths_m: Floats
+    """(N,) of the legs from each point to the next."""
+    directions: Floats
+    """(2, N) of the legs: cosines, sines."""
+    half_width_m: float
+    is_closed: bool
+
+    @property
+    def length_m(self) -> float:
+        """From the first point to the last."""
+        return float(self.along_m[-1])
+
+    def nearest(self, x_m: float, y_m: float) -> Place:
+        """Find the point nearest to a position."""
+        dx_m, dy_m = x_m - self.points_m[:-1, 0], y_m - self.points_m[:-1, 1]
+        cos, sin = self.directions
+        along_m = np.clip(dx_m * cos + dy_m * sin, 0.0, self.lengths_m)
+        squares = (dx_m - along_m * cos) ** 2 + (dy_m - along_m * sin) ** 2
+        leg = int(np.argmin(squares))
+        side = 1.0 if cos[leg] * dy_m[leg] >= sin[leg] * dx_m[leg] else -1.0
+        return Place(
+            along_m=float(self.along_m[leg] + along_m[leg]),
+            offset_m=side * math.sqrt(squares[leg]),
+            yaw_rad=math.atan2(sin[leg], cos[leg]),
+        )
+
+    def point(self, along_m: float) -> tuple[float, float]:
+        """Give the point (x, y) at a distance along the course; beyond an open end, straight on."""
+        x_m, y_m = self.points_m.T
+        if self.is_closed:
+            along_m %= self.length_m
+        beyond_m = max(0.0, along_m - self.length_m)
+        cos, sin = self.directions[:, -1].tolist()
+        return (
+            float(np.interp(along_m, self.along_m, x_m)) + beyond_m * cos,
+            float(np.interp(along_m, self.along_m, y_m)) + beyond_m * sin,
+        )
+
+
+def courses_of(network: Any) -> tuple[Course, ...]:
+    """String the lanes of a road together: a course for each of the lanes side by side.
+
+    Args:
+        network: a `highway_env.road.road.RoadNetwork` without forks.
+    """
+    edges = list(_edges(network.graph))
+    return tuple(
+        _course([lanes[number] for _, _, lanes in edges], edges[0][0] == edges[-1][1])
+        for number in range(len(edges[0][2]))
+    )
+
+
+def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
+    """Walk from the node that nothing leads to, or around from the first one: node, node, lanes."""
+    reached = {end for ends in graph.values() for end in ends}
+    first = next((node for node in graph if node not in reached), next(iter(graph)))
+    node, is_new = first, True
+    while node in graph and (is_new or node != first):
+        end, lanes = next(iter(graph[node].items()))
+        yield node, end, lanes
+        node, is_new = end, False
+
+
+def _course(lanes: list[Any], is_closed: bool) -> Course:
+    points: list[Floats] = []
+    for lane in lanes:
+        # A lane may begin beside an earlier one's end, and is entered there.
+        first_m = lane.local_coordinates(points[-1] * FLIP)[0] if points else 0.0
+        count = int(np.ceil((lane.length - first_m) / SAMPLE_M))
+        sampled = np.linspace(max(0.0, first_m), lane.length, count + 1)
+        points += [lane.position(along_m, 0.0) * FLIP for along_m in sampled[bool(points) :]]
+    if is_closed:
+        # The last lane's end may lie beyond the first one's start.
+        while lanes[0].local_coordinates(points[-1] * FLIP)[0] > -SAMPLE_M / 2:
+            points.pop()
+        points.append(points[0])
+    corners = np.array(points)
+    legs = np.diff(corners, axis=0)
+    lengths_m = np.hypot(legs[:, 0], legs[:, 1])
+    along_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
+    half_width_m = lanes[0].width / 2
+    return Course(
+        corners, along_m, lengths_m, (legs / lengths_m[:, None]).T, half_width_m, is_closed
+    )
