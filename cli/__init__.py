@@ -17,6 +17,7 @@ import click
 from mcaprl._version import __version__
 from mcaprl.cli.annotate import annotate
 from mcaprl.cli.evaluate import evaluate
+from mcaprl.cli.export import export
 from mcaprl.cli.logs import check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
@@ -37,6 +38,7 @@ _COMMANDS = (
     train_offline,
     evaluate,
     annotate,
+    export,
     replay,
     info,
     check,
