@@ -172,6 +172,8 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
+    # Enough copies of the target for the horizon of gamma, or it warns.
+    small += ["--gamma", "0.5", "--target-interval", "6"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
     capsys.readouterr()

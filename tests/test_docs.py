@@ -63,6 +63,7 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         arguments = shlex.split(line)[1:]
         if arguments[0] == "train-offline":
             arguments += ["--updates", "30", "--hidden", "16,16"]
+            arguments += ["--gamma", "0.5", "--target-interval", "3"]
         for option, value in SMALLER.items():
             if option in arguments:
                 arguments[arguments.index(option) + 1] = value

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.bc import BCConfig
+from mcaprl.offline.bcq import BCQConfig
 from mcaprl.offline.cql import CQLConfig
 from mcaprl.offline.dqn import DoubleDQNConfig, DQNConfig
+from mcaprl.offline.iql import IQLConfig
 from mcaprl.offline.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset import Dataset
@@ -33,7 +36,18 @@ SHORT: dict[str, Any] = {
     "log_interval": 10,
     "checkpoint_interval": 40,
 }
-SHORT_CQL = CQLConfig(**SHORT, target_interval=30)
+SHORT_CQL = CQLConfig(**SHORT, target_interval=30, gamma=0.5)
+
+
+LATE = {**SHORT, "gamma": 0.5, "target_interval": 30}
+RESUMABLE = [
+    SHORT_CQL,
+    replace(SHORT_CQL, n_steps=2, frame_stack=2, normalize=True, n_quantiles=3, weight_decay=0.1),
+    DQNConfig(**LATE, dueling=True, layer_norm=True),
+    BCQConfig(**LATE),
+    IQLConfig(**LATE),
+    BCConfig(**SHORT),
+]
 
 
 class Stopped(Exception):
@@ -115,7 +129,8 @@ def test_progress_is_told_each_log_interval(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "config", [DQNConfig(**SHORT), DoubleDQNConfig(**SHORT), BCConfig(**SHORT)]
+    "config",
+    [DQNConfig(**SHORT, gamma=0.5), DoubleDQNConfig(**SHORT, gamma=0.5), BCConfig(**SHORT)],
 )
 def test_the_same_seed_gives_the_same_curve_and_weights(tmp_path: Path, config: Any) -> None:
     for name in ("a", "b"):
@@ -139,8 +154,10 @@ def test_each_seed_gets_a_folder_and_does_not_depend_on_the_others(tmp_path: Pat
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
 
 
-@pytest.mark.parametrize("stop", [20, 40, 70, 100])
-@pytest.mark.parametrize("config", [SHORT_CQL, BCConfig(**SHORT)], ids=["cql", "bc"])
+@pytest.mark.parametrize(
+    ("config", "stop"),
+    [*((SHORT_CQL, stop) for stop in (20, 40, 100)), *((config, 70) for config in RESUMABLE)],
+)
 def test_a_stopped_run_resumes_bit_for_bit(tmp_path: Path, stop: int, config: Any) -> None:
     train(corridor(), config, tmp_path / "whole", progress=silent)
     with pytest.raises(Stopped):
@@ -217,8 +234,8 @@ def test_a_run_resumes_only_with_its_own_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("other", "says"),
     [
-        (CQLConfig(**SHORT, target_interval=30, alpha=2.0), "has alpha 1.0, not 2.0"),
-        (CQLConfig(**{**SHORT, "updates": 200}, target_interval=30), "has updates 100, not 200"),
+        (replace(SHORT_CQL, alpha=2.0), "has alpha 1.0, not 2.0"),
+        (replace(SHORT_CQL, updates=200), "has updates 100, not 200"),
         (BCConfig(**SHORT), "has algo 'cql', not 'bc'"),
     ],
 )
@@ -271,10 +288,15 @@ def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path:
     # One step of 1e15 in each of four layers, and the next output is beyond float32.
     wild = {"learning_rate": 1e15, "hidden": (16, 16, 16), "checkpoint_interval": 1}
     with pytest.raises(TrainingError) as caught:
-        train(corridor(), DQNConfig(**{**SHORT, **wild}), tmp_path / "run", progress=silent)
+        train(
+            corridor(),
+            DQNConfig(**{**SHORT, **wild}, gamma=0.5, target_interval=10),
+            tmp_path / "run",
+            progress=silent,
+        )
     message = str(caught.value)
     folder = tmp_path / "run" / "seed-0"
-    assert message.startswith(f"update 2 of {folder}: mean_q is ")
+    assert message.startswith(f"update 2 of {tmp_path / 'run'}: mean_q of seed 0 is ")
     assert f"Last good checkpoint: {folder / 'checkpoint.safetensors'}" in message
     assert "\n" not in message
     weights = load_file(folder / "policy.safetensors")
@@ -291,7 +313,7 @@ def test_a_loss_that_is_not_finite_at_once_has_no_checkpoint(tmp_path: Path) -> 
         next_observations=np.zeros((4, 1), np.float32),
     )
     with pytest.raises(TrainingError, match=r"update 1 of .*checkpoint: none yet"):
-        train(huge, DQNConfig(**SHORT), tmp_path / "run", progress=silent)
+        train(huge, DQNConfig(**SHORT, gamma=0.5), tmp_path / "run", progress=silent)
 
 
 def test_a_refused_request_leaves_no_folder(tmp_path: Path) -> None:
