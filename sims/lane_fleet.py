@@ -65,7 +65,6 @@ class LaneFleet(Fleet):
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
         check_name("start", start, (None, *STARTS))
-        self.observation_kind = observation
         self._classic, self._by_code = rules != "default", rules == "classic-code"
         self._on_line = start == "line" or (self._classic and start is None)
         super().__init__(
@@ -79,7 +78,10 @@ class LaneFleet(Fleet):
         self._started_at_m = np.zeros(count)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
-        self._seen = self._rays if observation == "rays" else self._states
+        self._has_pictures, self._has_rays = observation == "depth", observation == "rays"
+        self._seen = self._rays if self._has_rays else self._states
+        # Views of each row, made once: a single environment reads one of each in every step.
+        self._car_rows, self._seen_rows = list(self._cars), list(self._seen)
         self._encode = encode_nearness if self._classic else encode_depth
         self._camera: DepthCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
@@ -99,7 +101,7 @@ class LaneFleet(Fleet):
             start_car(random.random(4), self._on_line, self._classic, row, state)
         self._started_at_m[i] = row[ALONG]
         self.rewards[i], self.ends[i] = 0.0, GOING_ON
-        if self._seen is self._rays:
+        if self._has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
         self._depth_m.pop(i, None)
 
@@ -109,20 +111,19 @@ class LaneFleet(Fleet):
             step_classic(self._cars, actions, self.rewards, self.ends, self._states, self._by_code)
         else:
             step_cars(self._cars, actions, self.rewards, self.ends, self._states)
-        if self._seen is self._rays:
+        if self._has_rays:
             observe_all_rays(self._cars, self._rays)
         self._depth_m.clear()
 
     def observation(self, i: int) -> NDArray[Any]:
         """Give the numbers or the picture that car i sees."""
-        if self.observation_kind == "depth":
+        if self._has_pictures:
             return self._encode(self.depth_image_m(i))[:, :, np.newaxis]
-        seen: NDArray[np.float32] = self._seen[i].copy()
-        return seen
+        return self._seen_rows[i].copy()
 
     def observations(self) -> NDArray[Any]:
         """Give what all cars see."""
-        if self.observation_kind == "depth":
+        if self._has_pictures:
             return np.stack([self.observation(i) for i in range(self.count)])
         return self._seen.copy()
 
@@ -140,7 +141,7 @@ class LaneFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
-        return _described(self._cars[i].tolist(), self._started_at_m.item(i))
+        return _described(self._car_rows[i].tolist(), self._started_at_m.item(i))
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Give the `info` of all cars."""

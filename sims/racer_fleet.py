@@ -73,6 +73,8 @@ class RacerFleet(Fleet):
         self._cars = np.zeros((count, len(Racer._fields)))
         self._started_at_m = np.zeros(count)
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
+        # Views of each row, made once: a single environment reads one of each in every step.
+        self._car_rows, self._seen_rows = list(self._cars), list(self._seen)
 
     def car(self, i: int) -> Racer:
         """Give the whole state of a car."""
@@ -109,8 +111,7 @@ class RacerFleet(Fleet):
 
     def observation(self, i: int) -> NDArray[np.float32]:
         """Give the numbers that car i sees."""
-        seen: NDArray[np.float32] = self._seen[i].copy()
-        return seen
+        return self._seen_rows[i].copy()
 
     def observations(self) -> NDArray[np.float32]:
         """Give what all cars see."""
@@ -118,7 +119,7 @@ class RacerFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
-        described = _described(self._cars[i].tolist(), self._started_at_m.item(i))
+        described = _described(self._car_rows[i].tolist(), self._started_at_m.item(i))
         described["gates_passed"] = int(described["gates_passed"])
         return described
 

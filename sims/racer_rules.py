@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import project, wrap_angle
-from mcaprl.sims.racer_car import Racer, corner_at, racer_at, store_racer
+from mcaprl.sims.racer_car import (
+    CAR_LENGTH_PX,
+    CAR_WIDTH_PX,
+    Racer,
+    corner_at,
+    racer_at,
+    store_racer,
+)
 from mcaprl.sims.racer_rays import (
     RAY_NAMES,
     RAYS,
@@ -50,6 +57,8 @@ DRIFT_RAD = math.radians(10.0)
 BEHIND_M, AHEAD_M = 4.0, 8.0
 """How far behind and ahead of the last nearest path point the next one is looked for."""
 
+CORNER_PX_2 = 0.25 * (CAR_LENGTH_PX**2 + CAR_WIDTH_PX**2)
+"""Square of a corner's distance from the car's centre."""
 LOOK_PX, NEAR_GATE_PX = 50.0, 20.0
 """Classic: a gate is passed when the car looks at it, so far at most, from nearer than this."""
 MAX_IDLE_STEPS = 100
@@ -74,6 +83,11 @@ def walls_hit(track: Track, car: Racer) -> int:
         corner_at(car, -1.0, -1.0),
     )
     for wall in track.walls_px:
+        along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
+        away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
+        if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
+            # The whole line of the wall is farther than any corner.
+            continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
             share, along_wall = crossing(x, y, end_x - x, end_y - y, wall)
