@@ -37,7 +37,13 @@ from mcaprl.sims import make_sim
     help="Simulated seconds in a second.",
 )
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535))
+@click.option(
+    "--port",
+    default=8765,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Of the live server on 127.0.0.1; 0 takes a free one.",
+)
 @click.option("--verify", "verifies", is_flag=True, help="Step the sim again and compare.")
 @click.option("--sim", help="Step this sim instead of the one that the log names.")
 def replay(

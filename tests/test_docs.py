@@ -16,7 +16,7 @@ from mcaprl.cli import cli, run
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 # Sizes at which the README's commands take seconds; what they do stays the same.
-SMALLER = {"--episodes": "2", "--updates": "30", "--hidden": "16,16"}
+SMALLER = {"--episodes": "2", "--steps": "200"}
 
 
 def _generator() -> ModuleType:
@@ -58,12 +58,16 @@ def test_code_about_the_sims_runs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = [line for line in README.splitlines() if line.startswith("mcaprl ")]
-    assert len(lines) == 8
+    assert len(lines) == 11
     for line in lines:
         arguments = shlex.split(line)[1:]
         if arguments[0] == "train-offline":
             arguments += ["--updates", "30", "--hidden", "16,16"]
             arguments += ["--gamma", "0.5", "--target-interval", "3"]
+        if "--data" in arguments:
+            arguments += ["--updates", "10"]
+        if arguments[0] == "train-online":
+            arguments += ["--eval-episodes", "1", "--final-episodes", "1", "--envs", "2"]
         for option, value in SMALLER.items():
             if option in arguments:
                 arguments[arguments.index(option) + 1] = value
