@@ -19,7 +19,7 @@ from mcaprl.cli.show import print_json, print_table, progress, write_json
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.wrapper import RecordMcap
-from mcaprl.sims import make_sim
+from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluate import Improvement, PolicyScore, improvements, normalize
 from mcaprl.sims.evaluate import evaluate as evaluate_policy
 from mcaprl.sims.statistics import bootstrap_interval, interquartile_mean
@@ -104,7 +104,10 @@ def _evaluate_in_sim(
             import_extra("jinja2", "report")
             write_json(report / RESULT_NAME, {})
         world = list(getattr(env.unwrapped, "static_scene", list)())
-        scores = _score_all(env, policies, episodes, seed, record_path, overwrite)
+        envs = None
+        if env.spec is not None and env.spec.vector_entry_point and record_path is None:
+            envs = make_sims(sim, episodes, **sim_arguments)
+        scores = _score_all(env, envs, policies, episodes, seed, record_path, overwrite)
     if logged is not None:
         logged = _scaled(logged, scores)
     compared = improvements(scores)
@@ -127,6 +130,7 @@ def _evaluate_in_sim(
 
 def _score_all(
     env: gym.Env[Any, Any],
+    envs: gym.vector.VectorEnv[Any, Any, Any] | None,
     names: Sequence[str],
     episodes: int,
     seed: int,
@@ -157,6 +161,7 @@ def _score_all(
                 name=shown[name],
                 episodes=episodes,
                 seed=seed,
+                envs=None if name in SCRIPTED else envs,
                 on_policy=partial(_tell_policy, recorded),
                 on_episode=lambda result: advance(),
             )
@@ -237,6 +242,7 @@ def _print_scores(
                 _interval(logged["interval"]),
                 "",
                 _score(logged["normalized_score"]),
+                "",
                 f"{logged['episodes']} episodes",
             ]
         )
@@ -247,13 +253,22 @@ def _print_scores(
             _interval(score.interval),
             f"{float(interquartile_mean(score.returns)):.2f}",
             _score(score.normalized_score),
+            "" if score.success_rate is None else f"{score.success_rate:.0%}",
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
         ]
         for score in scores
     ]
     print_table(
         f"{sim}: {episodes} episodes for each policy and training seed",
-        ["policy", "mean return", "95 % interval", "middle half", "random 0, pilot 1", "ends"],
+        [
+            "policy",
+            "mean return",
+            "95 % interval",
+            "middle half",
+            "random 0, pilot 1",
+            "success",
+            "ends",
+        ],
         rows,
     )
 

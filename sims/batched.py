@@ -143,6 +143,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         infos = self._infos(ended_itself)
         return fleet.observations(), rewards, terminated, truncated, infos
 
+    def places(self) -> NDArray[np.float64]:
+        """Give where all vehicles are, (N, 2) x and y in the map, metres."""
+        return self.fleet.places()
+
     def _check_can_step(self) -> Bools:
         """Give which episodes are at their end, and to be reset in this step."""
         if not self._is_started:

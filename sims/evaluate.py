@@ -12,7 +12,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, Policy, rollout
+from mcaprl.sims.batch_rollout import batch_rollout
+from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, Policy, episode_seed, rollout
 from mcaprl.sims.statistics import (
     bootstrap_interval,
     improvement_interval,
@@ -33,6 +34,7 @@ class PolicyScore:
         interval: 95 % bootstrap interval of the mean, over seeds and episodes.
         normalized_score: 0 as random, 1 as the pilot; None without a pilot.
         normalized_interval: the interval on that scale.
+        successes: ends that count as success; None if the environment does not tell.
     """
 
     policy: str
@@ -41,6 +43,7 @@ class PolicyScore:
     interval: tuple[float, float]
     normalized_score: float | None = None
     normalized_interval: tuple[float, float] | None = None
+    successes: tuple[str, ...] | None = None
 
     @property
     def returns(self) -> NDArray[np.float64]:
@@ -51,6 +54,13 @@ class PolicyScore:
     def ends(self) -> dict[str, int]:
         """Episodes by the reason they ended."""
         return dict(Counter(e.reason for seed in self.results for e in seed).most_common())
+
+    @property
+    def success_rate(self) -> float | None:
+        """The share of episodes that ended well; None if the environment does not tell."""
+        if self.successes is None:
+            return None
+        return sum(self.ends.get(reason, 0) for reason in self.successes) / self.returns.size
 
     def to_json(self) -> dict[str, Any]:
         """As `mcaprl evaluate --json` prints it."""
@@ -69,6 +79,7 @@ class PolicyScore:
                 for name, statistic in middle.items()
             },
             "seed_means": returns.mean(axis=1).tolist(),
+            "success_rate": self.success_rate,
             "mean_length": float(np.mean([e.length for seed in self.results for e in seed])),
             "ends": self.ends,
             "returns": returns.ravel().tolist(),
@@ -82,6 +93,7 @@ def evaluate(
     name: str,
     episodes: int,
     seed: int,
+    envs: gym.vector.VectorEnv[Any, Any, Any] | None = None,
     on_policy: Callable[[str], None] = lambda name: None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> PolicyScore:
@@ -93,18 +105,30 @@ def evaluate(
         name: for tables.
         episodes: for each of `policies`; the same starts for all.
         seed: of the episodes.
+        envs: `episodes` of the same environment, to be stepped together instead; for policies that
+            act on batches.
         on_policy: called with each policy's own name before its first episode.
         on_episode: called after each episode.
     """
     results = []
     for policy in policies:
         on_policy(name if policy is None or len(policies) == 1 else policy.name)
+        if envs is not None and policy is not None:
+            seeds = [episode_seed(seed, episode) for episode in range(episodes)]
+            results.append(tuple(batch_rollout(envs, policy, seeds, on_episode)))
+            continue
         behavior = EpsilonGreedy(policy, 0.0, env.action_space)
         results.append(
             tuple(rollout(env, behavior, seed=seed, episodes=episodes, on_episode=on_episode))
         )
     returns = np.array([[episode.total_reward for episode in one] for one in results])
-    return PolicyScore(name, tuple(results), float(returns.mean()), bootstrap_interval(returns))
+    return PolicyScore(
+        name,
+        tuple(results),
+        float(returns.mean()),
+        bootstrap_interval(returns),
+        successes=getattr(env.unwrapped, "success_reasons", None),
+    )
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:

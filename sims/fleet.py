@@ -82,6 +82,10 @@ class Fleet(ABC):
         """Give what all observe, with a leading dimension of N, the caller's own."""
 
     @abstractmethod
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres; the caller's own."""
+
+    @abstractmethod
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of vehicle i, without the reason of an end."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -143,6 +143,7 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
     """
 
     metadata = METADATA
+    success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
     action_meanings = ACTION_MEANINGS
     observation_names = OBSERVATION_NAMES
 

@@ -139,6 +139,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
     """
 
     metadata = METADATA
+    success_reasons = ("time_limit",)
 
     def __init__(
         self,

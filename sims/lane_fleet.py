@@ -139,6 +139,10 @@ class LaneFleet(Fleet):
             self._depth_m[i] = self._camera.image_m(position_m, level_axes(yaw_rad))
         return self._depth_m[i]
 
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres."""
+        return self._cars[:, :2].copy()
+
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
         return _described(self._car_rows[i].tolist(), self._started_at_m.item(i))

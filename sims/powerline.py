@@ -128,6 +128,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     """
 
     metadata = METADATA
+    success_reasons = ("finished",)
 
     def __init__(
         self,

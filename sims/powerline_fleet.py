@@ -163,6 +163,11 @@ class PowerlineFleet(Fleet):
             self._depth_m[i] = self._camera.image_m(self.flight(i).drone)
         return self._depth_m[i]
 
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres."""
+        # The log's axes are ROS's: y points west.
+        return self._flights[:, :2] * (1.0, -1.0)
+
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of drone i."""
         return _described(self._bearings[i].tolist(), self._started_at_m.item(i))

@@ -126,6 +126,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     """
 
     metadata = METADATA
+    success_reasons = ("time_limit",)
 
     def __init__(
         self,

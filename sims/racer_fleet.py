@@ -22,7 +22,7 @@ from mcaprl.sims.racer_rules import (
     step_racers,
 )
 from mcaprl.sims.racer_start import racer_from, start_anywhere, start_exactly, start_on_line
-from mcaprl.sims.racer_track import METRES_PER_PX, Track, make_track
+from mcaprl.sims.racer_track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track, make_track
 
 RULES = ("default", "classic")
 OBSERVATIONS = ("rays",)
@@ -116,6 +116,11 @@ class RacerFleet(Fleet):
     def observations(self) -> NDArray[np.float32]:
         """Give what all cars see."""
         return self._seen.copy()
+
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres."""
+        x_px, y_px = self._cars[:, 0], self._cars[:, 1]
+        return METRES_PER_PX * np.column_stack([x_px, PICTURE_HEIGHT_PX - y_px])
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""

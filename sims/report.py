@@ -156,11 +156,21 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
             f"{float(interquartile_mean(score.returns)):.2f}",
             f"{float(median(score.returns)):.2f}",
             "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
+            "" if score.success_rate is None else f"{score.success_rate:.0%}",
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
         )
         for score in scores
     ]
-    names = ("policy", "mean return", "95 % interval", "middle half", "median", "score", "ends")
+    names = (
+        "policy",
+        "mean return",
+        "95 % interval",
+        "middle half",
+        "median",
+        "score",
+        "success",
+        "ends",
+    )
     return Table(names, rows)
 
 

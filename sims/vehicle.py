@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -33,6 +33,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
     """An environment of one vehicle: seeds, steps, ends and pictures, the same for all sims."""
 
     trail_length: int = 40
+    success_reasons: ClassVar[tuple[str, ...]]
+    """Ends that are what one hopes for; `time_limit` is that of the TimeLimit, too."""
 
     def __init__(self, fleet: AnyFleet, render_mode: RenderMode | None) -> None:
         """Take over a fleet of one.
