@@ -16,6 +16,7 @@ import numpy as np
 from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
+from mcaprl.errors import CorruptLogError
 from mcaprl.recorder import messages
 from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
@@ -111,11 +112,17 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
 
     Returns:
         None if the file has no `/rl/step` of known form, for it is no log then.
+
+    Raises:
+        LogError: it is a log, but what says so contradicts the rest.
     """
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):
         return EpisodePlan() if METADATA_NAME in reader.metadata else None
-    if any(name not in steps.fields for name in _FIELDS):
+    missing = [name for name in _FIELDS if name not in steps.fields]
+    if missing and METADATA_NAME in reader.metadata:
+        raise CorruptLogError(f"{STEP_TOPIC} has no field {', '.join(missing)}")
+    if missing:
         return None
     order = np.lexsort((steps.times, steps.channel_ids))
     columns = steps.read(_FIELDS, order)
