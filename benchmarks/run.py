@@ -9,7 +9,7 @@ import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from benchmarks import growth, logs
+from benchmarks import growth, logs, sims
 from benchmarks.measure import Table
 
 ROOT = Path(__file__).parent.parent
@@ -23,6 +23,7 @@ LIBRARIES = (
     "minari",
     "h5py",
     "pyarrow",
+    "highway-env",
 )
 _PAGE = """\
 # Speed
@@ -49,6 +50,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tables = [*logs.tables(folder, arguments.transitions), *growth.tables(folder, sizes)]
+        tables += sims.tables()
     write_results(tables, arguments.transitions)
 
 

@@ -106,7 +106,7 @@ class ChunkHeader:
             self.crc,
             len(name),
         )
-        return start + name + data_bytes.to_bytes(8, "little")
+        return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
 
 def chunk_header(file: memoryview, offset: int) -> ChunkHeader:

@@ -213,11 +213,12 @@ class McapReader:
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """The first attachment of a name; None if there is none.
+        """The last attachment of a name; None if there is none.
 
         Raises:
             CorruptLogError: it does not match its CRC.
         """
+        found = None
         for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
             if opcode == Opcode.ATTACHMENT:
                 attachment = self._parse(opcode, content, offset)
@@ -225,10 +226,10 @@ class McapReader:
                     (crc,) = struct.unpack("<I", content[-4:])
                     if crc and zlib.crc32(content[:-4]) != crc:
                         raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
-                    return bytes(attachment.data)
+                    found = bytes(attachment.data)
             if opcode == Opcode.DATA_END:
                 break
-        return None
+        return found
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.

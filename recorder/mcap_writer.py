@@ -41,7 +41,7 @@ from mcaprl.recorder.signals import HoldSignals
 COMPRESSIONS = ("zstd", "lz4", "none")
 # Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
 # themselves so much that a slower search halves them.
-_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 6
+_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 9
 
 
 class McapWriter:
