@@ -1,0 +1,163 @@
+"""Writes logs of format version 1 that every later version must read.
+
+`python -m tests.golden.make` writes only files that are missing: those that are there stay for
+ever. What is in each is stated in `contents.json`, as a hash of each column's bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+
+import mcaprl
+from mcaprl.recorder.recover import recover_log
+from tests.faults import Told, play
+from tests.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
+
+FOLDER = Path(__file__).parent
+CONTENTS = FOLDER / "contents.json"
+START_NS = 10**18
+
+
+def every_space(path: Path, compression: str) -> None:
+    """A Dict space with a leaf of each kind, two pictures among them."""
+    record(path, MIXED_SPACE, spaces.Box(-1, 1, (2,), np.float32), [3, 2], compression=compression)
+
+
+def simple(path: Path, observation_space: spaces.Space[Any], action_space: Any) -> None:
+    """A space that is one array."""
+    record(path, observation_space, action_space, [2, 3, 1])
+
+
+def appended(path: Path) -> None:
+    """Two recordings in one file."""
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    record(path, space, spaces.Discrete(3), [3, 2])
+    record(path, space, spaces.Discrete(3), [4], seed=7, append=True, start_time_ns=2 * START_NS)
+
+
+def recovered(path: Path, *, keep_unfinished: bool) -> None:
+    """A log that was cut off in its second episode, behind its first 8191 steps."""
+    whole = path.with_suffix(".whole")
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    rows = [(np.full(2, step % 2, np.float32), 0.5, False, step == 8200) for step in range(8201)]
+    episodes = [[*rows[:3], (*rows[3][:2], True, False)], rows]
+    env = mcaprl.RecordMcap(
+        ScriptedEnv(space, spaces.Discrete(2), episodes), whole, start_time_ns=START_NS
+    )
+    with closing(env):
+        play(env)
+        env.reset()
+        for _ in range(8195):
+            env.step(1)
+        data = whole.read_bytes()
+    whole.write_bytes(data[:-100])
+    try:
+        recover_log(whole, path, keep_unfinished=keep_unfinished)
+    finally:
+        whole.unlink()
+
+
+def of_a_vector(path: Path) -> None:
+    """Two environments side by side, with `/rl/learner`."""
+    envs = SyncVectorEnv([Told, Told])
+    env = mcaprl.RecordVecMcap(envs, path, policy_version=3, epsilon=0.5, start_time_ns=START_NS)
+    with closing(env):
+        env.reset(seed=4)
+        for step in range(8):
+            env.behavior_probs = np.array([0.5, 0.25])
+            env.policy_version = step
+            env.step(np.array([step % 4, (step + 1) % 4]))
+
+
+def with_scene(path: Path) -> None:
+    """All that viewers show, from a sim."""
+    env = mcaprl.RecordMcap(
+        gym.make("mcaprl/LaneKeeping-v0"), path, policy="pilot", start_time_ns=START_NS
+    )
+    with closing(env):
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(0)
+
+
+def told(path: Path) -> None:
+    """One episode of the environment whose every value is known."""
+    with closing(mcaprl.RecordMcap(Told(), path, start_time_ns=START_NS)) as env:
+        play(env)
+
+
+FILES: dict[str, Callable[[Path], None]] = {
+    **{
+        f"every-space-{name}": partial(every_space, compression=name)
+        for name in ("zstd", "lz4", "none")
+    },
+    "box": lambda path: simple(
+        path, spaces.Box(-np.inf, np.inf, (2, 3), np.float64), spaces.Discrete(3, start=-1)
+    ),
+    "discrete": lambda path: simple(path, spaces.Discrete(5), spaces.MultiDiscrete([3, 4])),
+    "multi-discrete": lambda path: simple(
+        path, spaces.MultiDiscrete([3, 4]), spaces.MultiBinary(3)
+    ),
+    "multi-binary": lambda path: simple(
+        path, spaces.MultiBinary(4), spaces.Box(-1, 1, (), np.float32)
+    ),
+    "image": lambda path: simple(path, spaces.Box(0, 255, (9, 8, 3), np.uint8), spaces.Discrete(2)),
+    "appended": appended,
+    "recovered": partial(recovered, keep_unfinished=False),
+    "recovered-unfinished": partial(recovered, keep_unfinished=True),
+    "vector-of-environments": of_a_vector,
+    "lane-with-scene": with_scene,
+    "told": told,
+}
+
+
+def contents_of(path: Path) -> dict[str, Any]:
+    """What is in a log, as it is stated: values of episodes, hashes of columns."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = mcaprl.open(path)
+    columns = {"actions": data.actions, "rewards": data.rewards, "terminated": data.terminated}
+    columns |= {"truncated": data.truncated, "behavior_probs": data.behavior_probs}
+    columns |= {f"observation {k}": leaf for k, leaf in enumerate(leaves_of(data.observations))}
+    columns |= {f"next {k}": leaf for k, leaf in enumerate(leaves_of(data.next_observations))}
+    columns["log_time_ns"] = np.concatenate([e.log_time_ns for e in data.episodes])
+    return {
+        "observation_space": str(data.observation_space),
+        "action_space": str(data.action_space),
+        "env_id": data.env_id,
+        "episodes": [[e.length, e.total_reward, e.reason, e.seed, e.policy] for e in data.episodes],
+        "columns": {name: _digest(column) for name, column in columns.items()},
+    }
+
+
+def _digest(column: np.ndarray[Any, Any]) -> str:
+    digest = hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest()[:16]
+    return f"{column.dtype} {column.shape} {digest}"
+
+
+def main() -> None:
+    """Write what is missing."""
+    stated = json.loads(CONTENTS.read_text()) if CONTENTS.exists() else {}
+    for name, write in FILES.items():
+        path = FOLDER / f"{name}.mcap"
+        if not path.exists():
+            write(path)
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            stated[name] = {"sha256": digest, **contents_of(path)}
+    CONTENTS.write_text(json.dumps(stated, indent=1, sort_keys=True) + "\n")
+
+
+if __name__ == "__main__":
+    main()
