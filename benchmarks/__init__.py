@@ -1,1 +1,0 @@
-"""Measures this package beside others': `make bench`."""
