@@ -20,9 +20,13 @@ from mcaprl.recorder.log_layout import attached_layout
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.moments import moments_of
 from mcaprl.recorder.reader import find_logs, open_logs
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim
+
+# What `recover` exits with when something of the old file is missing in the new one.
+_WITH_LOSSES = 3
 
 
 @click.command()
@@ -32,7 +36,16 @@ from mcaprl.sims import SIMS, make_sim
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="That read chunks at a time; pays for large logs.",
+)
+def info(
+    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
+) -> int:
     """Tell what is in DATA: files, folders or globs of logs."""
     paths = find_logs(data)
     if report is not None:
@@ -40,9 +53,10 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
         import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dataset = open_logs(paths)
+        dataset = open_logs(paths, threads=threads)
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
+    facts["storage"] = dataset.storage
     findings = lint(dataset)
     facts["problems"] = [str(warning.message) for warning in caught] + [
         str(finding) for finding in findings if finding.severity == "problem"
@@ -93,6 +107,34 @@ def check(files: tuple[str, ...], as_json: bool) -> int:
         if not problems:
             click.echo(f"{len(paths)} file{'s' * (len(paths) > 1)} checked, nothing wrong")
     return int(bool(problems))
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--keep-unfinished",
+    is_flag=True,
+    help="Keep episodes whose end is missing, marked truncated, as far as they are there.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
+    """Write what is left of FILE, cut off or damaged, to OUT, which is whole then.
+
+    Exits with 0 if nothing is lost, with 3 if something is, with 1 if nothing can be kept.
+    """
+    found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+    losses = [*map(str, found.damages), *map(str, found.dropped)]
+    losses += [f"{found.strays} messages of episodes that are not kept"] if found.strays else []
+    if as_json:
+        print_json({"ok": not found.has_losses, **asdict(found)})
+    else:
+        ended = f", {found.ended} of them without their end" if found.ended else ""
+        click.echo(f"{out}: {found.episodes} episodes{ended}, {found.messages} messages")
+        for loss in losses:
+            click.echo(f"lost: {loss}")
+    return _WITH_LOSSES if found.has_losses else 0
 
 
 @click.command()
@@ -153,6 +195,7 @@ def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
         ("simulated time", f"{facts['duration_s']:.1f} s"),
         ("mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"),
         ("observations", _short(facts["observations"])),
+        ("kept in", facts["storage"]),
         ("actions", _short(facts["actions"])),
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),

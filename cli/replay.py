@@ -37,7 +37,13 @@ from mcaprl.sims import make_sim
     help="Simulated seconds in a second.",
 )
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535))
+@click.option(
+    "--port",
+    default=8765,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="Of 127.0.0.1, to listen on; 0 takes any that is free.",
+)
 @click.option("--verify", "verifies", is_flag=True, help="Step the sim again and compare.")
 @click.option("--video", type=click.Path(path_type=Path), help="Film to write: .mp4 or .gif.")
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="Stills to write: .png.")

@@ -21,12 +21,19 @@ def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
             default = getattr(config, name)
             if name in options:
                 continue
-            options[name] = click.Option(
-                [flag(name), name],
-                type=_Widths() if isinstance(default, tuple) else type(default),
-                help=f"{line}  [default: {_shown(default)}]",
-            )
+            options[name] = _option(name, line, default)
     return list(options.values())
+
+
+def _option(name: str, line: str, default: Any) -> click.Option:
+    if isinstance(default, bool):
+        both = f"{flag(name)}/--no-{name.replace('_', '-')}"
+        return click.Option([both, name], default=None, help=line)
+    return click.Option(
+        [flag(name), name],
+        type=_Widths() if isinstance(default, tuple) else type(default),
+        help=f"{line}  [default: {_shown(default)}]",
+    )
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):

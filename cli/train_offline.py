@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from mcaprl.cli.settings import setting_options
-from mcaprl.recorder.reader import open_logs
+from mcaprl.errors import MissingExtraError
 from mcaprl.settings import check_settings, plain_settings
 
 
@@ -25,7 +25,7 @@ class _TrainCommand(click.Command):
 @click.command(cls=_TrainCommand)
 @click.argument("data", nargs=-1, required=True, metavar="DATA...")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to make.")
-@click.option("--algo", help="dqn, double-dqn, cql or bc.  [default: cql]")
+@click.option("--algo", help="dqn, double-dqn, cql, bc, bcq or iql.  [default: cql]")
 @click.option(
     "--seeds",
     default=1,
@@ -44,6 +44,8 @@ class _TrainCommand(click.Command):
     help="Of torch; more than one pays only with big batches on an idle machine.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
+@click.option("--follow", is_flag=True, help="Learn from logs that are still being written, too.")
+@click.option("--other-data", is_flag=True, help="When resuming, go on even with other DATA.")
 def train_offline(
     data: tuple[str, ...],
     out: Path,
@@ -52,16 +54,26 @@ def train_offline(
     seed: int,
     threads: int,
     resume: bool,
+    follow: bool,
+    other_data: bool,
     **settings: Any,
 ) -> None:
-    """Learn a policy from DATA: files, folders or globs of logs, which all count the same.
+    """Learn a policy from DATA: files, folders or globs of logs.
 
-    Settings that are not given have the algorithm's own defaults; with --resume, the run's.
+    A number behind a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
+    twice as often as others. With --follow, another process may still write DATA: each episode is
+    taken up when it is finished, until all updates are made. All seeds are trained side by side and
+    do not depend on each other. Settings that are not given have the algorithm's own defaults; with
+    --resume, the run's.
     """
     import torch
 
     from mcaprl.offline.algorithms import choose_algorithm
-    from mcaprl.offline.train import CONFIG_NAME, read_config, train
+    from mcaprl.offline.curves import draw_curves
+    from mcaprl.offline.follow import GrowingLogs
+    from mcaprl.offline.run_folder import CONFIG_NAME, read_config
+    from mcaprl.offline.sources import open_weighted
+    from mcaprl.offline.train import describe_seeds, train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}
@@ -73,14 +85,27 @@ def train_offline(
     _, defaults = choose_algorithm(algo)
     check_settings(algo, defaults, given)
     config = type(defaults)(**given)
-    dataset = open_logs(list(data))
+    growing = GrowingLogs(data) if follow else None
+    dataset, weights = (growing.dataset, None) if growing else open_weighted(data)
     click.echo(
         f"{algo} learns from {len(dataset.episodes)} episodes, {len(dataset)} transitions,"
         f" mean return {dataset.statistics.mean_return:.2f}"
     )
-    for summary in train(dataset, config, out, seeds=seeds, seed=seed, resume=resume):
-        done = summary.updates - summary.resumed_at
-        rate = done / summary.seconds if summary.seconds else 0.0
-        terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
-        click.echo(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
-    click.echo(f"curves: tensorboard --logdir {out}")
+    summaries = train(
+        dataset,
+        config,
+        out,
+        seeds=seeds,
+        seed=seed,
+        weights=weights,
+        resume=resume,
+        # Logs that grew since are not what the checkpoints are of.
+        other_data=other_data or follow,
+        follow=growing,
+    )
+    for line in describe_seeds(summaries):
+        click.echo(line)
+    try:
+        click.echo(f"curves: {draw_curves(out)}, or tensorboard --logdir {out}")
+    except MissingExtraError as error:
+        click.echo(f"curves: tensorboard --logdir {out}; for a picture: {error}")

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -17,7 +18,11 @@ _DESCRIPTION = "description"
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
     """Write tensors, with a JSON object in the file's header."""
-    whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    # Copies, because safetensors refuses views of one storage.
+    whole = {
+        name: tensor.clone(memory_format=torch.contiguous_format)
+        for name, tensor in tensors.items()
+    }
     write_atomically(path, save(whole, {_DESCRIPTION: json.dumps(description)}))
 
 

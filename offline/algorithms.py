@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.bc import BC
+from mcaprl.offline.bcq import BCQ
 from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.cql import CQL
 from mcaprl.offline.dqn import DQN, DoubleDQN
+from mcaprl.offline.iql import IQL
 from mcaprl.offline.learner import Learner
 
 ALGORITHMS: dict[str, type[Learner]] = {
-    learner.name: learner for learner in (DQN, DoubleDQN, CQL, BC)
+    learner.name: learner for learner in (DQN, DoubleDQN, CQL, BC, BCQ, IQL)
 }
 
 

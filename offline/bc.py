@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from torch import Tensor
-
 from mcaprl.offline.buffer import Batch
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.learner import Learner, Outputs
-from mcaprl.offline.losses import behavior_cloning
+from mcaprl.offline.learner import ActsBy, Learner, Losses
+from mcaprl.offline.losses import cross_entropy
 
 
 @dataclass(frozen=True)
@@ -27,12 +25,17 @@ class BC(Learner):
 
     name = "bc"
     config_type: ClassVar[type[TrainingConfig]] = BCConfig
-    outputs: ClassVar[Outputs] = "logits"
+    acts_by: ClassVar[ActsBy] = "logits"
+    policy_models: ClassVar[tuple[str, ...]] = ("logits",)
     config: BCConfig
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """A logit for each action."""
+        return {"logits": (self.n_actions,)}
+
+    def losses(self, batch: Batch) -> Losses:
         """The cross entropy, and how often the likeliest action is the logged one."""
-        logits_tm1 = self.network(batch.observations)
-        right = logits_tm1.detach().argmax(1) == batch.actions
-        loss = behavior_cloning(logits_tm1, batch.actions).mean()
-        return {"accuracy": right.float().mean(), "loss": loss}
+        logits_tm1 = self.learn("logits", batch.observations)
+        right = logits_tm1.argmax(1) == batch.actions
+        loss = cross_entropy(logits_tm1, batch.actions)
+        return Losses({"accuracy": right.float(), "loss": loss.value}, {"logits": loss.slope})

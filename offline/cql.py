@@ -5,8 +5,9 @@
 The second term lowers the values of actions that the data do not hold, so that the greedy policy
 stays with what was seen to work.
 
-Departures from the paper: its Atari agent has a quantile head, here values are plain means; alpha
-is fixed and not tuned by a Lagrange multiplier; the target is that of Double DQN.
+Departures from the paper: values are plain means unless `n_quantiles` is above 1, as they are in
+its Atari agent; alpha is fixed and not tuned by a Lagrange multiplier; the target is that of Double
+DQN.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from torch import Tensor
 from mcaprl.offline.buffer import Batch
 from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.dqn import DoubleDQN, DoubleDQNConfig
-from mcaprl.offline.losses import conservative_penalty, huber
+from mcaprl.offline.learner import Losses
+from mcaprl.offline.losses import Loss, chosen, cross_entropy, mean_values
 
 
 @dataclass(frozen=True)
@@ -42,14 +44,29 @@ class CQL(DoubleDQN):
     config_type: ClassVar[type[TrainingConfig]] = CQLConfig
     config: CQLConfig
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
+    def losses(self, batch: Batch) -> Losses:
         """The loss of Double DQN plus alpha times the penalty."""
-        q_tm1 = self.network(batch.observations)
-        td_loss = huber(self.temporal_difference(q_tm1, batch).error).mean()
-        penalty = conservative_penalty(q_tm1, batch.actions).mean()
-        return {
-            "mean_q": q_tm1.detach().mean(),
-            "td_loss": td_loss,
-            "conservative_penalty": penalty,
-            "loss": td_loss + self.config.alpha * penalty,
+        q_tm1 = self.learn("q", batch.observations)
+        td_loss = self.td_loss(q_tm1, batch)
+        penalty = conservative_penalty(q_tm1, batch.actions)
+        alpha = self.config.alpha
+        terms = {
+            "mean_q": chosen(mean_values(q_tm1), batch.actions),
+            "td_loss": td_loss.value,
+            "conservative_penalty": penalty.value,
+            "loss": td_loss.value + alpha * penalty.value,
         }
+        return Losses(terms, {"q": td_loss.slope.add_(penalty.slope, alpha=alpha)})
+
+
+def conservative_penalty(q_tm1: Tensor, a_tm1: Tensor) -> Loss:
+    """`cross_entropy` of the values; of quantiles (B, A, N), of their means.
+
+    Args:
+        q_tm1: (B, A) values, or (B, A, N) quantiles, of the network that learns.
+        a_tm1: (B,) int64 actions of the data.
+    """
+    value, slope = cross_entropy(mean_values(q_tm1), a_tm1)
+    if q_tm1.ndim == 2:
+        return Loss(value, slope)
+    return Loss(value, slope.unsqueeze(2).expand_as(q_tm1) / q_tm1.shape[2])

@@ -2,6 +2,7 @@
 
     DQN         https://doi.org/10.1038/nature14236   target r + gamma max_a Q'(s', a)
     Double DQN  https://arxiv.org/abs/1509.06461      target r + gamma Q'(s', argmax_a Q(s', a))
+    quantiles   https://arxiv.org/abs/1710.10044      Q is the mean of `n_quantiles` learned ones
 
 Q is the network that learns, Q' a copy of it renewed every `target_interval` updates.
 
@@ -13,34 +14,49 @@ never shows, and both overrate them: they are the baseline that CQL mends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcaprl.offline.buffer import Batch, TransitionBuffer
-from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.learner import Learner, Outputs
-from mcaprl.offline.losses import TemporalDifference, double_q_learning, huber, q_learning
+from mcaprl.offline.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.learner import ActsBy, Learner, Losses
+from mcaprl.offline.losses import (
+    Loss,
+    allowed_only,
+    chosen,
+    double_q_learning_target,
+    huber_regression,
+    mean_values,
+    q_learning_target,
+    quantile_regression,
+)
+from mcaprl.offline.models import Model
+from mcaprl.offline.networks import Architecture
 from mcaprl.offline.target import HardTarget
 
 
 @dataclass(frozen=True)
-class DQNConfig(TrainingConfig):
+class DQNConfig(BootstrapConfig):
     """Settings of DQN."""
 
-    gamma: float = 0.97
-    """discount of the reward one step later; 0.97 looks about 33 steps ahead"""
-    target_interval: int = 500
-    """updates between two copies of the weights into the target network"""
+    dueling: bool = False
+    """learn the value of a state apart from the advantages of its actions"""
+    n_quantiles: int = 1
+    """learn so many quantiles of the return, and act by their mean; 1 learns the mean alone"""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
         super().__post_init__()
-        self._require("gamma", 0 <= self.gamma <= 1, "within [0, 1]")
-        self._require("target_interval", self.target_interval >= 1, "at least 1")
+        self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
+        self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
+
+    @property
+    def architecture(self) -> Architecture:
+        """What networks look like."""
+        return replace(super().architecture, dueling=self.dueling)
 
 
 @dataclass(frozen=True)
@@ -53,42 +69,63 @@ class DQN(Learner):
 
     name = "dqn"
     config_type: ClassVar[type[TrainingConfig]] = DQNConfig
-    outputs: ClassVar[Outputs] = "q_values"
+    acts_by: ClassVar[ActsBy] = "q_values"
+    policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: DQNConfig
 
-    def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seed: int) -> None:
+    def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
         """Start with random weights, and the same ones as target."""
-        super().__init__(config, buffer, seed)
+        super().__init__(config, buffer, seeds)
         rows_per_sync = config.batch_size * config.target_interval
-        self.target = HardTarget(self.network, buffer, rows_per_sync)
+        self.target = HardTarget(self.models["q"], buffer, rows_per_sync)
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """The Huber loss of the temporal difference."""
-        q_tm1 = self.network(batch.observations)
-        td_loss = huber(self.temporal_difference(q_tm1, batch).error).mean()
-        return {"mean_q": q_tm1.detach().mean(), "loss": td_loss}
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """A value for each action, or quantiles."""
+        count = self.config.n_quantiles
+        return {"q": (self.n_actions,) if count == 1 else (self.n_actions, count)}
 
-    def temporal_difference(self, q_tm1: Tensor, batch: Batch) -> TemporalDifference:
+    def losses(self, batch: Batch) -> Losses:
+        """The loss of the temporal difference."""
+        q_tm1 = self.learn("q", batch.observations)
+        td_loss = self.td_loss(q_tm1, batch)
+        q_a_tm1 = chosen(mean_values(q_tm1), batch.actions)
+        return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
+
+    def judge(self, batch: Batch) -> dict[str, Tensor]:
+        """The values of the actions taken, and how far they are from their targets."""
+        q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
+        target_tm1 = self.targets(batch)
+        mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
+        return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
+
+    def td_loss(self, q_tm1: Tensor, batch: Batch) -> Loss:
+        """How far the values of the actions taken are from their targets."""
+        regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
+        return regression(q_tm1, batch.actions, self.targets(batch))
+
+    def targets(self, batch: Batch) -> Tensor:
         """The target network both chooses the next action and judges it."""
-        discount_t = self.config.gamma * batch.continues
-        q_t = self.target.values(batch)
-        return q_learning(q_tm1, batch.actions, batch.rewards, discount_t, q_t)
+        return q_learning_target(batch.rewards, batch.discounts, self.target_outputs(batch))
+
+    def target_outputs(self, batch: Batch) -> Tensor:
+        """(R, A) values of the next states, or (R, A, N) quantiles, under the target network."""
+        return allowed_only(self.target.outputs(batch), batch.next_observations.mask)
 
     def update(self) -> dict[str, Tensor]:
         """Make one gradient step, then copy the weights into the target when it is due."""
         terms = super().update()
         if self.step % self.config.target_interval == 0:
-            self.target.sync(self.network)
+            self.target.sync(self.models["q"])
         return terms
 
-    def networks(self) -> dict[str, nn.Module]:
-        """The network that learns and its target."""
-        return super().networks() | {"target": self.target.network}
+    def everything(self) -> dict[str, Model]:
+        """The model that learns and its target."""
+        return {**self.models, "target": self.target.model}
 
-    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+    def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go back to what `state` returned after `step` updates."""
-        super().load_state(tensors, step)
-        self.target.refresh()
+        super().load_state(seed, tensors, step)
+        self.target.forget()
 
 
 class DoubleDQN(DQN):
@@ -98,12 +135,8 @@ class DoubleDQN(DQN):
     config_type: ClassVar[type[TrainingConfig]] = DoubleDQNConfig
     config: DoubleDQNConfig
 
-    def temporal_difference(self, q_tm1: Tensor, batch: Batch) -> TemporalDifference:
+    def targets(self, batch: Batch) -> Tensor:
         """The learning network chooses, the target network judges."""
-        discount_t = self.config.gamma * batch.continues
-        with torch.no_grad():
-            q_t_selector = self.network(batch.next_observations)
-        q_t_value = self.target.values(batch)
-        return double_q_learning(
-            q_tm1, batch.actions, batch.rewards, discount_t, q_t_value, q_t_selector
-        )
+        q_t_selector = self.outputs("q", batch.next_observations)
+        q_t_value = self.target_outputs(batch)
+        return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)

@@ -13,18 +13,18 @@ about actions that the log never shows answers with anything.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mcaprl.offline.buffer import Batch, TransitionBuffer
+from mcaprl.offline.buffer import Batch, Packing, TransitionBuffer
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.learner import Learner, Outputs
-from mcaprl.offline.losses import expected_sarsa
-from mcaprl.offline.target import HardTarget
+from mcaprl.offline.learner import ActsBy, Learner, Losses
+from mcaprl.offline.losses import chosen, expected_sarsa_target, square_regression
+from mcaprl.offline.models import Model
+from mcaprl.offline.target import HardTarget, outputs_everywhere
 
 SYNCS_PER_HORIZON = 5.0
 """Fewer copies than 5 / (1 - gamma), and Q has not seen the end of its horizon."""
@@ -48,6 +48,11 @@ class FQEConfig(TrainingConfig):
         self._require("target_interval", self.target_interval >= 1, "at least 1")
 
     @property
+    def packing(self) -> Packing:
+        """Single steps: sums of several would be those of the policy that acted in the log."""
+        return Packing(gamma=self.gamma)
+
+    @property
     def enough_syncs(self) -> bool:
         """Whether rewards have had the time to travel through the horizon.
 
@@ -62,55 +67,63 @@ class FQE(Learner):
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
-    outputs: ClassVar[Outputs] = "q_values"
+    acts_by: ClassVar[ActsBy] = "q_values"
+    policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: FQEConfig
 
     def __init__(
-        self, config: FQEConfig, buffer: TransitionBuffer, seed: int, pi_t: Tensor
+        self, config: FQEConfig, buffer: TransitionBuffer, seeds: Sequence[int], pi_t: Tensor
     ) -> None:
         """Start with random weights, and the same ones as target.
 
         Args:
             config: settings.
             buffer: the log's N transitions.
-            seed: of the weights and the batches.
+            seeds: of the weights and the batches.
             pi_t: (N, A) probabilities of the policy in question in each next state.
         """
-        super().__init__(config, buffer, seed)
+        super().__init__(config, buffer, seeds)
         self.pi_t = pi_t
-        self.target = HardTarget(self.network, buffer, config.batch_size * config.target_interval)
-        self.low, self.high = reachable(buffer.rewards, config.gamma)
+        rows_per_sync = config.batch_size * config.target_interval
+        self.target = HardTarget(self.models["q"], buffer, rows_per_sync)
+        rewards, _ = buffer.returns
+        drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
+        self.low, self.high = reachable(drawn, config.gamma)
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Half the squared temporal difference: unlike Huber's, its minimum is the mean target."""
-        q_tm1 = self.network(batch.observations)
-        q_t = self.target.values(batch).clamp(self.low, self.high)
-        discount_t = self.config.gamma * batch.continues
+    def output_shapes(self) -> dict[str, tuple[int, ...]]:
+        """A value for each action."""
+        return {"q": (self.n_actions,)}
+
+    def losses(self, batch: Batch) -> Losses:
+        """Half the squared temporal difference."""
+        q_tm1 = self.learn("q", batch.observations)
+        q_t = self.target.outputs(batch).clamp(self.low, self.high)
         pi_t = self.pi_t.index_select(0, batch.rows)
-        td = expected_sarsa(q_tm1, batch.actions, batch.rewards, discount_t, q_t, pi_t)
-        return {"mean_q": q_tm1.detach().mean(), "loss": 0.5 * td.error.square().mean()}
+        target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
+        td_loss = square_regression(q_tm1, batch.actions, target_tm1)
+        q_a_tm1 = chosen(q_tm1, batch.actions)
+        return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
 
     def update(self) -> dict[str, Tensor]:
         """Make one gradient step, then copy the weights into the target when it is due."""
         terms = super().update()
         if self.step % self.config.target_interval == 0:
-            self.target.sync(self.network)
+            self.target.sync(self.models["q"])
         return terms
 
-    def networks(self) -> dict[str, nn.Module]:
-        """The network that learns and its target."""
-        return super().networks() | {"target": self.target.network}
+    def everything(self) -> dict[str, Model]:
+        """The model that learns and its target."""
+        return {**self.models, "target": self.target.model}
 
-    def load_state(self, tensors: Mapping[str, Tensor], step: int) -> None:
+    def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
         """Go back to what `state` returned after `step` updates."""
-        super().load_state(tensors, step)
-        self.target.refresh()
+        super().load_state(seed, tensors, step)
+        self.target.forget()
 
-    @torch.no_grad()
-    def values(self, observations: Tensor) -> Tensor:
-        """(N, A) the values of all actions, within what is reachable."""
-        parts = [self.network(part) for part in torch.split(observations, 1024)]
-        return torch.cat(parts).clamp(self.low, self.high)
+    def values(self, *, next_states: bool) -> Tensor:
+        """(N, A) the first seed's values of the buffer's states, or next states, within reach."""
+        everywhere = outputs_everywhere(self.models["q"], self.buffer, next_states=next_states)
+        return everywhere[: len(self.buffer)].clamp(self.low, self.high)
 
 
 def reachable(rewards: Tensor, gamma: float) -> tuple[float, float]:

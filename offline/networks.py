@@ -1,99 +1,100 @@
-"""Networks from observations to one number per action, chosen by the observation space."""
+"""Networks from observations to numbers per action, built from what the observations hold.
+
+picture -> convolutions -> layer -+
+vector  ------------------> layer +-> layers -> outputs
+"""
 
 from __future__ import annotations
 
-import math
-from typing import Any, cast
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
 
-import numpy as np
 import torch
-from gymnasium import spaces
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from mcaprl.errors import SpaceError
-
-MIN_IMAGE_EDGE = 36
-"""The smallest image, in pixels, that the convolutions leave a pixel of."""
+from mcaprl.offline.observations import Observations
 
 
-def is_image(space: spaces.Space[Any]) -> bool:
-    """Whether observations are pictures: uint8, (height, width) or (height, width, channels)."""
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) in (2, 3)
+@dataclass(frozen=True)
+class Architecture:
+    """The shape of a network.
 
-
-def observation_tensor(observations: NDArray[Any], space: spaces.Space[Any]) -> Tensor:
-    """Observations as the networks take them: images as uint8, everything else as float32."""
-    dtype = np.uint8 if is_image(space) else np.float32
-    return torch.from_numpy(np.require(observations, dtype, ["C", "W"]))
-
-
-def box_observations(space: spaces.Space[Any]) -> spaces.Box:
-    """The observation space, if there is a network for it.
-
-    Raises:
-        SpaceError: it is not a Box, or one of images that are smaller than the convolutions.
+    Attributes:
+        hidden: widths of the fully connected hidden layers; the first is one for each input.
+        layer_norm: normalise before each ReLU of these layers (https://arxiv.org/abs/1607.06450).
+        dueling: outputs are a value plus advantages of mean 0, each with a last hidden layer of
+            its own (https://arxiv.org/abs/1511.06581).
     """
-    if not isinstance(space, spaces.Box):
-        kind = type(space).__name__
-        raise SpaceError(f"offline learning needs Box observations, got a {kind} space")
-    if is_image(space) and min(space.shape[:2]) < MIN_IMAGE_EDGE:
-        least = f"{MIN_IMAGE_EDGE}x{MIN_IMAGE_EDGE}"
-        raise SpaceError(f"image observations need at least {least} pixels, got {space.shape}")
-    return space
+
+    hidden: tuple[int, ...]
+    layer_norm: bool = False
+    dueling: bool = False
 
 
-def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
-    """The action space, if the algorithms here can learn with it.
+class Network(nn.Module):
+    """Observations to outputs (B, *output_shape)."""
 
-    Raises:
-        SpaceError: it is not Discrete.
-    """
-    if not isinstance(space, spaces.Discrete):
-        raise SpaceError(f"offline learning needs discrete actions, got {space}")
-    return space
+    def __init__(
+        self,
+        vector_width: int,
+        image_shapes: Sequence[tuple[int, ...]],
+        output_shape: tuple[int, ...],
+        architecture: Architecture,
+    ) -> None:
+        """Build for a vector of `vector_width` numbers and pictures of `image_shapes`.
 
+        Args:
+            vector_width: 0 where there is no vector.
+            image_shapes: (height, width, channels) of each picture.
+            output_shape: the first axis counts actions, if there is more than one.
+            architecture: what lies between.
+        """
+        super().__init__()
+        self.output_shape = output_shape
+        hidden, layer_norm = architecture.hidden, architecture.layer_norm
+        # Of a dueling network, the last hidden layer belongs to the head.
+        shared = hidden[:-1] if architecture.dueling else hidden
+        self.stems = nn.ModuleList()
+        width = 0
+        for shape in image_shapes:
+            convolutions = NatureConvolutions(shape)
+            layers, stem_width = _layers(convolutions.n_features, shared[:1], layer_norm)
+            self.stems.append(nn.Sequential(convolutions, *layers))
+            width += stem_width
+        if vector_width:
+            layers, stem_width = _layers(vector_width, shared[:1], layer_norm)
+            self.stems.append(nn.Sequential(*layers))
+            width += stem_width
+        layers, width = _layers(width, shared[1:], layer_norm)
+        self.body = nn.Sequential(*layers)
+        self.head: nn.Module = (
+            DuelingHead(width, hidden[-1:], output_shape, layer_norm)
+            if architecture.dueling
+            else _linear(width, output_shape)
+        )
 
-def build_network(
-    observation_space: spaces.Space[Any], n_outputs: int, hidden: tuple[int, ...]
-) -> nn.Module:
-    """Build a network with outputs (B, n_outputs).
-
-    An image goes through the convolutions of the Nature DQN, anything else is flattened; then
-    come fully connected layers with ReLU. The DQN paper has one such layer of 512.
-
-    Args:
-        observation_space: of one observation, a Box.
-        n_outputs: numbers per observation, one per action.
-        hidden: widths of the fully connected hidden layers.
-
-    Raises:
-        SpaceError: no network takes such observations.
-    """
-    shape = box_observations(observation_space).shape
-    if is_image(observation_space):
-        torso: nn.Module = NatureConvolutions(shape)
-        with torch.no_grad():
-            blank = torch.zeros(1, *shape, dtype=torch.uint8)
-            n_features = cast(Tensor, torso(blank)).shape[1]
-    else:
-        torso, n_features = nn.Flatten(), math.prod(shape)
-    return nn.Sequential(torso, *_connected_layers(n_features, hidden, n_outputs))
+    def forward(self, observations: Observations) -> Tensor:
+        """Map observations to outputs."""
+        inputs = [*observations.images, observations.vector]
+        features = [stem(part) for stem, part in zip(self.stems, inputs, strict=False)]
+        whole = features[0] if len(features) == 1 else torch.cat(features, 1)
+        outputs = cast(Tensor, self.head(self.body(whole)))
+        return outputs.view(-1, *self.output_shape)
 
 
 class NatureConvolutions(nn.Module):
-    """Three convolutions from images (B, height, width[, channels]) of uint8 to (B, features).
+    """Three convolutions from images (B, height, width, channels) of uint8 to (B, n_features).
 
     See "Human-level control through deep reinforcement learning",
     https://doi.org/10.1038/nature14236.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        """Build for images of `shape`: (height, width) or (height, width, channels)."""
+        """Build for images of `shape`: (height, width, channels)."""
         super().__init__()
-        self.shape = (*shape, 1) if len(shape) == 2 else shape
         self.layers = nn.Sequential(
-            nn.Conv2d(self.shape[2], 32, kernel_size=8, stride=4),
+            nn.Conv2d(shape[2], 32, kernel_size=8, stride=4),
             nn.ReLU(),
             nn.Conv2d(32, 64, kernel_size=4, stride=2),
             nn.ReLU(),
@@ -101,16 +102,46 @@ class NatureConvolutions(nn.Module):
             nn.ReLU(),
             nn.Flatten(),
         )
+        with torch.no_grad():
+            self.n_features = self(torch.zeros(1, *shape, dtype=torch.uint8)).shape[1]
 
     def forward(self, images: Tensor) -> Tensor:
         """Map uint8 images to features."""
-        channels_first = images.reshape(-1, *self.shape).permute(0, 3, 1, 2)
-        return cast(Tensor, self.layers(channels_first.float() / 255))
+        return cast(Tensor, self.layers(images.permute(0, 3, 1, 2).float() / 255))
 
 
-def _connected_layers(n_inputs: int, hidden: tuple[int, ...], n_outputs: int) -> list[nn.Module]:
+class DuelingHead(nn.Module):
+    """Q = V + A - mean(A): how good a state is apart from which action is best in it."""
+
+    def __init__(
+        self, n_inputs: int, hidden: tuple[int, ...], output_shape: tuple[int, ...], norm: bool
+    ) -> None:
+        """Build two streams with hidden layers of their own."""
+        super().__init__()
+        self.output_shape = output_shape
+        layers, width = _layers(n_inputs, hidden, norm)
+        self.advantages = nn.Sequential(*layers, _linear(width, output_shape))
+        layers, width = _layers(n_inputs, hidden, norm)
+        self.value = nn.Sequential(*layers, _linear(width, (1, *output_shape[1:])))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map features to flat outputs."""
+        advantages = cast(Tensor, self.advantages(features)).view(-1, *self.output_shape)
+        value = cast(Tensor, self.value(features)).view(-1, 1, *self.output_shape[1:])
+        return (value + advantages - advantages.mean(1, keepdim=True)).flatten(1)
+
+
+def _layers(
+    n_inputs: int, widths: tuple[int, ...], layer_norm: bool
+) -> tuple[list[nn.Module], int]:
+    """Fully connected layers with ReLU, and the width of the last."""
     layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(n_inputs, width), nn.ReLU()]
+    for width in widths:
+        norm = [nn.LayerNorm(width)] if layer_norm else []
+        layers += [nn.Linear(n_inputs, width), *norm, nn.ReLU()]
         n_inputs = width
-    return [*layers, nn.Linear(n_inputs, n_outputs)]
+    return layers, n_inputs
+
+
+def _linear(n_inputs: int, output_shape: tuple[int, ...]) -> nn.Linear:
+    return nn.Linear(n_inputs, torch.Size(output_shape).numel())

@@ -124,7 +124,7 @@ class OffPolicyEvaluator:
         self._config = config or FQEConfig()
         self._seed = seed
         self._dataset = dataset
-        self._buffer = TransitionBuffer.from_dataset(dataset)
+        self._buffer = TransitionBuffer.from_dataset(dataset, self._config.packing)
         self._lengths = np.array([len(episode) for episode in dataset.episodes])
         if len(self._lengths) < FOLDS:
             raise UsageError(f"off-policy evaluation needs {FOLDS} episodes or more in the log")
@@ -213,21 +213,19 @@ class OffPolicyEvaluator:
         actions = self._buffer.actions.numpy()
         q, v, v_next = (np.zeros(len(fold)) for _ in range(3))
         for held_out in range(FOLDS):
-            rows = torch.from_numpy(np.flatnonzero(fold != held_out))
-            seen = self._buffer.take(rows)
-            with torch.random.fork_rng(devices=[]):
-                learner = FQE(
-                    self._config,
-                    seen,
-                    self._seed + held_out,
-                    torch.from_numpy(pi_next.astype(np.float32)).index_select(0, rows),
-                )
-                for _ in range(self._config.updates):
-                    learner.update()
-                    on_update()
             judged = fold == held_out
-            values = learner.values(self._buffer.observations).numpy().astype(np.float64)
-            values_next = learner.values(self._buffer.next_observations).numpy()
+            seen = self._buffer.drawn_by((~judged).astype(np.float64))
+            learner = FQE(
+                self._config,
+                seen,
+                [self._seed + held_out],
+                torch.from_numpy(pi_next.astype(np.float32)),
+            )
+            for _ in range(self._config.updates):
+                learner.update()
+                on_update()
+            values = learner.values(next_states=False).numpy().astype(np.float64)
+            values_next = learner.values(next_states=True).numpy()
             q[judged] = values[np.arange(len(fold)), actions][judged]
             v[judged] = (pi * values).sum(1)[judged]
             v_next[judged] = (pi_next * values_next.astype(np.float64)).sum(1)[judged]

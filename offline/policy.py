@@ -1,43 +1,78 @@
 """Trained policies: saved as safetensors and JSON, loaded without running any code from a file.
 
-`policy.json` says which network to build and what its outputs mean; `policy.safetensors` has its
-weights.
+`policy.json` says which networks to build and how to act by them; `policy.safetensors` has their
+weights and the normalisation of observations. What the best action is taken of:
+
+    q_values            values Q(s, a)                                    dqn, double-dqn, cql
+    logits              odds of actions                                   bc, iql
+    filtered_q_values   Q(s, a) of actions likely under the logits        bcq
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.files import write_json
-from mcaprl.offline.learner import Learner, Outputs
-from mcaprl.offline.networks import build_network, discrete_actions, observation_tensor
+from mcaprl.offline.buffer import discrete_actions
+from mcaprl.offline.learner import ActsBy, Learner
+from mcaprl.offline.losses import allowed_only, likely_actions, mean_values
+from mcaprl.offline.networks import Architecture, Network
+from mcaprl.offline.observations import ObservationEncoder, Observations
 from mcaprl.recorder.spaces import space_from_json, space_to_json
-from mcaprl.tensor_files import write_tensors
+from mcaprl.tensor_files import read_tensors, write_tensors
 
-FORMAT_VERSION = 1
-_JSON_NAME = "policy.json"
+FORMAT_VERSION = 2
+POLICY_NAME = "policy.json"
 _WEIGHTS_NAME = "policy.safetensors"
 _BROKEN_FILE_ERRORS = (
     OSError,
     ValueError,
     TypeError,
     KeyError,
+    AttributeError,
     RuntimeError,
     SafetensorError,
     SpaceError,
 )
+
+
+class Scores(nn.Module):
+    """From observations to a number for each action, of which the policy takes the largest."""
+
+    def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
+        """Take the networks `q` or `logits`, or both."""
+        super().__init__()
+        self.networks = nn.ModuleDict(networks)
+        self.acts_by = acts_by
+        self.threshold = threshold
+
+    def outputs(self, name: str, observations: Observations) -> Tensor:
+        """(B, A) values or logits, minus infinity for actions that are not allowed."""
+        outputs = mean_values(self.networks[name](observations))
+        return allowed_only(outputs, observations.mask)
+
+    def forward(self, observations: Observations) -> Tensor:
+        """(B, A) what is acted by."""
+        if self.acts_by == "logits":
+            return self.outputs("logits", observations)
+        values = self.outputs("q", observations)
+        if self.acts_by == "q_values":
+            return values
+        return allowed_only(
+            values, likely_actions(self.outputs("logits", observations), self.threshold)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +86,9 @@ class Policy:
         action_space: of one action.
         env_id: of the environment whose log it learned from; empty if unknown.
         env_kwargs: arguments to make that environment.
-        outputs: what the network's outputs mean.
-        network: (B, *shape) observations to (B, A) outputs.
+        frame_stack: how many successive observations it looks at; see `act`.
+        encoder: makes tensors of observations.
+        scores: what it acts by.
     """
 
     name: str
@@ -61,72 +97,135 @@ class Policy:
     action_space: spaces.Discrete
     env_id: str
     env_kwargs: dict[str, Any]
-    outputs: Outputs
-    network: nn.Module
+    frame_stack: int
+    encoder: ObservationEncoder
+    scores: Scores
+    _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
-    def act(self, observations: NDArray[Any]) -> NDArray[np.int64]:
+    def begin(self) -> None:
+        """Forget what was seen: the next observations are the first of their episodes."""
+        self._seen.clear()
+
+    def act(self, observations: Any) -> NDArray[np.int64]:
         """The best actions (B,), values of `action_space`; of equal ones the first.
+
+        A policy with `frame_stack` k > 1 remembers the observations of its last k calls since
+        `begin`; given (B, k, *shape), oldest first, it takes those and remembers nothing.
 
         Raises:
             PolicyError: the observations have another shape than (B, *shape).
         """
-        best: NDArray[np.int64] = self._forward(observations).argmax(1)
+        if self.frame_stack > 1 and not self._is_stack(observations):
+            best = self._greedy(self._remember(self._encode(observations)))
+        else:
+            best = self._greedy(self._whole(observations))
         return best + self.action_space.start
 
-    def q_values(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+    def q_values(self, observations: Any) -> NDArray[np.float32]:
         """The values (B, A) of all actions, in the order of the action space.
+
+        Those of actions that an action mask forbids are minus infinity.
+
+        Args:
+            observations: (B, *shape), or (B, k, *shape) where k frames are stacked.
 
         Raises:
             PolicyError: the policy has none, or the observations have another shape.
         """
-        if self.outputs != "q_values":
+        if "q" not in self.scores.networks:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
-        return self._forward(observations)
+        with torch.inference_mode():
+            return cast(
+                NDArray[np.float32], self.scores.outputs("q", self._whole(observations)).numpy()
+            )
 
-    def action_probabilities(self, observations: NDArray[Any]) -> NDArray[np.float32]:
+    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
         """The probabilities (B, A) of all actions.
 
-        Those of behavior cloning estimate the policy in the log. A policy with Q-values is
-        greedy: the action of `act` has 1.
+        Those of behavior cloning estimate the policy in the log, those of IQL are its policy's. A
+        policy that acts by Q-values is greedy: the action of `act` has 1.
+
+        Args:
+            observations: (B, *shape), or (B, k, *shape) where k frames are stacked.
 
         Raises:
             PolicyError: the observations have another shape.
         """
-        outputs = self._forward(observations)
-        if self.outputs == "logits":
-            odds = np.exp(outputs - outputs.max(1, keepdims=True))
-            return cast(NDArray[np.float32], odds / odds.sum(1, keepdims=True))
-        probabilities = np.zeros_like(outputs)
-        probabilities[np.arange(len(outputs)), outputs.argmax(1)] = 1.0
-        return probabilities
-
-    def _forward(self, observations: NDArray[Any]) -> NDArray[np.float32]:
-        shape = self.observation_space.shape
-        if observations.shape[1:] != shape or observations.ndim == 0:
-            wanted = ", ".join(map(str, ("B", *(shape or ()))))
-            got = observations.shape
-            raise PolicyError(f"{self.name} takes observations ({wanted}), got {got}")
         with torch.inference_mode():
-            outputs = self.network(observation_tensor(observations, self.observation_space))
-        return cast(NDArray[np.float32], outputs.numpy())
+            scores = self.scores(self._whole(observations))
+            if self.scores.acts_by == "logits":
+                return cast(NDArray[np.float32], scores.softmax(1).numpy())
+            best = nn.functional.one_hot(scores.argmax(1), scores.shape[1])
+            return cast(NDArray[np.float32], best.float().numpy())
+
+    def _greedy(self, observations: Observations) -> NDArray[np.int64]:
+        with torch.inference_mode():
+            return cast(NDArray[np.int64], self.scores(observations).argmax(1).numpy())
+
+    def _is_stack(self, observations: Any) -> bool:
+        try:
+            return self.encoder.is_stack(observations, self.frame_stack)
+        except (KeyError, IndexError, TypeError):
+            return False
+
+    def _whole(self, observations: Any) -> Observations:
+        """All that the networks look at, with nothing remembered."""
+        if self.frame_stack == 1:
+            return self._encode(observations)
+        if not self._is_stack(observations):
+            raise PolicyError(
+                f"{self.name} looks at {self.frame_stack} observations in a row: give it"
+                f" (B, {self.frame_stack}, *shape), oldest first"
+            )
+        return self._encode(_flatten(observations)).stacked(self.frame_stack)
+
+    def _remember(self, now: Observations) -> Observations:
+        """The last observations in a row, this one last; the first stands for what was before."""
+        if self._seen and len(self._seen[-1]) != len(now):
+            self.begin()
+        self._seen.extend([now] * (1 if self._seen else self.frame_stack))
+        while len(self._seen) > self.frame_stack:
+            self._seen.popleft()
+        columns = zip(*(past.parts() for past in self._seen), strict=True)
+        in_rows = [torch.stack(column, 1).flatten(0, 1) for column in columns]
+        return now.like(in_rows).stacked(self.frame_stack)
+
+    def _encode(self, observations: Any) -> Observations:
+        try:
+            return self.encoder.encode(observations)
+        except SpaceError as error:
+            raise PolicyError(f"{self.name} {error}") from error
 
 
-def save_policy(folder: Path, learner: Learner, env_id: str, env_kwargs: dict[str, Any]) -> None:
-    """Write the learner's present policy into a folder."""
-    weights: dict[str, Tensor] = learner.network.state_dict()
+def save_policy(
+    folder: Path, learner: Learner, seed: int, env_id: str, env_kwargs: dict[str, Any]
+) -> None:
+    """Write a seed's present policy into a folder."""
+    buffer = learner.buffer
+    networks = {name: learner.network(name, seed) for name in learner.policy_models}
+    weights = {
+        f"{name}.{key}": value
+        for name, network in networks.items()
+        for key, value in network.state_dict().items()
+    }
+    weights["observation.shift"] = torch.from_numpy(buffer.encoder.shift)
+    weights["observation.scale"] = torch.from_numpy(buffer.encoder.scale)
     write_tensors(folder / _WEIGHTS_NAME, weights, {"updates": learner.step})
     description = {
         "format_version": FORMAT_VERSION,
         "algo": learner.name,
-        "outputs": learner.outputs,
+        "acts_by": learner.acts_by,
+        "threshold": getattr(learner.config, "threshold", 0.0),
         "updates": learner.step,
-        "hidden": list(learner.config.hidden),
+        "architecture": asdict(learner.config.architecture),
+        "outputs": {name: list(network.output_shape) for name, network in networks.items()},
+        "frame_stack": buffer.packing.frame_stack,
         "env_id": env_id,
         "env_kwargs": env_kwargs,
-        "observation_space": json.loads(space_to_json(learner.buffer.observation_space)),
-        "action_space": json.loads(space_to_json(learner.buffer.action_space)),
+        "observation_space": json.loads(space_to_json(buffer.encoder.space)),
+        "action_space": json.loads(space_to_json(buffer.action_space)),
     }
-    write_json(folder / _JSON_NAME, description)
+    write_json(folder / POLICY_NAME, description)
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -148,7 +247,7 @@ def load_policies(path: str | Path) -> list[Policy]:
 
 
 def _seed_folders(path: Path) -> list[Path]:
-    if (path / _JSON_NAME).exists():
+    if (path / POLICY_NAME).exists():
         return [path]
     numbered = {
         int(number): folder
@@ -156,19 +255,19 @@ def _seed_folders(path: Path) -> list[Path]:
         if (number := folder.name.removeprefix("seed-")).isdigit()
     }
     if not numbered:
-        raise PolicyError(f"{path} has no policy: neither {_JSON_NAME} nor a seed-K folder")
+        raise PolicyError(f"{path} has no policy: neither {POLICY_NAME} nor a seed-K folder")
     return [numbered[number] for number in sorted(numbered)]
 
 
 def _load_seed(folder: Path) -> Policy:
     try:
-        description = json.loads((folder / _JSON_NAME).read_text())
+        description = json.loads((folder / POLICY_NAME).read_text())
         if description["format_version"] != FORMAT_VERSION:
             raise ValueError(f"format_version {description['format_version']} is not known")
-        return _build(folder, description, load_file(folder / _WEIGHTS_NAME))
+        return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])
     except FileNotFoundError as error:
         raise PolicyError(
-            f"{folder} has no policy: no {_JSON_NAME} and {_WEIGHTS_NAME}; "
+            f"{folder} has no policy: no {POLICY_NAME} and {_WEIGHTS_NAME}; "
             "training writes them with its first checkpoint"
         ) from error
     except _BROKEN_FILE_ERRORS as error:
@@ -177,13 +276,22 @@ def _load_seed(folder: Path) -> Policy:
 
 
 def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Policy:
-    if description["outputs"] not in ("q_values", "logits"):
-        raise ValueError(f"outputs {description['outputs']!r} are not known")
+    if description["acts_by"] not in get_args(ActsBy):
+        raise ValueError(f"acts_by {description['acts_by']!r} is not known")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = discrete_actions(space_from_json(json.dumps(description["action_space"])))
-    hidden = tuple(description["hidden"])
-    network = build_network(observation_space, int(action_space.n), hidden)
-    network.load_state_dict(weights)
+    encoder = ObservationEncoder(observation_space, int(action_space.n))
+    encoder.shift = weights.pop("observation.shift").numpy()
+    encoder.scale = weights.pop("observation.scale").numpy()
+    stack, shape = int(description["frame_stack"]), description["architecture"]
+    architecture = Architecture(**{**shape, "hidden": tuple(shape["hidden"])})
+    images = [(height, width, count * stack) for height, width, count in encoder.image_shapes]
+    networks = {
+        name: Network(encoder.width * stack, images, tuple(outputs), architecture)
+        for name, outputs in description["outputs"].items()
+    }
+    scores = Scores(networks, description["acts_by"], float(description["threshold"]))
+    scores.networks.load_state_dict(weights)
     return Policy(
         name=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         algo=description["algo"],
@@ -191,6 +299,14 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         action_space=action_space,
         env_id=description["env_id"],
         env_kwargs=description["env_kwargs"],
-        outputs=description["outputs"],
-        network=network.eval(),
+        frame_stack=stack,
+        encoder=encoder,
+        scores=scores.eval(),
     )
+
+
+def _flatten(observations: Any) -> Any:
+    """(B, k, *shape) to (B * k, *shape), in nested dicts too."""
+    if isinstance(observations, dict):
+        return {key: _flatten(part) for key, part in observations.items()}
+    return observations.reshape(-1, *observations.shape[2:])

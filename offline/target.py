@@ -2,47 +2,76 @@
 
 from __future__ import annotations
 
-import copy
-from typing import cast
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mcaprl.offline.buffer import Batch, TransitionBuffer
+from mcaprl.offline.models import Model
 
 _ROWS_AT_ONCE = 1024
 
 
 class HardTarget:
-    """Values of the next states under a network copied every so many updates.
+    """Values under a model that is copied every so many updates.
 
     Between two copies the values do not change. So, where the data set is smaller than what is
     sampled in that time, each is computed once for the whole data set and then looked up.
+
+    Attributes:
+        model: the copy.
     """
 
-    def __init__(self, network: nn.Module, buffer: TransitionBuffer, rows_per_sync: int) -> None:
-        """Copy `network`; about `rows_per_sync` rows are asked for between two calls of `sync`."""
-        self.network = copy.deepcopy(network).requires_grad_(False)
-        self._next_observations = buffer.next_observations
-        self._table: Tensor | None = None
+    def __init__(
+        self,
+        model: Model,
+        buffer: TransitionBuffer,
+        rows_per_sync: int,
+        *,
+        next_states: bool = True,
+    ) -> None:
+        """Copy `model`.
+
+        Args:
+            model: that learns.
+            buffer: what it learns from.
+            rows_per_sync: about how many rows of a seed are asked for between two calls of `sync`.
+            next_states: whether the values are those of the next states, or of the states.
+        """
+        self.model = model.clone()
+        self._buffer = buffer
+        self._next_states = next_states
         self._use_table = len(buffer) <= rows_per_sync
-        self.refresh()
+        self._table: Tensor | None = None
+        self._seeds = len(model.weights)
+        self._offsets = torch.arange(self._seeds).unsqueeze(1) * len(buffer)
 
-    def sync(self, network: nn.Module) -> None:
-        """Copy the weights of `network`."""
-        self.network.load_state_dict(network.state_dict())
-        self.refresh()
+    def sync(self, model: Model) -> None:
+        """Copy the weights of `model`."""
+        self.model.weights.copy_(model.weights)
+        self.forget()
 
-    @torch.no_grad()
-    def refresh(self) -> None:
-        """Compute the table anew, after the weights have changed."""
-        if self._use_table:
-            parts = torch.split(self._next_observations, _ROWS_AT_ONCE)
-            self._table = torch.cat([self.network(part) for part in parts])
+    def forget(self) -> None:
+        """Compute values anew when they are next asked for: the weights have changed."""
+        self._table = None
 
-    @torch.no_grad()
-    def values(self, batch: Batch) -> Tensor:
-        """(B, A) values of the batch's next states."""
-        if self._table is not None:
-            return self._table.index_select(0, batch.rows)
-        return cast(Tensor, self.network(batch.next_observations))
+    def outputs(self, batch: Batch) -> Tensor:
+        """(R, ...) the model's outputs for the batch's states, or next states."""
+        if not self._use_table:
+            return self.model(batch.next_observations if self._next_states else batch.observations)
+        if self._table is None:
+            self._table = outputs_everywhere(
+                self.model, self._buffer, next_states=self._next_states
+            )
+        rows = batch.rows
+        if self._seeds > 1:
+            rows = (rows.view(self._seeds, -1) + self._offsets).flatten()
+        return self._table.index_select(0, rows)
+
+
+def outputs_everywhere(model: Model, buffer: TransitionBuffer, *, next_states: bool) -> Tensor:
+    """(K * N, ...) the outputs of K networks for the N states of a buffer, or its next states."""
+    seeds, parts = len(model.weights), []
+    for places in torch.split(buffer.places[int(next_states)], _ROWS_AT_ONCE):
+        outputs = model(buffer.observe(places.repeat(seeds)))
+        parts.append(outputs.view(seeds, len(places), *outputs.shape[1:]))
+    return torch.cat(parts, 1).flatten(0, 1)

@@ -1,6 +1,7 @@
-"""Train one algorithm on one dataset, with several seeds, into a run folder.
+"""Train one algorithm on one dataset, with several seeds at once, into a run folder.
 
 RUN/config.json                         algorithm, settings, data
+RUN/curves.png                          all seeds' curves, see `curves`
 RUN/seed-0/policy.json, .safetensors    see `policy`
 RUN/seed-0/checkpoint.safetensors       see `checkpoint`
 RUN/seed-0/metrics.csv                  loss terms by update; the same for TensorBoard
@@ -9,35 +10,47 @@ RUN/seed-1/...
 
 from __future__ import annotations
 
-import json
+import hashlib
 import time
-from contextlib import nullcontext
+import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 
-from mcaprl.errors import OutputExistsError, TrainingError, UsageError
-from mcaprl.files import write_json
+from mcaprl.errors import TrainingError, UsageError
 from mcaprl.offline.algorithms import choose_algorithm
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.checkpoint import (
     CHECKPOINT_NAME,
+    Checkpoint,
     RunIdentity,
-    load_checkpoint,
+    read_checkpoint,
     save_checkpoint,
 )
-from mcaprl.offline.config import TrainingConfig
+from mcaprl.offline.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.learner import Learner, NotFiniteError
 from mcaprl.offline.metrics import MetricsWriter
-from mcaprl.offline.policy import save_policy
+from mcaprl.offline.observations import ObservationEncoder
+from mcaprl.offline.policy import POLICY_NAME, load_policy, save_policy
+from mcaprl.offline.run_folder import RunFolder
+from mcaprl.offline.watch import (
+    HeldOut,
+    choose_held_out,
+    divergence_warning,
+    horizon_warning,
+    largest_return,
+)
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.sims.statistics import bootstrap_interval
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
-
-CONFIG_NAME = "config.json"
 
 
 @dataclass(frozen=True)
@@ -50,7 +63,7 @@ class RunSummary:
         seed: K.
         updates: done in all.
         resumed_at: updates that an earlier session had done; 0 for a fresh start.
-        seconds: wall time of this session.
+        seconds: wall time of this session, shared with the seeds that learned beside it.
         terms: the last update's loss terms; empty if there was nothing left to do.
     """
 
@@ -70,19 +83,27 @@ def train(
     *,
     seeds: int = 1,
     seed: int = 0,
+    weights: NDArray[np.float64] | None = None,
     resume: bool = False,
+    other_data: bool = False,
+    follow: GrowingLogs | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[RunSummary]:
     """Train on a dataset; the same seed, data and machine give the same weights.
 
     Args:
         dataset: with discrete actions.
-        algo: `dqn`, `double-dqn`, `cql` or `bc` with default settings, or a config such as
+        algo: a name such as `cql`, with default settings, or a config such as
             `CQLConfig(alpha=0.5)`.
         out: the run's folder; it must not exist, or be empty.
-        seeds: how many networks to train, one after the other.
+        seeds: how many networks to train, side by side; they do not depend on each other.
         seed: of the first; the others count up from it.
+        weights: (E,) how often each transition of an episode is drawn, relative to others; default:
+            all alike.
         resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
+        other_data: when resuming, go on even if the checkpoints are from other data.
+        follow: logs that `dataset` was read from and that grow; each episode that is finished
+            while the networks learn is learned from, too.
         progress: called with each row of metrics; None shows a bar where stderr is a terminal.
 
     Returns:
@@ -97,125 +118,186 @@ def train(
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
     learner_type, config = choose_algorithm(algo)
-    buffer = TransitionBuffer.from_dataset(dataset)
-    run = _Run(Path(out), dataset, RunIdentity(learner_type.name, config, dataset.fingerprint))
-    run.open(resume)
+    weights = np.ones(len(dataset.episodes)) if weights is None else weights
+    _check_weights(weights, len(dataset.episodes))
+    identity = RunIdentity(learner_type.name, config, _fingerprint(dataset, weights), other_data)
+    source = {"env_id": dataset.env_id, "transitions": len(dataset)}
+    folder = RunFolder(Path(out), identity, source)
+    held_out = choose_held_out(len(weights), config.held_out)
+    drawn = np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
+    buffer = TransitionBuffer.from_dataset(
+        dataset,
+        config.packing,
+        encoder=_earlier_encoder(folder) if resume and other_data else None,
+        weights=drawn,
+    )
+    folder.open(resume)
+    if message := horizon_warning(config):
+        warnings.warn(message, stacklevel=2)
+    gamma = config.gamma if isinstance(config, BootstrapConfig) else 1.0
+    watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
+    run = _Run(folder, dataset, watched, largest_return(dataset, gamma), held_out, follow)
+    summaries = []
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-        return [
-            run.train_seed(learner_type, buffer, number, report)
-            for number in range(seed, seed + seeds)
-        ]
+        for start in _starts(folder, range(seed, seed + seeds)):
+            learner = learner_type(config, buffer, list(start))
+            for number, checkpoint in start.items():
+                if checkpoint is not None:
+                    checkpoint.restore(learner, number)
+            summaries += run.train(learner, report)
+    return sorted(summaries, key=lambda summary: summary.seed)
+
+
+def describe_seeds(summaries: Sequence[RunSummary]) -> list[str]:
+    """A line for each seed, and one with means and 95 % intervals over seeds."""
+    lines = []
+    for summary in summaries:
+        done = summary.updates - summary.resumed_at
+        rate = done / summary.seconds if summary.seconds else 0.0
+        terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
+        lines.append(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
+    finished = [summary.terms for summary in summaries if summary.terms]
+    if len(finished) > 1:
+        shown = []
+        for name in finished[0]:
+            values = np.array([[terms[name]] for terms in finished])
+            low, high = bootstrap_interval(values)
+            shown.append(f"{name} {values.mean():.4g} [{low:.4g}, {high:.4g}]")
+        lines.append(f"mean of {len(finished)} seeds [95 % interval]: {', '.join(shown)}")
+    return lines
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A run folder, and what every seed in it shares."""
+    """What all seeds of a run share.
 
-    folder: Path
+    Attributes:
+        folder: of the run.
+        dataset: that it learns from.
+        held_out: transitions to judge the networks by, if any.
+        limit: no return can be larger in size.
+        never_drawn: numbers of the held-out episodes.
+        follow: the logs, if they may grow.
+    """
+
+    folder: RunFolder
     dataset: Dataset
-    identity: RunIdentity
+    held_out: HeldOut | None
+    limit: float
+    never_drawn: NDArray[np.int64]
+    follow: GrowingLogs | None
 
-    def open(self, resume: bool) -> None:
-        """Make the folder, or make sure that it is this run's."""
-        path = self.folder / CONFIG_NAME
-        if resume and path.exists():
-            self._check_same_run(path)
-            return
-        if self.folder.is_file() or (self.folder.is_dir() and any(self.folder.iterdir())):
-            raise OutputExistsError(
-                f"{self.folder} exists: choose another folder"
-                + (
-                    "; it holds no run to resume"
-                    if resume
-                    else ", or resume the run in it (--resume)"
-                )
-            )
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise TrainingError(f"cannot write {self.folder}: {error.strerror}") from error
-        source = {"env_id": self.dataset.env_id, "transitions": len(self.dataset.rewards)}
-        write_json(path, {**self.identity.to_json(), **source})
-
-    def train_seed(
-        self,
-        learner_type: type[Learner],
-        buffer: TransitionBuffer,
-        seed: int,
-        report: ProgressCallback,
-    ) -> RunSummary:
-        """Train one network, from its last checkpoint if it has one."""
-        folder = self.folder / f"seed-{seed}"
-        folder.mkdir(exist_ok=True)
-        began = time.perf_counter()
-        with torch.random.fork_rng(devices=[]):
-            learner = learner_type(self.identity.config, buffer, seed)
-            load_checkpoint(folder, learner, self.identity)
-            resumed_at = learner.step
-            terms: dict[str, float] = {}
-            if resumed_at < learner.config.updates:
-                terms = self._train(folder, learner, seed, report)
-        seconds = time.perf_counter() - began
-        return RunSummary(folder, learner.name, seed, learner.step, resumed_at, seconds, terms)
-
-    def _train(
-        self, folder: Path, learner: Learner, seed: int, report: ProgressCallback
-    ) -> dict[str, float]:
-        """Make all updates that are left; gives the last one's terms."""
+    def train(self, learner: Learner, report: ProgressCallback) -> list[RunSummary]:
+        """Make all updates that are left to a learner's seeds."""
+        began, resumed_at = time.perf_counter(), learner.step
         updates = learner.config.updates
-        with MetricsWriter(folder, learner.step + 1) as metrics:
-            while True:
-                terms = self._train_to_next_stop(folder, learner, metrics)
-                report(TrainingProgress(seed, learner.step, updates, terms))
-                if learner.step == updates:
-                    return terms
+        terms: list[dict[str, float]] = [{} for _ in learner.seeds]
+        warned = False
+        with ExitStack() as stack:
+            metrics = [
+                stack.enter_context(MetricsWriter(self.folder.of_seed(seed), learner.step + 1))
+                for seed in learner.seeds
+                if learner.step < updates
+            ]
+            while learner.step < updates:
+                learner = self._with_new_episodes(learner)
+                before, terms = terms, self._train_to_next_stop(learner, metrics)
+                warned = warned or self._warn(before, terms)
+                for seed, mine in zip(learner.seeds, terms, strict=True):
+                    report(TrainingProgress(seed, learner.step, updates, mine))
+        seconds = time.perf_counter() - began
+        return [
+            RunSummary(
+                self.folder.of_seed(seed), learner.name, seed, updates, resumed_at, seconds, mine
+            )
+            for seed, mine in zip(learner.seeds, terms, strict=True)
+        ]
 
     def _train_to_next_stop(
-        self, folder: Path, learner: Learner, metrics: MetricsWriter
-    ) -> dict[str, float]:
+        self, learner: Learner, metrics: list[MetricsWriter]
+    ) -> list[dict[str, float]]:
         """Update until something is to be written, and write it."""
         config = learner.config
         while True:
-            terms = _update(folder, learner)
+            terms = self._update(learner)
             last = learner.step == config.updates
             checkpoint_due = last or learner.step % config.checkpoint_interval == 0
-            if not (checkpoint_due or learner.step % config.log_interval == 0):
+            if checkpoint_due or learner.step % config.log_interval == 0:
+                break
+        values = learner.seed_means(terms)
+        if self.held_out is not None:
+            judged = self.held_out.terms(learner)
+            values = [mine | held for mine, held in zip(values, judged, strict=True)]
+        rate = config.learning_rate_at(learner.step - 1)
+        for writer, mine in zip(metrics, values, strict=True):
+            writer.write(learner.step, rate, mine)
+        if checkpoint_due:
+            self._save(learner)
+        return values
+
+    def _with_new_episodes(self, learner: Learner) -> Learner:
+        """The learner, now and then with the episodes that were logged meanwhile."""
+        if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
+            return learner
+        return with_more_data(learner, self.follow.dataset, self.never_drawn)
+
+    def _save(self, learner: Learner) -> None:
+        """Write each seed's policy and then its checkpoint.
+
+        The checkpoint comes last: a kill before it costs updates, but leaves no policy behind that
+        is older than a finished run.
+        """
+        for seed in learner.seeds:
+            folder = self.folder.of_seed(seed)
+            save_policy(folder, learner, seed, self.dataset.env_id, self.dataset.env_kwargs)
+            save_checkpoint(folder, learner, seed, self.folder.identity)
+
+    def _update(self, learner: Learner) -> dict[str, Any]:
+        try:
+            return learner.update()
+        except NotFiniteError as error:
+            paths = [self.folder.of_seed(seed) / CHECKPOINT_NAME for seed in learner.seeds]
+            good = ", ".join(str(path) for path in paths if path.exists()) or "none yet"
+            raise TrainingError(
+                f"update {learner.step + 1} of {self.folder.path}: {error}. Last good checkpoint:"
+                f" {good}. Look for huge values in the data, or lower the learning rate"
+            ) from error
+
+    def _warn(self, before: list[dict[str, float]], now: list[dict[str, float]]) -> bool:
+        """Tell of values that run away, once; gives whether it was told."""
+        for earlier, later in zip(before, now, strict=True):
+            if "mean_q" not in earlier:
                 continue
-            values = {name: term.item() for name, term in terms.items()}
-            metrics.write(learner.step, config.learning_rate_at(learner.step - 1), values)
-            if checkpoint_due:
-                # The checkpoint comes last: a kill before it costs updates, but leaves no policy
-                # behind that is older than a finished run.
-                save_policy(folder, learner, self.dataset.env_id, self.dataset.env_kwargs)
-                save_checkpoint(folder, learner, self.identity)
-            return values
-
-    def _check_same_run(self, path: Path) -> None:
-        self.identity.check_same(read_config(path), path)
+            if message := divergence_warning(earlier["mean_q"], later["mean_q"], self.limit):
+                warnings.warn(message, stacklevel=2)
+                return True
+        return False
 
 
-def read_config(path: Path) -> dict[str, Any]:
-    """What RUN/config.json says: `algo`, `config`, `data` and where the data came from.
-
-    Raises:
-        TrainingError: it cannot be read, or is no JSON object.
-    """
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
-    if not isinstance(found, dict):
-        raise TrainingError(f"cannot resume: {path} is no JSON object")
-    return found
+def _starts(folder: RunFolder, seeds: range) -> list[dict[int, Checkpoint | None]]:
+    """Seeds with their checkpoints, in groups that have done the same number of updates."""
+    groups: dict[int, dict[int, Checkpoint | None]] = {}
+    for seed in seeds:
+        checkpoint = read_checkpoint(folder.of_seed(seed), folder.identity)
+        groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
+    return list(groups.values())
 
 
-def _update(folder: Path, learner: Learner) -> dict[str, torch.Tensor]:
-    try:
-        return learner.update()
-    except NotFiniteError as error:
-        path = folder / CHECKPOINT_NAME
-        good = path if path.exists() else "none yet"
-        raise TrainingError(
-            f"update {learner.step + 1} of {folder}: {error}. Last good checkpoint: {good}. "
-            "Look for NaN or huge values in the data, or lower the learning rate"
-        ) from error
+def _earlier_encoder(folder: RunFolder) -> ObservationEncoder | None:
+    """The normalisation that the weights in a folder are used to."""
+    policies = sorted(folder.path.glob(f"seed-*/{POLICY_NAME}"))
+    return load_policy(policies[0].parent).encoder if policies else None
+
+
+def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
+    """Of the data, and of their weights where these differ."""
+    if len(set(weights.tolist())) < 2:
+        return dataset.fingerprint
+    return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
+
+
+def _check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
+    if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
+        raise UsageError(
+            f"weights must be {n_episodes} numbers of at least 0, one for each episode"
+        )

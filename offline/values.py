@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.dqn import DQNConfig
-from mcaprl.offline.losses import q_learning
-from mcaprl.offline.train import CONFIG_NAME
+from mcaprl.offline.losses import q_learning_target
+from mcaprl.offline.run_folder import CONFIG_NAME
 from mcaprl.recorder.episode import Episode
 
 Columns = dict[str, NDArray[Any]]
@@ -97,15 +97,13 @@ def td_errors(
         terminated: (T,); nothing comes behind such a step.
         gamma: the discount.
     """
-    values = torch.from_numpy(q)
-    error = q_learning(
-        values[:-1],
-        torch.from_numpy(np.ascontiguousarray(actions)),
+    target = q_learning_target(
         torch.from_numpy(rewards.astype(np.float32)),
         torch.from_numpy(np.where(terminated, 0.0, gamma).astype(np.float32)),
-        values[1:],
-    ).error
-    return cast(NDArray[np.float32], error.numpy())
+        torch.from_numpy(q[1:]),
+    )
+    error: NDArray[np.float32] = target.numpy() - q[np.arange(len(actions)), actions]
+    return error
 
 
 def softmax(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -154,6 +154,24 @@ class Dataset:
         return f"images on disk in {names[0]}{more}" if names else "memory"
 
     @property
+    def frames(self) -> Any:
+        """(N + E, *shape), each observation once: an episode's, its last one, the next episode's.
+
+        Like `observations`, in nested dicts for a Dict space; not copied.
+        """
+        return nest(self._leaves, list(self._transitions.frames))
+
+    @property
+    def frame_of_step(self) -> NDArray[np.int64]:
+        """(N,) which of `frames` each transition's observation is; the next one is one more."""
+        return self._transitions.frame_of_step()
+
+    @property
+    def episode_lengths(self) -> NDArray[np.int64]:
+        """(E,) transitions of each episode."""
+        return self._transitions.lengths
+
+    @property
     def actions(self) -> NDArray[Any]:
         """(N,) int64 of a Discrete space, else (N, *shape)."""
         return self._transitions.actions

@@ -40,6 +40,8 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
 LEARNER_TOPIC = "/rl/learner"
+INTERRUPTED = "interrupted"
+"""Why an episode ended that the recorder, not the environment, broke off."""
 # Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100

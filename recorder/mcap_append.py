@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import McapRecord
+from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
@@ -17,6 +17,8 @@ from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import parse_record
 from mcaprl.recorder.mcap_summary import Summary
 
+Standing = Metadata | Schema | Channel | Attachment
+"""Records that stand outside of chunks."""
 _DATA_END = struct.Struct("<BQI")
 
 
@@ -34,7 +36,7 @@ class Written:
     summary: Summary
     end: int
     crc: int
-    standing: list[McapRecord] = field(default_factory=list)
+    standing: list[Standing] = field(default_factory=list)
 
 
 def what_is_written(path: Path) -> Written:
@@ -64,7 +66,8 @@ def what_is_written(path: Path) -> Written:
 
 
 def _take_topics(reader: McapReader, written: Written) -> None:
-    for topic in (*reader.schemas.values(), *reader.channels.values()):
+    topics: list[Standing] = [*reader.schemas.values(), *reader.channels.values()]
+    for topic in topics:
         written.summary.note(topic, 0, 0)
         written.standing.append(topic)
     for channel in reader.channels.values():
@@ -77,7 +80,7 @@ def _take_topics(reader: McapReader, written: Written) -> None:
 def _take_other_records(reader: McapReader, written: Written) -> None:
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            record = parse_record(opcode, content)
+            record: Standing = parse_record(opcode, content)
             written.summary.note(record, offset, RECORD_HEADER_BYTES + len(content))
             written.standing.append(record)
         elif opcode == Opcode.DATA_END:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Header,
@@ -33,9 +32,9 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
+from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, ChunkHeader, compressor
 from mcaprl.recorder.log_file import create, release, reopen
-from mcaprl.recorder.mcap_append import what_is_written
+from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.signals import HoldSignals
 
@@ -82,7 +81,7 @@ class McapWriter:
         self._compress_rows = compressor(compression, _ROWS_LEVEL)
         self._compress_messages = compressor(compression, _MESSAGES_LEVEL)
         # What every file begins with, in this order.
-        self._standing: list[McapRecord] = []
+        self._standing: list[Standing] = []
         if append and Path(path).exists():
             self._continue(Path(path))
         else:
@@ -92,6 +91,16 @@ class McapWriter:
     def closed(self) -> bool:
         """Whether the file is finished."""
         return self._file.closed
+
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Those announced, by id."""
+        return self._summary.schemas
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Those announced, by id."""
+        return self._summary.channels
 
     @property
     def end_time_ns(self) -> int:
@@ -141,7 +150,7 @@ class McapWriter:
         if all(record.name != name for record in self._summary.attachments):
             self.announce(Attachment(time_ns, time_ns, name, media_type, data))
 
-    def announce(self, record: Metadata | Schema | Channel | Attachment) -> None:
+    def announce(self, record: Standing) -> None:
         """Write a record that stands outside of chunks, in this file and those that follow it."""
         self._write_standing(record)
         self._standing.append(record)
@@ -192,6 +201,17 @@ class McapWriter:
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
         self._write_chunk(memoryview(builder.end()), indexes, self._compress_messages)
 
+    def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
+        """Write a chunk's records as they are.
+
+        Args:
+            records: Message records of announced channels, their sequence numbers included.
+            indexes: of `chunks.INDEX_ENTRY`, by channel id.
+        """
+        for channel_id, index in indexes.items():
+            self._summary.counts[channel_id] += len(index)
+        self._write_chunk(records, dict(indexes), self._compress_rows)
+
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
         if self.closed:
@@ -241,23 +261,24 @@ class McapWriter:
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
         data = compress(records)
         name = "" if self._compression == "none" else self._compression
-        builder = RecordBuilder()
-        Chunk(
+        header = ChunkHeader(
+            start_time=start_time,
+            end_time=end_time,
+            uncompressed_bytes=len(records),
+            crc=zlib.crc32(records),
             compression=name,
-            data=data,
-            message_start_time=start_time,
-            message_end_time=end_time,
-            uncompressed_crc=zlib.crc32(records),
-            uncompressed_size=len(records),
-        ).write(builder)
-        offset, chunk_bytes = self.position, builder.count
-        index_offsets = {}
+            data=slice(0, len(data)),
+        )
+        # The records go to the file as they are: a copy of them would cost as much as the rest.
+        head = header.to_record()
+        offset, chunk_bytes = self.position, len(head) + len(data)
+        index_offsets, builder = {}, RecordBuilder()
         for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset + builder.count
+            index_offsets[channel_id] = offset + chunk_bytes + builder.count
             _write_message_index(builder, channel_id, index)
-        index_bytes = builder.count - chunk_bytes
+        index_bytes = builder.count
         with HoldSignals():
-            self._write(builder.end())
+            self._write(head, data, builder.end())
             self._summary.chunks.append(
                 ChunkIndex(
                     chunk_start_offset=offset,
@@ -287,17 +308,19 @@ class McapWriter:
         record.write(builder)
         self._write(builder.end())
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
         """Write all of it or none: what stands in the file stays a whole number of records."""
         try:
             with HoldSignals():
                 if self.untouched:
                     self._cut_off_summary()
-                rest = memoryview(data)
-                while rest:
-                    rest = rest[self._file.write(rest) :]
-                self._crc = zlib.crc32(data, self._crc)
-                self.position += len(data)
+                for part in parts:
+                    rest = memoryview(part)
+                    while rest:
+                        rest = rest[self._file.write(rest) :]
+                for part in parts:
+                    self._crc = zlib.crc32(part, self._crc)
+                self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up()
             raise LogError(

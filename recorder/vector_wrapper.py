@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
+from mcaprl.recorder.log_writer import INTERRUPTED
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
 from mcaprl.recorder.rows import add_up, as_declared, converters
@@ -302,7 +303,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         with HoldSignals():
             for number in numbers.tolist():
                 if self._running[number] and self._steps[number] and not self._recording.closed:
-                    self._end(number, False, True, "interrupted")
+                    self._end(number, False, True, INTERRUPTED)
             self._running[numbers] = self._due[numbers] = False
             self._steps[numbers] = 0
             self._display.clear()

@@ -16,6 +16,7 @@ import gymnasium as gym
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
+from mcaprl.recorder.log_writer import INTERRUPTED
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
 from mcaprl.recorder.rows import ImageColumn, StepColumns, observation_keeper
@@ -224,7 +225,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Keep an episode that is broken off; one without a transition leaves no trace."""
         if self._open is not None and self._open.steps > 0:
             with HoldSignals():
-                self._end(False, True, "interrupted")
+                self._end(False, True, INTERRUPTED)
         self._display.clear()
         self._open = None
 

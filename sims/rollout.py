@@ -16,7 +16,10 @@ from mcaprl.errors import PolicyError
 
 
 class Policy(Protocol):
-    """Whatever chooses actions: a scripted pilot, a trained network."""
+    """Whatever chooses actions: a scripted pilot, a trained network.
+
+    One that remembers what it saw has a method `begin`, called where an episode begins.
+    """
 
     @property
     def name(self) -> str:
@@ -66,7 +69,10 @@ class EpsilonGreedy:
         self.begin(0)
 
     def begin(self, seed: int) -> None:
-        """Make what follows depend on `seed` alone."""
+        """Make what follows depend on `seed` alone: an episode begins."""
+        forget = getattr(self.policy, "begin", None)
+        if forget is not None:
+            forget()
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 

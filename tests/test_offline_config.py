@@ -10,9 +10,11 @@ import pytest
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.algorithms import ALGORITHMS, choose_algorithm
 from mcaprl.offline.bc import BCConfig
+from mcaprl.offline.bcq import BCQConfig
 from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.cql import CQLConfig
 from mcaprl.offline.dqn import DQNConfig
+from mcaprl.offline.iql import IQLConfig
 from mcaprl.settings import field_help
 
 
@@ -40,6 +42,25 @@ def test_a_single_update_has_the_full_learning_rate() -> None:
     assert TrainingConfig(updates=1, learning_rate=0.5).learning_rate_at(0) == 0.5
 
 
+def test_a_dueling_network_needs_a_hidden_layer() -> None:
+    with pytest.raises(UsageError, match="hidden must be not empty if dueling"):
+        DQNConfig(hidden=(), dueling=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reach"),
+    [
+        # Two copies of one step each: 1 + .5 of 2 rewards.
+        ({"updates": 20, "target_interval": 10, "gamma": 0.5}, 0.75),
+        ({"updates": 20, "target_interval": 10, "gamma": 0.5, "n_steps": 2}, 1 - 0.5**4),
+        ({"updates": 20, "target_interval": 10, "gamma": 0.0}, 1.0),
+        ({"updates": 20, "target_interval": 10, "gamma": 1.0}, 0.0),
+    ],
+)
+def test_how_far_values_reach(settings: dict[str, Any], reach: float) -> None:
+    assert DQNConfig(**settings).reach == pytest.approx(reach)
+
+
 def test_configs_cannot_be_changed() -> None:
     config: Any = CQLConfig()
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -55,6 +76,15 @@ def test_configs_cannot_be_changed() -> None:
         (BCConfig, "final_learning_rate_fraction", 1.5),
         (BCConfig, "hidden", (256, 0)),
         (BCConfig, "log_interval", 0),
+        (BCConfig, "weight_decay", -0.1),
+        (BCConfig, "frame_stack", 0),
+        (BCConfig, "held_out", 1.0),
+        (DQNConfig, "n_steps", 0),
+        (DQNConfig, "n_quantiles", 0),
+        (BCQConfig, "threshold", 1.1),
+        (BCQConfig, "logits_penalty", -1.0),
+        (IQLConfig, "expectile", 1.0),
+        (IQLConfig, "beta", -1.0),
         (BCConfig, "checkpoint_interval", -1),
         (DQNConfig, "gamma", 1.01),
         (DQNConfig, "target_interval", 0),
@@ -81,7 +111,9 @@ def test_an_algorithm_is_chosen_by_name_or_by_its_settings() -> None:
 
 
 def test_an_unknown_algorithm_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match=r"'cqll'.*known: bc, cql, double-dqn, dqn"):
+    with pytest.raises(
+        UnknownNameError, match=r"'cqll'.*known: bc, bcq, cql, double-dqn, dqn, iql"
+    ):
         choose_algorithm("cqll")
 
 

@@ -1,14 +1,26 @@
-"""Networks: what they take, what they give, what they refuse."""
+"""Networks: what they take, what they give, and K of them at once."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
+from typing import Any
+
 import pytest
 import torch
-from gymnasium import spaces
+from torch import Tensor
 
-from mcaprl.errors import SpaceError
-from mcaprl.offline.networks import build_network, observation_tensor
+from mcaprl.offline.models import AnyModel, Model, StackedMLP, build_model
+from mcaprl.offline.networks import Architecture, Network
+from mcaprl.offline.observations import Observations
+
+
+def vectors(rows: int, width: int, seed: int = 0) -> Observations:
+    return Observations(torch.randn(rows, width, generator=torch.Generator().manual_seed(seed)))
+
+
+def pictures(rows: int, *shapes: tuple[int, ...], width: int = 0) -> Observations:
+    images = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
+    return Observations(torch.randn(rows, width), tuple(images))
 
 
 def weights_of(network: torch.nn.Module) -> list[tuple[int, ...]]:
@@ -16,43 +28,46 @@ def weights_of(network: torch.nn.Module) -> list[tuple[int, ...]]:
 
 
 def test_vectors_go_through_the_hidden_layers() -> None:
-    network = build_network(spaces.Box(-1, 1, (12,)), 9, (256, 128))
+    network = Network(12, [], (9,), Architecture((256, 128)))
     assert weights_of(network) == [(256, 12), (128, 256), (9, 128)]
-    assert network(torch.zeros(5, 12)).shape == (5, 9)
+    assert network(vectors(5, 12)).shape == (5, 9)
 
 
 def test_without_hidden_layers_the_network_is_linear() -> None:
-    network = build_network(spaces.Box(-1, 1, (3,)), 2, ())
+    network = Network(3, [], (2,), Architecture(()))
     left, right = torch.randn(2, 4, 3)
-    torch.testing.assert_close(
-        network(left) + network(right), network(left + right) + network(torch.zeros(4, 3))
-    )
-
-
-def test_arrays_of_floats_are_flattened() -> None:
-    network = build_network(spaces.Box(-1, 1, (3, 4)), 2, (8,))
-    assert network(torch.zeros(5, 3, 4)).shape == (5, 2)
-
-
-@pytest.mark.parametrize("shape", [(84, 84), (84, 84, 1), (84, 84, 4), (36, 48, 3)])
-def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
-    network = build_network(spaces.Box(0, 255, shape, np.uint8), 4, (512,))
-    channels = shape[2] if len(shape) == 3 else 1
-    assert weights_of(network)[:3] == [(32, channels, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3)]
-    assert network(torch.zeros(2, *shape, dtype=torch.uint8)).shape == (2, 4)
+    outputs = [network(Observations(x)) for x in (left, right, left + right, torch.zeros(4, 3))]
+    torch.testing.assert_close(outputs[0] + outputs[1], outputs[2] + outputs[3])
 
 
 def test_the_nature_network_has_its_published_size() -> None:
-    network = build_network(spaces.Box(0, 255, (84, 84, 4), np.uint8), 18, (512,))
-    assert weights_of(network)[3:] == [(512, 3136), (18, 512)]
+    network = Network(0, [(84, 84, 4)], (18,), Architecture((512,)))
+    convolutions = [(32, 4, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3)]
+    assert weights_of(network) == [*convolutions, (512, 3136), (18, 512)]
+
+
+@pytest.mark.parametrize("shape", [(84, 84, 1), (36, 48, 3)])
+def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
+    network = Network(0, [shape], (4,), Architecture((16,)))
+    assert network(pictures(2, shape)).shape == (2, 4)
+
+
+def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
+    network = Network(3, [(36, 36, 1), (40, 36, 2)], (4,), Architecture((8, 6)))
+    assert weights_of(network.body) == [(6, 24)]
+    both = pictures(2, (36, 36, 1), (40, 36, 2), width=3)
+    assert network(both).shape == (2, 4)
+    for part in (*both.images, both.vector):
+        before = network(both)
+        part.add_(1)
+        assert not torch.equal(network(both), before)
 
 
 def test_channels_are_kept_apart_from_rows() -> None:
-    # A network on (height, width, channels) must give the same for equal channels in any order.
-    space = spaces.Box(0, 255, (36, 36, 2), np.uint8)
-    network = build_network(space, 3, (16,))
+    # Equal channels must give the same in any order of the weights.
+    network = Network(0, [(36, 36, 2)], (3,), Architecture((16,)))
     image = torch.randint(0, 256, (1, 36, 36, 1), dtype=torch.uint8)
-    twice = torch.cat([image, image], dim=3)
+    twice = Observations(torch.empty(1, 0), (torch.cat([image, image], dim=3),))
     first = next(network.parameters())
     with torch.no_grad():
         before = network(twice)
@@ -60,29 +75,96 @@ def test_channels_are_kept_apart_from_rows() -> None:
         torch.testing.assert_close(network(twice), before)
 
 
-def test_images_stay_bytes_and_all_else_becomes_float32() -> None:
-    image_space = spaces.Box(0, 255, (36, 36), np.uint8)
-    assert observation_tensor(np.zeros((2, 36, 36), np.uint8), image_space).dtype == torch.uint8
-    vector_space = spaces.Box(-1, 1, (3,), np.float64)
-    assert observation_tensor(np.zeros((2, 3)), vector_space).dtype == torch.float32
+@pytest.mark.parametrize("output_shape", [(4,), (4, 5)])
+def test_dueling_advantages_have_mean_zero(output_shape: tuple[int, ...]) -> None:
+    network = Network(3, [], output_shape, Architecture((16, 8), dueling=True))
+    seen = vectors(6, 3)
+    head: Any = network.head
+    value = head.value(network.body(network.stems[0](seen.vector)))
+    torch.testing.assert_close(network(seen).mean(1).flatten(), value.flatten())
 
 
-def test_arrays_that_may_not_be_written_to_are_taken() -> None:
-    frozen = np.zeros((2, 3), np.float32)
-    frozen.flags.writeable = False
-    assert observation_tensor(frozen, spaces.Box(-1, 1, (3,))).shape == (2, 3)
+def test_layer_norm_makes_outputs_blind_to_the_scale_of_the_first_layer() -> None:
+    network = Network(3, [], (2,), Architecture((32, 16), layer_norm=True))
+    seen = vectors(4, 3)
+    before = network(seen)
+    with torch.no_grad():
+        for parameter in list(network.stems[0].parameters())[:2]:
+            parameter.mul_(10)
+    torch.testing.assert_close(network(seen), before, rtol=1e-3, atol=1e-3)
 
 
-def test_images_too_small_for_the_convolutions_are_refused() -> None:
-    with pytest.raises(SpaceError, match=r"36x36.*\(35, 84, 1\)"):
-        build_network(spaces.Box(0, 255, (35, 84, 1), np.uint8), 2, (8,))
+def networks(count: int, hidden: tuple[int, ...] = (32, 16)) -> list[Network]:
+    torch.manual_seed(3)
+    return [Network(5, [], (4,), Architecture(hidden)) for _ in range(count)]
+
+
+def gradients(model: Model, observations: Observations, slope: Tensor) -> tuple[Tensor, Tensor]:
+    outputs = model.learn_from(observations)
+    model.backward(slope)
+    return outputs, model.gradients.clone()
+
+
+@pytest.mark.parametrize("hidden", [(), (32,), (32, 16, 24)])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_written_out_backward_pass_is_that_of_autograd(
+    seeds: int, hidden: tuple[int, ...]
+) -> None:
+    seen, slope = vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
+    by_hand = gradients(StackedMLP(networks(seeds, hidden)), seen, slope)
+    automatic = gradients(AnyModel(networks(seeds, hidden)), seen, slope)
+    for mine, reference in zip(by_hand, automatic, strict=True):
+        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
+
+
+def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
+    seen, slope = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
+    together = gradients(model_type(networks(4)), seen, slope)
+    pairs = []
+    for k, network in enumerate(networks(4)):
+        mine = slice(k * rows, (k + 1) * rows)
+        alone = gradients(model_type([network]), Observations(seen.vector[mine]), slope[mine])
+        pairs += [(alone[0], together[0][mine]), (alone[1][0], together[1][k])]
+    return pairs
+
+
+@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
+@pytest.mark.parametrize("rows", [1, 32, 256])
+def test_a_seed_gets_the_same_bits_alone_and_beside_others(
+    model_type: type[Model], rows: int
+) -> None:
+    assert all(torch.equal(alone, beside) for alone, beside in alone_and_together(model_type, rows))
+
+
+def test_a_network_shows_the_weights_of_its_model() -> None:
+    model = build_model(networks(2))
+    seen = vectors(6, 5)
+    model.weights.mul_(0.5)
+    expected = torch.cat(
+        [net(part) for net, part in zip(model.networks, seen.split(3), strict=True)]
+    )
+    torch.testing.assert_close(model(seen), expected)
+
+
+def test_a_clone_has_weights_of_its_own() -> None:
+    model = build_model(networks(2))
+    clone = model.clone()
+    before = clone(vectors(4, 5))
+    model.weights.zero_()
+    assert torch.equal(clone(vectors(4, 5)), before)
+    assert before.abs().min() > 0
 
 
 @pytest.mark.parametrize(
-    "space",
-    [spaces.Dict({"depth": spaces.Box(0, 1, (3,))}), spaces.Discrete(4)],
-    ids=["Dict", "Discrete"],
+    ("network", "kind"),
+    [
+        (Network(5, [], (4,), Architecture((8,))), StackedMLP),
+        (Network(5, [], (4, 3), Architecture((8,))), StackedMLP),
+        (Network(5, [], (4,), Architecture((8,), layer_norm=True)), AnyModel),
+        (Network(5, [], (4,), Architecture((8,), dueling=True)), AnyModel),
+        (Network(5, [], (1,), Architecture((8,))), AnyModel),
+        (Network(0, [(36, 36, 1)], (4,), Architecture((8,))), AnyModel),
+    ],
 )
-def test_other_observations_are_refused(space: spaces.Space[object]) -> None:
-    with pytest.raises(SpaceError, match=f"Box observations, got a {type(space).__name__}"):
-        build_network(space, 2, (8,))
+def test_plain_networks_are_stacked(network: Network, kind: type[Model]) -> None:
+    assert type(build_model([network])) is kind

@@ -14,10 +14,16 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
+from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.bc import BC, BCConfig
+from mcaprl.offline.bcq import BCQ
 from mcaprl.offline.buffer import TransitionBuffer
+from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.cql import CQL, CQLConfig
+from mcaprl.offline.dqn import DQNConfig
+from mcaprl.offline.iql import IQL
 from mcaprl.offline.learner import Learner
+from mcaprl.offline.observations import Observations
 from mcaprl.offline.policy import Policy, load_policies, load_policy, save_policy
 from mcaprl.offline.train import train
 from mcaprl.recorder.dataset import Dataset
@@ -28,31 +34,38 @@ TINY: dict[str, Any] = {"updates": 20, "batch_size": 16, "hidden": (16, 8)}
 
 @pytest.fixture
 def cql_run(tmp_path: Path) -> Path:
-    train(corridor(), CQLConfig(**TINY), tmp_path / "run", seeds=2, progress=lambda _: None)
+    config = CQLConfig(**TINY, gamma=0.5)
+    train(corridor(), config, tmp_path / "run", seeds=2, progress=lambda _: None)
     return tmp_path / "run"
 
 
-def learner_with_outputs(learner_type: type[Learner], outputs: list[float]) -> Learner:
-    """A learner whose network gives the same outputs for whatever it sees."""
-    config = learner_type.config_type(**{**TINY, "hidden": ()})
-    learner = learner_type(config, TransitionBuffer.from_dataset(corridor()), 0)
-    linear = [module for module in learner.network.modules() if isinstance(module, torch.nn.Linear)]
-    with torch.no_grad():
-        linear[-1].weight.zero_()
-        linear[-1].bias.copy_(torch.tensor(outputs))
+def learner_of(config: TrainingConfig, dataset: Dataset) -> Learner:
+    learner_type = next(each for each in ALGORITHMS.values() if type(config) is each.config_type)
+    return learner_type(config, TransitionBuffer.from_dataset(dataset, config.packing), [0])
+
+
+def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> Learner:
+    """A learner whose networks give the same outputs for whatever they see."""
+    learner = learner_of(learner_type.config_type(**{**TINY, "hidden": ()}), corridor())
+    for name, constants in zip(learner.policy_models, outputs, strict=True):
+        *_, weight, bias = learner.network(name, 0).parameters()
+        with torch.no_grad():
+            weight.zero_()
+            bias.copy_(torch.tensor(constants))
     return learner
 
 
 def saved_and_loaded(folder: Path, learner: Learner) -> Policy:
-    save_policy(folder, learner, "Corridor-v0", {"length": 5})
+    save_policy(folder, learner, 0, "Corridor-v0", {"length": 5})
     return load_policy(folder)
 
 
 def test_a_loaded_policy_gives_the_values_of_the_network_that_was_saved(tmp_path: Path) -> None:
-    learner = CQL(CQLConfig(**TINY), TransitionBuffer.from_dataset(corridor()), 0)
+    learner = learner_of(CQLConfig(**TINY), corridor())
     policy = saved_and_loaded(tmp_path, learner)
     with torch.no_grad():
-        expected = learner.network(torch.from_numpy(inner_observations())).numpy()
+        seen = Observations(torch.from_numpy(inner_observations()))
+        expected = learner.network("q", 0)(seen).numpy()
     np.testing.assert_array_equal(policy.q_values(inner_observations()), expected)
 
 
@@ -94,6 +107,93 @@ def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
     assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
 
 
+def test_filtered_values_leave_out_what_the_log_hardly_shows(tmp_path: Path) -> None:
+    # The second action is worth more, and a tenth as likely as the first.
+    learner = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(inner_observations()).tolist() == [5, 5, 5]
+    assert policy.q_values(inner_observations()).tolist() == [[1, 2]] * 3
+    assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
+
+
+def test_iql_acts_by_its_policy_and_knows_values(tmp_path: Path) -> None:
+    learner = learner_with_outputs(IQL, np.log([0.75, 0.25]).tolist(), [1.0, 2.0])
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(inner_observations()).tolist() == [5, 5, 5]
+    assert policy.q_values(inner_observations()).tolist() == [[1, 2]] * 3
+    np.testing.assert_allclose(
+        policy.action_probabilities(inner_observations()[:1]), [[0.75, 0.25]], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        DQNConfig(**TINY, dueling=True),
+        DQNConfig(**TINY, n_quantiles=3),
+        DQNConfig(**TINY, layer_norm=True, normalize=True),
+    ],
+)
+def test_every_kind_of_network_comes_back(tmp_path: Path, config: TrainingConfig) -> None:
+    learner = learner_of(config, corridor())
+    policy = saved_and_loaded(tmp_path, learner)
+    with torch.no_grad():
+        outputs = learner.network("q", 0)(learner.buffer.encoder.encode(inner_observations()))
+    expected = outputs.mean(2) if outputs.ndim == 3 else outputs
+    np.testing.assert_allclose(policy.q_values(inner_observations()), expected, rtol=1e-6)
+
+
+def test_an_action_that_is_not_allowed_is_not_taken(tmp_path: Path) -> None:
+    mask = np.array([[1, 1], [1, 0]], np.int8)
+    parts = {"action_mask": mask, "x": np.zeros((2, 1), np.float32)}
+    dataset = Dataset.from_arrays(
+        observations=parts,
+        actions=[1, 0],
+        rewards=[1, 0],
+        terminated=[True, True],
+        truncated=[False, False],
+        next_observations=parts,
+    )
+    learner = learner_of(DQNConfig(**{**TINY, "updates": 200}), dataset)
+    for _ in range(200):
+        learner.update()
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(parts).tolist() == [1, 0]
+    assert policy.q_values(parts)[1, 1] == -np.inf
+
+
+def walk_policy(folder: Path, count: int) -> Policy:
+    """A policy that looks at the last `count` of one number."""
+    steps = np.arange(8, dtype=np.float32)[:, None]
+    dataset = Dataset.from_arrays(
+        observations=steps[:-1],
+        actions=np.arange(7) % 2,
+        rewards=np.ones(7),
+        terminated=np.arange(7) == 6,
+        truncated=np.zeros(7, bool),
+        next_observations=steps[1:],
+    )
+    return saved_and_loaded(folder, learner_of(DQNConfig(**TINY, frame_stack=count), dataset))
+
+
+def test_a_policy_remembers_the_frames_it_looks_at(tmp_path: Path) -> None:
+    policy = walk_policy(tmp_path, 3)
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        policy.begin()
+        frames = random.normal(0, 5, (6, 4, 1)).astype(np.float32)
+        for step in range(6):
+            stack = frames[[max(step - 2, 0), max(step - 1, 0), step]].swapaxes(0, 1)
+            expected = policy.q_values(stack).argmax(1)
+            assert policy.act(frames[step]).tolist() == expected.tolist()
+            assert policy.act(stack).tolist() == expected.tolist()
+
+
+def test_values_of_lone_frames_are_not_made_up(tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match="looks at 3 observations in a row"):
+        walk_policy(tmp_path, 3).q_values(np.zeros((4, 1), np.float32))
+
+
 def test_images_are_taken_as_bytes(tmp_path: Path) -> None:
     images: NDArray[np.uint8] = np.random.default_rng(0).integers(
         0, 256, (6, 36, 40, 1), dtype=np.uint8
@@ -106,8 +206,7 @@ def test_images_are_taken_as_bytes(tmp_path: Path) -> None:
         truncated=np.zeros(6, bool),
         next_observations=images,
     )
-    learner = BC(BCConfig(**TINY), TransitionBuffer.from_dataset(dataset), 0)
-    policy = saved_and_loaded(tmp_path, learner)
+    policy = saved_and_loaded(tmp_path, learner_of(BCConfig(**TINY), dataset))
     assert policy.action_probabilities(images).shape == (6, 3)
     np.testing.assert_allclose(
         policy.action_probabilities(images[2:3]),
@@ -146,7 +245,7 @@ def test_seeds_are_ordered_as_numbers(tmp_path: Path) -> None:
     for number, best in ((10, [1.0, 0.0]), (9, [0.0, 1.0])):
         folder = tmp_path / f"seed-{number}"
         folder.mkdir()
-        save_policy(folder, learner_with_outputs(CQL, best), "", {})
+        save_policy(folder, learner_with_outputs(CQL, best), 0, "", {})
     actions = [policy.act(inner_observations()[:1]).item() for policy in load_policies(tmp_path)]
     assert actions == [6, 5]
 
@@ -179,9 +278,10 @@ def test_weights_cut_short_are_refused(cql_run: Path, cut: int) -> None:
     ("key", "value"),
     [
         ("format_version", 99),
-        ("hidden", [16, 9]),
-        ("hidden", "wide"),
-        ("outputs", "wishes"),
+        ("architecture", {"hidden": [16, 9]}),
+        ("architecture", "wide"),
+        ("acts_by", "wishes"),
+        ("outputs", {"q": [3]}),
         ("action_space", {"type": "Box", "low": 0, "high": 1, "shape": [2], "dtype": "float32"}),
         ("observation_space", {"type": "Cupboard"}),
     ],

@@ -1,0 +1,53 @@
+"""The curves of a run as a picture: one panel for each term, one line for each seed."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.figures import COLORS, new_figure, save_png
+from mcaprl.offline.metrics import METRICS_NAME
+
+CURVES_NAME = "curves.png"
+_COLUMNS = 3
+_LEARNED, _HELD_OUT = COLORS[:2]
+
+
+def draw_curves(folder: Path) -> Path:
+    """Write RUN/curves.png from the metrics of all its seeds; thick lines are means over seeds.
+
+    Returns:
+        Its path.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        ReportError: it cannot be written.
+    """
+    curves = [read_curve(path) for path in sorted(folder.glob(f"seed-*/{METRICS_NAME}"))]
+    names = [name for name in curves[0] if name not in ("update", "learning_rate")]
+    rows = -(-len(names) // _COLUMNS)
+    figure, panels = new_figure((4 * _COLUMNS, 2.4 * rows), rows, _COLUMNS, grid=True)
+    for panel in panels.flat[len(names) :]:
+        panel.set_axis_off()
+    for panel, name in zip(panels.flat, names, strict=False):
+        color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
+        for curve in curves:
+            panel.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5)
+        shortest = min((curve["update"] for curve in curves), key=len)
+        mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
+        panel.plot(shortest, mean, color=color, lw=1.8)
+        panel.set_title(name.replace("_", " "))
+    seeds = "one seed" if len(curves) == 1 else f"thick: mean of {len(curves)} seeds"
+    figure.supxlabel(f"updates; {seeds}")
+    save_png(figure, folder / CURVES_NAME)
+    return folder / CURVES_NAME
+
+
+def read_curve(path: Path) -> dict[str, NDArray[np.float64]]:
+    """The columns of a `metrics.csv`, by name."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
