@@ -42,9 +42,12 @@ from mcaprl.sims import make_sim
     default=8765,
     show_default=True,
     type=click.IntRange(0, 65535),
-    help="Of the live server on 127.0.0.1; 0 takes a free one.",
+    help="Of 127.0.0.1, to listen on; 0 takes any that is free.",
 )
 @click.option("--verify", "verifies", is_flag=True, help="Step the sim again and compare.")
+@click.option("--video", type=click.Path(path_type=Path), help="Film to write: .mp4 or .gif.")
+@click.option("--contact-sheet", type=click.Path(path_type=Path), help="Stills to write: .png.")
+@click.option("--overwrite", is_flag=True, help="Replace a picture that is there.")
 @click.option("--sim", help="Step this sim instead of the one that the log names.")
 def replay(
     files: tuple[str, ...],
@@ -54,8 +57,11 @@ def replay(
     port: int,
     verifies: bool,
     sim: str | None,
+    video: Path | None,
+    contact_sheet: Path | None,
+    overwrite: bool,
 ) -> int:
-    """Play FILE... to Foxglove, or step the sim through it again with --verify.
+    """Play FILE... to Foxglove; or check it with --verify; or film an episode with --video.
 
     Several files play side by side: all start at the same time, each below a word of its own.
     """
@@ -63,17 +69,36 @@ def replay(
     if verifies:
         same = [_verify(path, episode, sim) for path in paths]
         return int(not all(same))
+    if video or contact_sheet:
+        from mcaprl.cli.film import make_film
+
+        if len(paths) > 1:
+            raise UsageError("a film shows one file; give each a film of its own")
+        check_episode(open_logs(paths[0], columns=[]), episode, paths[0])
+        make_film(
+            paths[0],
+            episode or 0,
+            sim=sim,
+            speed=speed,
+            video=video,
+            sheet=contact_sheet,
+            overwrite=overwrite,
+        )
+        return 0
     _play(paths, episode, speed=speed, loops=loop, port=port)
     return 0
 
 
-def sim_of(dataset: Dataset, path: Path, sim: str | None = None) -> gym.Env[Any, Any]:
+def sim_of(
+    dataset: Dataset, path: Path, sim: str | None = None, **others: Any
+) -> gym.Env[Any, Any]:
     """Make the environment that a log was recorded in.
 
     Args:
         dataset: the log.
         path: of it.
         sim: short name or id, where the log's own is not the right one.
+        **others: arguments beside the log's.
 
     Raises:
         UsageError: the log names none, or it cannot be made.
@@ -81,7 +106,7 @@ def sim_of(dataset: Dataset, path: Path, sim: str | None = None) -> gym.Env[Any,
     name = sim or dataset.env_id
     if not name:
         raise UsageError(f"{path} does not tell which environment it is of: pass --sim")
-    return make_sim(name, **dataset.env_kwargs)
+    return make_sim(name, **{**dataset.env_kwargs, **others})
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:

@@ -7,7 +7,7 @@ short one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -46,18 +46,29 @@ class Track:
         end_ns: likewise the last.
     """
 
-    def __init__(self, reader: McapReader, window_ns: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        reader: McapReader,
+        window_ns: tuple[int, int] | None = None,
+        *,
+        topics: Collection[str] | None = None,
+    ) -> None:
         """Find where the messages are.
 
         Args:
             reader: of the file.
             window_ns: play what has a log_time from the first to the last of these; default: all.
+            topics: play these only; default: all.
 
         Raises:
             CorruptLogError: an index is damaged.
         """
         self.reader = reader
-        self._topics = [_TopicIndex(reader, channel) for channel in reader.channels.values()]
+        self._topics = [
+            _TopicIndex(reader, channel)
+            for channel in reader.channels.values()
+            if topics is None or channel.topic in topics
+        ]
         self._topics = [topic for topic in self._topics if topic.spans]
         self.start_ns, self.end_ns = window_ns or (
             min((topic.starts[0] for topic in self._topics), default=0),

@@ -1,0 +1,126 @@
+"""Films and sheets of stills, as files, from pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
+
+Picture = NDArray[np.uint8]
+
+FILM_KINDS = (".mp4", ".gif")
+_COLUMNS = 3
+_GAP_PX = 6
+
+
+def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
+    """Make sure, before the work, that a film or sheet can be written there.
+
+    Raises:
+        UnknownNameError: the path ends otherwise than these kinds.
+        OutputExistsError: there is a file, and `overwrite` is not set.
+        MissingExtraError: imageio is not installed.
+    """
+    import_extra("imageio", "video")
+    if path.suffix == ".mp4":
+        import_extra("av", "video")
+    if path.suffix not in kinds:
+        raise UnknownNameError("kind of picture", path.suffix or path.name, kinds)
+    if path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+
+
+def write_film(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -> int:
+    """Write a film as the pictures come; an `.mp4` is H.264, a `.gif` loops.
+
+    Args:
+        path: `.mp4` or `.gif`.
+        pictures: (height, width, 3), all of one size with even edges.
+        pictures_per_s: how fast it plays.
+
+    Returns:
+        How many pictures it has.
+
+    Raises:
+        UsageError: there are no pictures.
+        ReportError: it cannot be written.
+    """
+    unfinished = path.with_stem(f"{path.stem}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        count = _write(unfinished, pictures, pictures_per_s)
+        if count == 0:
+            raise UsageError(f"{path}: there is nothing to show")
+        unfinished.replace(path)
+    except OSError as error:
+        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return count
+
+
+def _write(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -> int:
+    imageio = import_extra("imageio.v3", "video")
+    if path.suffix == ".gif":
+        stills = list(pictures)
+        if stills:
+            milliseconds = round(1000 / pictures_per_s)
+            imageio.imwrite(path, stills, plugin="pillow", duration=milliseconds, loop=0)
+        return len(stills)
+    count = 0
+    with imageio.imopen(path, "w", plugin="pyav") as film:
+        film.init_video_stream("libx264", fps=float(pictures_per_s))
+        for picture in pictures:
+            film.write_frame(picture)
+            count += 1
+    return count
+
+
+def write_sheet(path: Path, pictures: Sequence[Picture]) -> None:
+    """Write pictures side by side and below each other as one PNG, at half their size.
+
+    Raises:
+        ReportError: it cannot be written.
+    """
+    imageio = import_extra("imageio.v3", "video")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        imageio.imwrite(path, contact_sheet(pictures))
+    except OSError as error:
+        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def contact_sheet(pictures: Sequence[Picture]) -> Picture:
+    """Pictures at half their size in three columns, with a gap between."""
+    halves = [_half(picture) for picture in pictures]
+    height, width, _ = halves[0].shape
+    columns = min(_COLUMNS, len(halves))
+    rows = math.ceil(len(halves) / columns)
+    size = (rows * (height + _GAP_PX) - _GAP_PX, columns * (width + _GAP_PX) - _GAP_PX, 3)
+    sheet = np.full(size, 255, np.uint8)
+    for number, half in enumerate(halves):
+        top, left = (number // columns) * (height + _GAP_PX), (number % columns) * (width + _GAP_PX)
+        sheet[top : top + height, left : left + width] = half
+    return sheet
+
+
+def spread(length: int, count: int) -> list[int]:
+    """Steps from the first to the last of an episode, evenly spread, each once.
+
+    >>> spread(10, 3)
+    [0, 5, 10]
+    """
+    return sorted(set(np.rint(np.linspace(0, length, count)).astype(int).tolist()))
+
+
+def _half(picture: Picture) -> Picture:
+    height, width = (edge // 2 * 2 for edge in picture.shape[:2])
+    parts: Any = picture[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
+    mean: Picture = parts.mean(axis=(1, 3)).astype(np.uint8)
+    return mean
