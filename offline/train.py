@@ -201,8 +201,8 @@ class _Run:
             ]
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
-                terms = self._train_to_next_stop(learner, metrics)
-                warned = warned or self._warn(terms)
+                before, terms = terms, self._train_to_next_stop(learner, metrics)
+                warned = warned or self._warn(before, terms)
                 for seed, mine in zip(learner.seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
         seconds = time.perf_counter() - began
@@ -263,10 +263,12 @@ class _Run:
                 f" {good}. Look for huge values in the data, or lower the learning rate"
             ) from error
 
-    def _warn(self, terms: list[dict[str, float]]) -> bool:
+    def _warn(self, before: list[dict[str, float]], now: list[dict[str, float]]) -> bool:
         """Tell of values that run away, once; gives whether it was told."""
-        for mine in terms:
-            if message := divergence_warning(mine, self.limit):
+        for earlier, later in zip(before, now, strict=True):
+            if "mean_q" not in earlier:
+                continue
+            if message := divergence_warning(earlier["mean_q"], later["mean_q"], self.limit):
                 warnings.warn(message, stacklevel=2)
                 return True
         return False
@@ -289,7 +291,7 @@ def _earlier_encoder(folder: RunFolder) -> ObservationEncoder | None:
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
     """Of the data, and of their weights where these differ."""
-    if (weights == weights[0]).all():
+    if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
 

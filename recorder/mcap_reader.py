@@ -92,6 +92,8 @@ class McapReader:
         self.data_end = 0
         self._counts: dict[int, int] = {}
         self._loose = LooseMessages()
+        # Who asks for a chunk's example asks for all of it next.
+        self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
         footer = self._footer()
         self.complete = footer is not None
@@ -170,10 +172,15 @@ class McapReader:
         Raises:
             CorruptLogError: the chunk is damaged.
         """
-        try:
-            return chunk_records(self.view, chunk.chunk_start_offset)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
+        start = chunk.chunk_start_offset
+        last, records = self._last_chunk
+        if last != start:
+            try:
+                records = chunk_records(self.view, start)
+            except CorruptLogError as error:
+                raise CorruptLogError(f"{self.path}: {error}") from error
+            self._last_chunk = start, records
+        return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Yield log_time and bytes of a topic's messages, one by one.
@@ -206,11 +213,12 @@ class McapReader:
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """The first attachment of a name; None if there is none.
+        """The last attachment of a name; None if there is none.
 
         Raises:
             CorruptLogError: it does not match its CRC.
         """
+        found = None
         for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
             if opcode == Opcode.ATTACHMENT:
                 attachment = self._parse(opcode, content, offset)
@@ -218,10 +226,10 @@ class McapReader:
                     (crc,) = struct.unpack("<I", content[-4:])
                     if crc and zlib.crc32(content[:-4]) != crc:
                         raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
-                    return bytes(attachment.data)
+                    found = bytes(attachment.data)
             if opcode == Opcode.DATA_END:
                 break
-        return None
+        return found
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.

@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Header,
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
+from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, ChunkHeader, compressor
 from mcaprl.recorder.log_file import create, release, reopen
 from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
@@ -42,7 +41,7 @@ from mcaprl.recorder.signals import HoldSignals
 COMPRESSIONS = ("zstd", "lz4", "none")
 # Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
 # themselves so much that a slower search halves them.
-_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 6
+_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 9
 
 
 class McapWriter:
@@ -262,23 +261,24 @@ class McapWriter:
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
         data = compress(records)
         name = "" if self._compression == "none" else self._compression
-        builder = RecordBuilder()
-        Chunk(
+        header = ChunkHeader(
+            start_time=start_time,
+            end_time=end_time,
+            uncompressed_bytes=len(records),
+            crc=zlib.crc32(records),
             compression=name,
-            data=data,
-            message_start_time=start_time,
-            message_end_time=end_time,
-            uncompressed_crc=zlib.crc32(records),
-            uncompressed_size=len(records),
-        ).write(builder)
-        offset, chunk_bytes = self.position, builder.count
-        index_offsets = {}
+            data=slice(0, len(data)),
+        )
+        # The records go to the file as they are: a copy of them would cost as much as the rest.
+        head = header.to_record()
+        offset, chunk_bytes = self.position, len(head) + len(data)
+        index_offsets, builder = {}, RecordBuilder()
         for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset + builder.count
+            index_offsets[channel_id] = offset + chunk_bytes + builder.count
             _write_message_index(builder, channel_id, index)
-        index_bytes = builder.count - chunk_bytes
+        index_bytes = builder.count
         with HoldSignals():
-            self._write(builder.end())
+            self._write(head, data, builder.end())
             self._summary.chunks.append(
                 ChunkIndex(
                     chunk_start_offset=offset,
@@ -308,17 +308,19 @@ class McapWriter:
         record.write(builder)
         self._write(builder.end())
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
         """Write all of it or none: what stands in the file stays a whole number of records."""
         try:
             with HoldSignals():
                 if self.untouched:
                     self._cut_off_summary()
-                rest = memoryview(data)
-                while rest:
-                    rest = rest[self._file.write(rest) :]
-                self._crc = zlib.crc32(data, self._crc)
-                self.position += len(data)
+                for part in parts:
+                    rest = memoryview(part)
+                    while rest:
+                        rest = rest[self._file.write(rest) :]
+                for part in parts:
+                    self._crc = zlib.crc32(part, self._crc)
+                self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up()
             raise LogError(

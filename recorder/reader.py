@@ -121,6 +121,8 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """
     if not isinstance(data, str | Path):
         every = [path for part in data for path in find_logs(part)]
+        if not every:
+            raise LogError("no data: the list of files is empty")
         # A file that is meant twice counts once.
         return list({path.resolve(): path for path in every}.values())
     path = Path(data)

@@ -157,7 +157,7 @@ def _note(plan: EpisodePlan, source: Path, recovery: Recovery) -> None:
         NoEpisodesError: none can be kept.
     """
     recovery.episodes, recovery.dropped = plan.episodes, plan.dropped
-    recovery.ended, recovery.strays = len(plan.ended), plan.strays
+    recovery.ended, recovery.strays = plan.ended, plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel, Metadata
+from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from mcaprl.recorder import messages
@@ -25,6 +25,7 @@ from mcaprl.recorder.mcap_append import what_is_written
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, contents_of
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.metadata import METADATA_NAME
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import message_dtype
 from mcaprl.recorder.spaces import observation_leaves
@@ -76,7 +77,8 @@ class EpisodePlan:
         fates: of the records of `/rl/step`, by their place, in the order of the file.
         spans: (E, 2) first and last log_time of the kept episodes, rising.
         dropped: episodes that are not kept.
-        ended: those that are kept without their end, as they are told of now.
+        ended: how many are kept without their end.
+        told_anew: what is told of those, and of others that nothing tells of any more.
         strays: messages of other topics that belong to no kept episode.
         is_in_order: whether the records are in the order of their times.
     """
@@ -84,7 +86,8 @@ class EpisodePlan:
     fates: dict[Place, NDArray[np.uint8]] = field(default_factory=dict)
     spans: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
     dropped: list[DroppedEpisode] = field(default_factory=list)
-    ended: list[EpisodeSummary] = field(default_factory=list)
+    ended: int = 0
+    told_anew: list[EpisodeSummary] = field(default_factory=list)
     strays: int = 0
     is_in_order: bool = True
 
@@ -96,7 +99,7 @@ class EpisodePlan:
     @property
     def changes_anything(self) -> bool:
         """Whether the log is not as it should be already."""
-        return bool(self.dropped or self.ended or self.strays) or not self.is_in_order
+        return bool(self.dropped or self.told_anew or self.strays) or not self.is_in_order
 
 
 def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan | None:
@@ -111,39 +114,29 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     """
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):
-        return EpisodePlan() if described(reader) else None
+        return EpisodePlan() if METADATA_NAME in reader.metadata else None
     if any(name not in steps.fields for name in _FIELDS):
         return None
     order = np.lexsort((steps.times, steps.channel_ids))
     columns = steps.read(_FIELDS, order)
-    shown = _with_images(reader, columns[LOG_TIME])
-    form_is_known = all(map(_form, map(reader.schema_of, reader.channels_of(STEP_TOPIC))))
-    plan, fates, spans = EpisodePlan(), np.zeros(len(steps), np.uint8), []
+    plan, fates = EpisodePlan(), np.zeros(len(steps), np.uint8)
     plan.is_in_order = bool((np.diff(order) > 0).all())
-    for start, stop in _runs(columns, steps.channel_ids[order]):
-        begins = columns["step"][start] == 0
-        length = int(np.argmin(np.append(shown[start:stop], False)))
-        last = start + length - 1
-        is_whole = begins and stop - start == length > 1 and columns["final"][last]
-        can_end = bool(form_is_known and begins and not is_whole and length > 1)
-        if is_whole or (can_end and keep_unfinished):
-            fates[order[start : last + 1]] = Fate.KEEP
-            spans.append(columns[LOG_TIME][[start, last]])
-        else:
-            why = "its beginning is lost" if not begins else "its end is lost, or never was"
-            number = int(columns["episode"][start])
-            plan.dropped.append(DroppedEpisode(number, stop - start, can_end, why))
-        if can_end and keep_unfinished:
-            fates[order[last - 1]], fates[order[last]] = Fate.TRUNCATE, Fate.MAKE_FINAL
-            plan.ended.append(_ended(columns, start, last))
+    told, spans = _told_ends(reader), []
+    for run in _runs(reader, columns, steps.channel_ids[order]):
+        can_end = run.can_end and all(map(_form, _schemas(reader)))
+        if not run.is_whole and not (can_end and keep_unfinished):
+            plan.dropped.append(run.dropped(columns, can_end))
+            continue
+        fates[order[run.start : run.last + 1]] = Fate.KEEP
+        if not run.is_whole:
+            fates[order[run.last - 1]], fates[order[run.last]] = Fate.TRUNCATE, Fate.MAKE_FINAL
+            plan.ended += 1
+        spans.append(columns[LOG_TIME][[run.start, run.last]])
+        if int(spans[-1][1]) not in told:
+            plan.told_anew.append(run.summary(columns))
     plan.spans = np.array(sorted(map(tuple, spans)), np.int64).reshape(-1, 2)
     plan.fates = dict(_by_place(steps, fates))
-    plan.strays = sum(
-        int((~_is_inside(plan, span.index["log_time"])).sum())
-        for channel in reader.channels.values()
-        if channel.topic.startswith(_OF_EPISODES) and channel.topic != STEP_TOPIC
-        for span in reader.spans(channel)
-    )
+    plan.strays = _count_strays(reader, plan)
     return plan
 
 
@@ -163,15 +156,82 @@ def write_planned(reader: McapReader, writer: McapWriter, plan: EpisodePlan) -> 
             writer.write_records(records, indexes)
         else:
             _write_some(reader, writer, records, indexes, fates)
-    if plan.ended:
+    if plan.told_anew:
         channel_id = writer.add_channel(
             EPISODE_TOPIC, messages.EPISODE_TYPE, messages.definition(messages.EPISODE_TYPE)
         )
-        told = [(s.end_time_ns, messages.encode(s.to_message())) for s in plan.ended]
+        told = [(s.end_time_ns, messages.encode(s.to_message())) for s in plan.told_anew]
         writer.write_messages([(channel_id, time_ns, data) for time_ns, data in told])
 
 
-def _form(schema: Any) -> np.dtype[Any] | None:
+@dataclass(frozen=True)
+class _Run:
+    """Records that follow each other.
+
+    Attributes:
+        start: of the first one.
+        last: of the last one that has all its pictures.
+        records: how many there are, with pictures or without.
+        begins: whether the first one is an episode's.
+        is_whole: whether it is an episode, from its first to its final record.
+    """
+
+    start: int
+    last: int
+    records: int
+    begins: bool
+    is_whole: bool
+
+    @property
+    def can_end(self) -> bool:
+        """Whether it could be an episode that was broken off behind its last whole transition."""
+        return self.begins and not self.is_whole and self.last > self.start
+
+    def dropped(self, columns: Columns, can_end: bool) -> DroppedEpisode:
+        """It is not kept."""
+        why = "its end is lost, or never was" if self.begins else "its beginning is lost"
+        number = int(columns["episode"][self.start])
+        return DroppedEpisode(number, self.records, can_end, why)
+
+    def summary(self, columns: Columns) -> EpisodeSummary:
+        """As much of the episode as its records tell."""
+        start, last = self.start, self.last
+        return EpisodeSummary(
+            episode=int(columns["episode"][start]),
+            length=last - start,
+            total_reward=add_up(columns["reward"][start:last].astype(np.float64)),
+            terminated=bool(columns["terminated"][last - 1]),
+            truncated=bool(columns["truncated"][last - 1]) or not self.is_whole,
+            start_time_ns=int(columns[LOG_TIME][start]),
+            end_time_ns=int(columns[LOG_TIME][last]),
+            reason="" if self.is_whole else INTERRUPTED,
+        )
+
+
+def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> Iterator[_Run]:
+    """Records that follow each other, in the order of channels and times."""
+    steps, episodes, times = columns["step"], columns["episode"], columns[LOG_TIME]
+    follows = (
+        (steps[1:] == steps[:-1] + 1)
+        & (episodes[1:] == episodes[:-1])
+        & (channel_ids[1:] == channel_ids[:-1])
+        & (times[1:] > times[:-1])
+        & ~columns["final"][:-1].astype(bool)
+    )
+    shown = _with_images(reader, times)
+    starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
+    for start, stop in zip(starts, [*starts[1:], len(steps)], strict=True):
+        length = int(np.argmin(np.append(shown[start:stop], False)))
+        begins, last = bool(steps[start] == 0), start + length - 1
+        is_whole = begins and stop - start == length > 1 and bool(columns["final"][last])
+        yield _Run(start, last, stop - start, begins, is_whole)
+
+
+def _schemas(reader: McapReader) -> list[Schema]:
+    return [reader.schema_of(channel) for channel in reader.channels_of(STEP_TOPIC)]
+
+
+def _form(schema: Schema) -> np.dtype[Any] | None:
     return message_dtype(schema.data.decode(errors="replace"))
 
 
@@ -185,30 +245,18 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
     return shown
 
 
-def _runs(columns: Columns, channel_ids: NDArray[Any]) -> Iterator[tuple[int, int]]:
-    """Spans of records that follow each other, in the order of channels and times."""
-    steps, episodes, times = columns["step"], columns["episode"], columns[LOG_TIME]
-    follows = (
-        (steps[1:] == steps[:-1] + 1)
-        & (episodes[1:] == episodes[:-1])
-        & (channel_ids[1:] == channel_ids[:-1])
-        & (times[1:] > times[:-1])
-        & ~columns["final"][:-1].astype(bool)
-    )
-    starts = [0, *(np.flatnonzero(~follows) + 1).tolist()]
-    yield from zip(starts, [*starts[1:], len(steps)], strict=True)
+def _told_ends(reader: McapReader) -> set[int]:
+    """Last log_times of the episodes that `/rl/episode` tells of."""
+    topic, name = Topic(reader, EPISODE_TOPIC), "end_time_ns"
+    return set(topic.read([name])[name].tolist()) if name in topic.fields else set()
 
 
-def _ended(columns: Columns, start: int, last: int) -> EpisodeSummary:
-    return EpisodeSummary(
-        episode=int(columns["episode"][start]),
-        length=last - start,
-        total_reward=add_up(columns["reward"][start:last].astype(np.float64)),
-        terminated=bool(columns["terminated"][last - 1]),
-        truncated=True,
-        start_time_ns=int(columns[LOG_TIME][start]),
-        end_time_ns=int(columns[LOG_TIME][last]),
-        reason=INTERRUPTED,
+def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
+    return sum(
+        int((~_is_inside(plan, span.index["log_time"])).sum())
+        for channel in reader.channels.values()
+        if channel.topic.startswith(_OF_EPISODES) and channel.topic != STEP_TOPIC
+        for span in reader.spans(channel)
     )
 
 
@@ -239,7 +287,8 @@ def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.b
         return np.zeros(len(log_times), np.bool_)
     times = log_times.astype(np.int64)
     span = np.searchsorted(plan.spans[:, 0], times, side="right") - 1
-    return (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
+    is_inside: NDArray[np.bool_] = (span >= 0) & (times <= plan.spans[np.maximum(span, 0), 1])
+    return is_inside
 
 
 def _write_some(

@@ -167,12 +167,12 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
                     self._make_room(step)
-                    self._count(episode, step)
+                    self._count(episode, step, float(reward))
                     if terminated or truncated:
                         reason = reason_of(info.get("reason"), bool(terminated))
                         self._end(bool(terminated), bool(truncated), reason)
             elif self._display.shows_steps:
-                self._count(episode, step)
+                self._count(episode, step, float(reward))
             else:
                 episode.steps = step
         except BaseException:
@@ -200,7 +200,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._full_at = self._next_full()
         self._keep_observation(observation)
         recording.begin(self._display, episode.policy)
-        self._count(episode, 0)
+        self._count(episode, 0, 0.0)
         self._open = episode
 
     def _make_room(self, step: int) -> None:
@@ -215,9 +215,9 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """The first step for whose observation there is no room."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
-    def _count(self, episode: OpenEpisode, step: int) -> None:
+    def _count(self, episode: OpenEpisode, step: int, reward: float) -> None:
         if self._display.shows_steps:
-            self._display.observe(step)
+            self._display.observe(step, reward)
         # From here on the step counts.
         episode.steps = step
 

@@ -89,12 +89,13 @@ def make_sims(
     Raises:
         UnknownNameError, MissingExtraError, UsageError: as of `make_sim`.
     """
-    env_id = SIMS.get(name, name)
+    env_id, modes = SIMS.get(name, name), [mode.value for mode in gym.vector.AutoresetMode]
+    if autoreset_mode not in modes:
+        raise UnknownNameError("autoreset_mode", autoreset_mode, modes)
     with _errors_of(name, kwargs):
         if env_id in SIMS.values() and gym.registry[env_id].vector_entry_point:
             return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
-        mode = gym.vector.AutoresetMode(autoreset_mode)
-        options = {"autoreset_mode": mode}
+        options = {"autoreset_mode": autoreset_mode}
         return gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
 
 

@@ -62,19 +62,11 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         _check_count("num_envs", num_envs)
         if max_episode_steps is not None:
             _check_count("max_episode_steps", max_episode_steps)
-        if not isinstance(autoreset_mode, AutoresetMode):
-            check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = _mode_of(autoreset_mode)
         self.fleet = self.fleet_type(num_envs, **kwargs)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
-        self.step_duration_s = self.fleet.step_duration_s
-        self.action_meanings = self.fleet.action_meanings
-        self.observation_names = self.fleet.observation_names
-        self.single_observation_space = self.fleet.observation_space
-        self.single_action_space = spaces.Discrete(len(self.action_meanings))
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._take_spaces(self.fleet)
         self._truncates = np.array(self.fleet.truncates)
         self._reasons = np.array(self.fleet.reasons, dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
@@ -82,6 +74,16 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
         self._ended = np.ones(num_envs, dtype=np.bool_)
         self._is_started = False
+
+    def _take_spaces(self, fleet: Fleet) -> None:
+        """Have the fleet's names and spaces, for one and for all."""
+        self.step_duration_s = fleet.step_duration_s
+        self.action_meanings = fleet.action_meanings
+        self.observation_names = fleet.observation_names
+        self.single_observation_space = fleet.observation_space
+        self.single_action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self,
@@ -177,8 +179,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def _told(self, chosen: Bools, ended_itself: Bools) -> dict[str, Any]:
         """Give the infos of some vehicles, with the reasons of those that ended by themselves."""
         infos: dict[str, Any] = {}
+        are_all = chosen.all()
         for key, values in self.fleet.infos().items():
-            infos[key], infos[f"_{key}"] = np.where(chosen, values, 0), chosen.copy()
+            infos[key] = values if are_all else np.where(chosen, values, 0)
+            infos[f"_{key}"] = chosen.copy()
         if ended_itself.any():
             reasons = np.full(self.num_envs, None, dtype=object)
             reasons[ended_itself] = self._reasons[self.fleet.ends[ended_itself]]
@@ -189,6 +193,12 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
 def _check_count(argument: str, value: object) -> None:
     if not isinstance(value, int | np.integer) or value < 1:
         raise UsageError(f"{argument} is a whole number of 1 or more, not {value!r}")
+
+
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    if not isinstance(mode, AutoresetMode):
+        check_name("autoreset_mode", mode, [known.value for known in AutoresetMode])
+    return AutoresetMode(mode)
 
 
 def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:

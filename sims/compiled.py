@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import numba
+from numba.core import event
 
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., object])
 
@@ -16,7 +18,36 @@ def compiled(function: AnyFunction) -> AnyFunction:
     Without `fastmath`: sums keep the order they are written in, so the same input gives the same
     bits. The decorator says to a type checker that the signature stays as written.
 
+    The result is kept in `__pycache__` beside the source; where that cannot be written, in the
+    user's cache folder; where NUMBA_CACHE_DIR is set, there. Where nothing can be written, it lasts
+    as long as the process.
+
     The cache notices an edit of the function's own file only. After an edit of a function that is
     called from other files, delete the `__pycache__` folder.
     """
-    return cast(AnyFunction, numba.njit(cache=True)(function))
+    try:
+        machine_code = numba.njit(cache=True)(function)
+    except RuntimeError:
+        _Announcer.lasts = "in each process, as no cache folder can be written: set NUMBA_CACHE_DIR"
+        machine_code = numba.njit(function)
+    return cast(AnyFunction, machine_code)
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Tells whoever waits, once, that something of ours is compiled and not read from the cache."""
+
+    lasts: ClassVar[str] = "once"
+    is_silent: ClassVar[bool] = False
+
+    def on_start(self, event: Any) -> None:
+        """Say it at the first compilation."""
+        ours = event.data["dispatcher"].py_func.__module__.startswith("mcaprl.")
+        if ours and not _Announcer.is_silent:
+            _Announcer.is_silent = True
+            print(f"compiling the sim for this machine, {self.lasts}", file=sys.stderr)
+
+    def on_end(self, event: Any) -> None:
+        """Say nothing."""
+
+
+event.register("numba:compile", _Announcer())

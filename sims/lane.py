@@ -120,7 +120,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
     - The lines are endless: driving off along the extension of a leg is paid like driving on it.
     - Braking to a stand never ends, and costs less than many a drive.
     - By the code, driving through a wall is over only when driving straight ahead.
-    - In a second, nothing can be corrected: 10 m at 10 m/s, three times the width allowed.
+    - In a second, nothing can be corrected: at 15 m/s, the slightest steering leaves the lane.
     - The picture's code spends half of its values on 1 to 2 m.
 
     Ours are the car, the town, and the picture's averaging where the published one interpolates.

@@ -70,16 +70,14 @@ class PowerlineFleet(Fleet):
             UnknownNameError: an argument has a value that is not in its list.
             UsageError: a number is outside its range, or the classic rules are to have gusts.
         """
-        classic = rules == "classic"
-        plant = plant or ("point" if classic else "quad")
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
         check_name("camera", camera, CAMERAS)
         check_name("start", start, STARTS)
-        check_name("plant", plant, PLANTS)
+        check_name("plant", plant, (None, *PLANTS))
+        self.classic = classic = rules == "classic"
         check_range("wind_m_s", wind_m_s, 0.0, MAX_WIND_M_S)
         check_range("gust_m_s", gust_m_s, 0.0, 0.0 if classic else MAX_GUST_M_S)
-        self.classic = classic
         self.velocity_step_m_s = CLASSIC_VELOCITY_STEP_M_S if classic else VELOCITY_STEP_M_S
         super().__init__(
             count,
@@ -89,17 +87,20 @@ class PowerlineFleet(Fleet):
             CLASSIC_DECISION_S if classic else DECISION_S,
             noise_size=3 if gust_m_s else 0,
         )
-        self._plant = PLANTS.index(plant)
+        self._plant = PLANTS.index(plant or ("point" if classic else "quad"))
         self._on_line = start == "line"
         self._wind_m_s, self._gust_m_s = wind_m_s, gust_m_s
         self._shows_state = observation == "state"
-        self._flights = np.zeros((count, FLIGHT_SIZE))
-        self._bearings = np.zeros((count, len(Bearing._fields)))
-        self._started_at_m = np.zeros(count)
-        self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._camera_view = camera
         self._camera: DroneCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
+        self._make_arrays()
+
+    def _make_arrays(self) -> None:
+        self._flights = np.zeros((self.count, FLIGHT_SIZE))
+        self._bearings = np.zeros((self.count, len(Bearing._fields)))
+        self._started_at_m = np.zeros(self.count)
+        self._seen = np.zeros((self.count, len(OBSERVATION_NAMES)), dtype=np.float32)
 
     def flight(self, i: int) -> Flight:
         """Give the whole state of a drone, NED."""

@@ -111,7 +111,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert run(ask) == 0
     assert "do not choose by this order" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
-    assert "the pilot reads the sim's state" in line
+    assert "pilot has no network to ask about a log" in line
 
 
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,7 +190,7 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
     # Enough copies of the target for the horizon of gamma, or it warns.
-    small += ["--gamma", "0.5", "--target-interval", "6"]
+    small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
     capsys.readouterr()

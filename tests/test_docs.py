@@ -48,9 +48,11 @@ def test_code_about_the_sims_runs(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sims.md").read_text(), re.DOTALL)
     for block in blocks:
         exec(compile(block.replace("episodes=100", "episodes=3"), "sims.md", "exec"), {})
-    first, second = capsys.readouterr().out.splitlines()
-    assert first == "straight 0.5 (600, 600, 3)"
-    assert second == "{'finished': 3}"
+    assert capsys.readouterr().out.splitlines() == [
+        "straight 0.5 (600, 600, 3)",
+        "(64, 12) (64,)",
+        "{'finished': 3}",
+    ]
 
 
 def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

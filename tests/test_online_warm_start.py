@@ -173,7 +173,7 @@ def test_pictures_are_turned_for_the_buffer(tmp_path: Path) -> None:
 
 
 def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path: Path) -> None:
-    config = CQLConfig(updates=30, hidden=(8,), log_interval=10, target_interval=1, gamma=0.5)
+    config = CQLConfig(updates=30, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
     policy = load_offline(tmp_path / "cql")
     observations = mcaprl.open(logs).observations
@@ -200,7 +200,7 @@ def test_an_agent_goes_on_from_an_online_policy(tmp_path: Path) -> None:
 
 
 def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> None:
-    config = CQLConfig(updates=10, hidden=(8,), log_interval=10, target_interval=1, gamma=0.5)
+    config = CQLConfig(updates=10, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
     with (
         closing(agent(tmp_path, hidden=(16, 8))) as begun,
@@ -239,7 +239,8 @@ def test_ppo_begins_with_neither(logs: Path, tmp_path: Path) -> None:
 def test_the_command_takes_logs_and_a_policy(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    offline = ["--updates", "20", "--hidden", "8", "--target-interval", "1", "--gamma", "0.5"]
+    offline = ["--updates", "20", "--hidden", "8", "--algo", "cql"]
+    offline += ["--gamma", "0.5", "--target-interval", "2"]
     assert run(["train-offline", str(logs), "--out", str(tmp_path / "cql"), *offline]) == 0
     sizes = ["--steps", "80", "--hidden", "8", "--eval-interval", "40"]
     sizes += ["--eval-episodes", "2", "--final-episodes", "2"]
