@@ -23,7 +23,7 @@ from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, Scale
 from mcaprl.online.first_episodes import FirstEpisodes
 from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
-from mcaprl.online.recording import describe_actions, recorded
+from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.online.warm_start import fill_buffer, sample_observations, take_weights
@@ -75,7 +75,7 @@ class Agent:
         self.resumed_at = 0
         self._began_with_policy = False
         self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
-        self._records, self._resumes = record is not None, resume
+        self._resumes = resume
         with ExitStack() as stack:
             batch = stack.enter_context(closing(task.batch(task.config.envs)))
             recorder = None
@@ -85,8 +85,9 @@ class Agent:
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             self._eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
             self.model: BaseAlgorithm = make_model(task.algo, task.config, env, seed)
+            self._describer = None
             if recorder is not None:
-                env.before_step = describe_actions(recorder, self.model)
+                self._describer = env.before_step = ActionDescriber(recorder, self.model)
             self._envs = stack.pop_all()
         self._description = describe_run(
             task.algo,
@@ -202,7 +203,8 @@ class Agent:
         write_curve(self._folder / CURVE_NAME, self.points)
         self.model.logger.record("eval/score", point.score)
         self.model.logger.dump(point.step)
-        if self._records:
+        if self._describer is not None:
+            self._describer.forget()
             folder = self._folder / EVALUATIONS_NAME
             folder.mkdir(exist_ok=True)
             path = folder / f"step-{point.step:09d}.mcap"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
+from torch import nn
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.recover import recover_log
@@ -74,15 +74,37 @@ def recorded(
         return wrap(append=True)
 
 
-def describe_actions(recorder: RecordVecMcap, model: BaseAlgorithm) -> Callable[[Any], None]:
-    """Make what tells the recorder how likely actions were, to be called before each step."""
+class ActionDescriber:
+    """Tells the recorder how likely actions were; to be called with them before each step."""
 
-    def describe(actions: NDArray[Any]) -> None:
-        recorder.epsilon = exploration(model)
+    def __init__(self, recorder: RecordVecMcap, model: BaseAlgorithm) -> None:
+        """Watch a model, which `recorder` records."""
+        self._recorder, self._model = recorder, model
+        self._were_greedy = False
+        if isinstance(model, DQN):
+            # SB3 asks the network only where it does not explore. Asking it once more at each
+            # step, to know what the greedy action is, would cost more than recording.
+            model.q_net.register_forward_hook(self._notice)
+
+    def __call__(self, actions: NDArray[Any]) -> None:
+        """Describe the actions (N,) that answer the model's last observations."""
+        model, recorder = self._model, self._recorder
+        recorder.epsilon = epsilon = exploration(model)
         recorder.policy_version = cast(Any, model)._n_updates
-        recorder.behavior_probs = behavior_probabilities(model, actions)
+        if self._were_greedy:
+            count = int(cast(spaces.Discrete, model.action_space).n)
+            recorder.behavior_probs = np.full(len(actions), epsilon / count + 1 - epsilon)
+        else:
+            recorder.behavior_probs = behavior_probabilities(model, actions)
+        self.forget()
 
-    return describe
+    def forget(self) -> None:
+        """Call it when the network was asked for anything but the next actions."""
+        self._were_greedy = False
+
+    def _notice(self, network: nn.Module, *_: Any) -> None:
+        """The network was asked: for actions, if it is not learning."""
+        self._were_greedy = not network.training
 
 
 def exploration(model: BaseAlgorithm) -> float:

@@ -22,6 +22,7 @@ from mcaprl.online.agent import Agent
 from mcaprl.online.curve import read_curve
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.first_episodes import FirstEpisodes
+from mcaprl.online.policy import load_policy
 from mcaprl.online.recording import behavior_probabilities, log_paths
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
@@ -124,6 +125,25 @@ def test_probabilities_are_those_of_the_behavior(tmp_path: Path) -> None:
     settled = ~warm_up & (epsilon <= 0.05)
     assert is_greedy[settled].mean() > 0.9
     assert learner.policy_version.max() > 100
+
+
+def test_probabilities_are_right_whatever_was_asked_in_between(tmp_path: Path) -> None:
+    # With a learning rate of next to nothing, the network at the end is that of all steps; an
+    # evaluation after each one asks the network for other actions.
+    _, log = trained(
+        tmp_path / "run",
+        learning_rate=1e-30,
+        exploration_initial_eps=0.5,
+        exploration_final_eps=0.5,
+        eval_interval=4,
+        learning_starts=100,
+        steps=300,
+    )
+    epsilon = read_learner(tmp_path / "run" / "log.mcap").epsilon
+    greedy = load_policy(tmp_path / "run" / "best_model.zip").act(log.observations)
+    expected = epsilon / LANE_ACTIONS + (1 - epsilon) * (log.actions == greedy)
+    np.testing.assert_allclose(log.behavior_probs, expected, rtol=1e-6)
+    assert 0.3 < (log.actions == greedy)[epsilon < 1].mean() < 0.9
 
 
 def test_greedy_steps_are_the_networks_choice() -> None:
