@@ -73,7 +73,8 @@ def train_offline(
     from mcaprl.offline.follow import GrowingLogs
     from mcaprl.offline.run_folder import CONFIG_NAME, read_config
     from mcaprl.offline.sources import open_weighted
-    from mcaprl.offline.train import describe_seeds, train
+    from mcaprl.offline.summary import describe_seeds
+    from mcaprl.offline.train import train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}

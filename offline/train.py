@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
-from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,13 +31,14 @@ from mcaprl.offline.checkpoint import (
     read_checkpoint,
     save_checkpoint,
 )
-from mcaprl.offline.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.learner import Learner, NotFiniteError
 from mcaprl.offline.metrics import MetricsWriter
 from mcaprl.offline.observations import ObservationEncoder
 from mcaprl.offline.policy import POLICY_NAME, load_policy, save_policy
 from mcaprl.offline.run_folder import RunFolder
+from mcaprl.offline.summary import RunSummary
 from mcaprl.offline.watch import (
     HeldOut,
     choose_held_out,
@@ -47,33 +47,9 @@ from mcaprl.offline.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
-from mcaprl.sims.statistics import bootstrap_interval
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """How the training of one seed ended.
-
-    Attributes:
-        folder: with the policy, RUN/seed-K.
-        algo: the algorithm's name.
-        seed: K.
-        updates: done in all.
-        resumed_at: updates that an earlier session had done; 0 for a fresh start.
-        seconds: wall time of this session, shared with the seeds that learned beside it.
-        terms: the last update's loss terms; empty if there was nothing left to do.
-    """
-
-    folder: Path
-    algo: str
-    seed: int
-    updates: int
-    resumed_at: int
-    seconds: float
-    terms: dict[str, float]
 
 
 def train(
@@ -124,47 +100,18 @@ def train(
     source = {"env_id": dataset.env_id, "transitions": len(dataset)}
     folder = RunFolder(Path(out), identity, source)
     held_out = choose_held_out(len(weights), config.held_out)
-    drawn = np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights)
     buffer = TransitionBuffer.from_dataset(
         dataset,
         config.packing,
         encoder=_earlier_encoder(folder) if resume and other_data else None,
-        weights=drawn,
+        weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
     )
     folder.open(resume)
     if message := horizon_warning(config):
         warnings.warn(message, stacklevel=2)
-    gamma = config.gamma if isinstance(config, BootstrapConfig) else 1.0
-    watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
-    run = _Run(folder, dataset, watched, largest_return(dataset, gamma), held_out, follow)
-    summaries = []
+    run = _Run.over(folder, dataset, buffer, held_out, follow)
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-        for start in _starts(folder, range(seed, seed + seeds)):
-            learner = learner_type(config, buffer, list(start))
-            for number, checkpoint in start.items():
-                if checkpoint is not None:
-                    checkpoint.restore(learner, number)
-            summaries += run.train(learner, report)
-    return sorted(summaries, key=lambda summary: summary.seed)
-
-
-def describe_seeds(summaries: Sequence[RunSummary]) -> list[str]:
-    """A line for each seed, and one with means and 95 % intervals over seeds."""
-    lines = []
-    for summary in summaries:
-        done = summary.updates - summary.resumed_at
-        rate = done / summary.seconds if summary.seconds else 0.0
-        terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
-        lines.append(f"{summary.folder}: {done} updates, {rate:.0f} a second; {terms}")
-    finished = [summary.terms for summary in summaries if summary.terms]
-    if len(finished) > 1:
-        shown = []
-        for name in finished[0]:
-            values = np.array([[terms[name]] for terms in finished])
-            low, high = bootstrap_interval(values)
-            shown.append(f"{name} {values.mean():.4g} [{low:.4g}, {high:.4g}]")
-        lines.append(f"mean of {len(finished)} seeds [95 % interval]: {', '.join(shown)}")
-    return lines
+        return run.train(learner_type, range(seed, seed + seeds), report)
 
 
 @dataclass(frozen=True)
@@ -174,6 +121,7 @@ class _Run:
     Attributes:
         folder: of the run.
         dataset: that it learns from.
+        buffer: the same, packed.
         held_out: transitions to judge the networks by, if any.
         limit: no return can be larger in size.
         never_drawn: numbers of the held-out episodes.
@@ -182,35 +130,62 @@ class _Run:
 
     folder: RunFolder
     dataset: Dataset
+    buffer: TransitionBuffer
     held_out: HeldOut | None
     limit: float
     never_drawn: NDArray[np.int64]
     follow: GrowingLogs | None
 
-    def train(self, learner: Learner, report: ProgressCallback) -> list[RunSummary]:
+    @classmethod
+    def over(
+        cls,
+        folder: RunFolder,
+        dataset: Dataset,
+        buffer: TransitionBuffer,
+        held_out: NDArray[np.int64],
+        follow: GrowingLogs | None,
+    ) -> _Run:
+        """A run that holds out some episodes, given by their numbers."""
+        gamma = buffer.packing.gamma
+        watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
+        limit = largest_return(dataset, gamma)
+        return cls(folder, dataset, buffer, watched, limit, held_out, follow)
+
+    def train(
+        self, learner_type: type[Learner], seeds: range, report: ProgressCallback
+    ) -> list[RunSummary]:
+        """Train seeds, side by side if their checkpoints are at the same update."""
+        summaries = []
+        for start in _starts(self.folder, seeds):
+            learner = learner_type(self.folder.identity.config, self.buffer, list(start))
+            for seed, checkpoint in start.items():
+                if checkpoint is not None:
+                    checkpoint.restore(learner, seed)
+            summaries += self._train_learner(learner, report)
+        return sorted(summaries, key=lambda summary: summary.seed)
+
+    def _train_learner(self, learner: Learner, report: ProgressCallback) -> list[RunSummary]:
         """Make all updates that are left to a learner's seeds."""
         began, resumed_at = time.perf_counter(), learner.step
-        updates = learner.config.updates
-        terms: list[dict[str, float]] = [{} for _ in learner.seeds]
+        updates, seeds = learner.config.updates, learner.seeds
+        terms: list[dict[str, float]] = [{} for _ in seeds]
         warned = False
         with ExitStack() as stack:
             metrics = [
                 stack.enter_context(MetricsWriter(self.folder.of_seed(seed), learner.step + 1))
-                for seed in learner.seeds
-                if learner.step < updates
+                for seed in (seeds if learner.step < updates else ())
             ]
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
                 warned = warned or self._warn(before, terms)
-                for seed, mine in zip(learner.seeds, terms, strict=True):
+                for seed, mine in zip(seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
         seconds = time.perf_counter() - began
+        folders = [self.folder.of_seed(seed) for seed in seeds]
         return [
-            RunSummary(
-                self.folder.of_seed(seed), learner.name, seed, updates, resumed_at, seconds, mine
-            )
-            for seed, mine in zip(learner.seeds, terms, strict=True)
+            RunSummary(folder, learner.name, seed, updates, resumed_at, seconds, mine)
+            for folder, seed, mine in zip(folders, seeds, terms, strict=True)
         ]
 
     def _train_to_next_stop(

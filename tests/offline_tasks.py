@@ -64,3 +64,19 @@ def inner_observations() -> NDArray[np.float32]:
 def one_hot(cells: NDArray[np.int64]) -> NDArray[np.float32]:
     """(N, 5) for N cells."""
     return np.eye(N_CELLS, dtype=np.float32)[cells]
+
+
+def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dataset:
+    """Episodes of a walk whose observation is the step; every step pays 1."""
+    steps = np.concatenate([np.arange(length, dtype=np.float32) for length in lengths])[:, None]
+    last = np.concatenate([np.arange(1, length + 1) == length for length in lengths])
+    return Dataset.from_arrays(
+        observations=steps,
+        actions=np.zeros(len(steps), np.int64),
+        rewards=np.ones(len(steps)),
+        terminated=last,
+        truncated=np.zeros(len(steps), bool),
+        next_observations=steps + 1,
+        env_id="Crossing-v0",
+        action_space=spaces.Discrete(n_actions),
+    )
