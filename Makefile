@@ -7,11 +7,13 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # Whatever of these changes, the environments are set up anew.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test check bench bench-learning docs wheel clean
+.PHONY: help demo test faults fuzz check bench bench-learning docs wheel clean
 
 help:
 	@echo "make demo    record a car, learn from its log offline, evaluate, make the replay"
 	@echo "make test    run all tests"
+	@echo "make faults  kill recorders, spoil files and fail writes by the thousand"
+	@echo "make fuzz    search for bytes that the reader cannot bear, for ten minutes"
 	@echo "make check   format, lint, types, and the direction of imports"
 	@echo "make bench   measure speed against other libraries, as ratios"
 	@echo "make bench-learning   the same of learning, and the CartPole grid, beside d3rlpy and SB3"
@@ -24,6 +26,13 @@ demo: $(VENV)/.demo
 
 test: $(VENV)/.dev tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
+
+faults: $(VENV)/.dev
+	MCAPRL_FAULTS=large OMP_NUM_THREADS=1 $(BIN)/pytest -q -s tests/test_faults_*.py
+
+fuzz: $(VENV)/.fuzz
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz_reader $(VENV)/fuzz \
+	  -max_total_time=600 -max_len=60000 -timeout=20 -rss_limit_mb=2048
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
@@ -79,6 +88,10 @@ $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
 	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1
+	@touch $@
+
+$(VENV)/.fuzz: $(VENV)/.dev
+	$(PIP) --group fuzz
 	@touch $@
 
 # Node's MCAP libraries judge our logs; without npm those tests are skipped.

@@ -1,13 +1,40 @@
-"""Writes a log: what the topics of format version 1 hold, in chunks of their own kinds.
+"""Writes a log of format version 1, which is specified here, in `schema` and in `metadata`.
 
-    columns of steps      -> /rl/step             one chunk, fixed-size rows
-    columns of images     -> /rl/observation/...  one chunk, fixed-size rows
-    how the policy learns -> /rl/learner          one chunk, fixed-size rows; only if there is any
-    one episode's summary -> /rl/episode          one chunk
-    what viewers show     -> see `display`        one chunk
+A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, all schemas `ros2msg`.
 
-Callers write an episode's steps last: a finished episode is one whose record `final` is in the
-file, and then all else of it is there too.
+    topic                  type                      a message for each
+    /rl/step               mcaprl_msgs/msg/Step...   observation: what `schema` says
+    /rl/observation/<key>  sensor_msgs/msg/Image     picture that is observed: mono8, rgb8 or rgba8
+    /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end: what `messages` says
+    /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy told its version
+    all others                                       what only viewers show: see `display`
+
+Episodes. One of T transitions has T + 1 records of `/rl/step`, one behind the other: record k has
+observation k, and the action taken there with what it brought; record T is `final` and has only the
+last observation. `episode` counts from 0 in the recording, `step` from 0 in the episode. The last
+transition is `terminated`, `truncated` or both. One that was broken off is truncated for the reason
+`interrupted`. Episodes of many environments that ran side by side are written one after the other,
+in the order of their ends.
+
+Times. log_time is the start of the recording since the Unix epoch plus simulated time, in integer
+nanoseconds; publish_time is the same. It rises from record to record of `/rl/step`, from episode to
+episode too, and all that belongs to one observation has its log_time: that is the key which joins
+topics. `/rl/episode` has that of the final record.
+
+Chunks. Each holds one kind of topic, as the lines above divide them, and is compressed by zstd, lz4
+or not at all, with its CRC, and a MessageIndex for each channel in it. Schemas, channels, metadata
+and attachments stand outside of chunks, before what needs them. The summary repeats schemas and
+channels, and indexes all else. Every CRC that MCAP has is there.
+
+Order. First comes the metadata record `mcaprl.dataset`. Of an episode, `/rl/step` is written last:
+a finished episode is one whose record `final` is in the file, and then all else of it is there too.
+A file without a summary is one whose writer was killed, or is still at work; its finished episodes
+are whole. With the first episode comes the attachment `foxglove-layout.json`.
+
+Growth. What is appended goes on counting episodes, and begins later than the file ended; its
+environment has the same id, arguments, spaces, names and step duration as the one before. A
+recording may go on in more files, `NAME-00000.mcap`, `NAME-00001.mcap` and so on: each is a log of
+whole episodes, and episodes and times go on from one to the next.
 """
 
 from __future__ import annotations
