@@ -1,18 +1,20 @@
 # One verb per task; `make` alone lists them. Everything is installed into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
+BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
 # Whatever of these changes, the environments are set up anew.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test check bench docs wheel clean
+.PHONY: help demo test check bench bench-learning docs wheel clean
 
 help:
 	@echo "make demo    record a car, learn from its log offline, evaluate, make the replay"
 	@echo "make test    run all tests"
 	@echo "make check   format, lint, types, and the direction of imports"
 	@echo "make bench   measure speed against other libraries, as ratios"
+	@echo "make bench-learning   the same of learning, and the CartPole grid, beside d3rlpy and SB3"
 	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
 	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
 	@echo "make clean   remove what these made"
@@ -29,8 +31,12 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.run
+bench: $(BENCH)/.ready
+	OMP_NUM_THREADS=1 $(BENCH)/bin/python -m benchmarks.run
+
+bench-learning: $(VENV)/.rivals
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.learning
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.cartpole_grid $(VENV)/cartpole
 
 docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
@@ -39,7 +45,7 @@ wheel: $(VENV)/.dev
 	PYTHON="$(BIN)/python" sh .ci/bare-wheel
 
 clean:
-	rm -rf $(VENV) build dist demo *.egg-info tests/node/node_modules
+	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -55,6 +61,24 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
 	$(PIP) -e '.[sims,offline,online,report,tables]' --group dev
+	@touch $@
+
+# The libraries that we are measured against.
+$(BENCH)/.ready: $(SETTINGS)
+	@echo "installing into $(BENCH)"
+	$(PYTHON) -m venv $(BENCH)
+	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt \
+	  -e '.[sims,offline]' --group bench
+	@touch $@
+
+# d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins.
+$(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
+	@echo "installing into $(VENV)/rivals"
+	$(BIN)/python -m venv $(VENV)/rivals
+	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[offline,online]'
+	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
+	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1
 	@touch $@
 
 # Node's MCAP libraries judge our logs; without npm those tests are skipped.

@@ -1,179 +1,84 @@
-"""Measures recording, writing, reading and the sims beside other libraries: `make bench`.
-
-All sides run in one process, in turns, on the same data, by CPU time, and the best of several turns
-counts. What is printed are ratios: seconds depend on the machine, ratios much less.
-"""
+"""Runs the benchmarks, and writes results.json and docs/speed.md: `make bench`."""
 
 from __future__ import annotations
 
+import argparse
 import json
+import platform
 import tempfile
-import time
-from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
-import numpy as np
-import zstandard
-from gymnasium import spaces
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
-from mcap_ros2.decoder import DecoderFactory
+from benchmarks import growth, logs, sims
+from benchmarks.measure import Table
 
-import mcaprl
-from benchmarks import sims
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.schema import message_dtype, step_schema
+ROOT = Path(__file__).parent.parent
+LIBRARIES = (
+    "numpy",
+    "zstandard",
+    "mcap",
+    "mcap-ros2-support",
+    "foxglove-sdk",
+    "rosbags",
+    "minari",
+    "h5py",
+    "pyarrow",
+    "highway-env",
+)
+_PAGE = """\
+# Speed
 
-ROUNDS = 3
-EPISODES, LENGTH = 100, 1000
-OBSERVATION = spaces.Box(-np.inf, np.inf, (19,), np.float32)
-ACTION = spaces.Discrete(9)
-RESULTS = Path(__file__).parent / "results.json"
+Measured by the command below, which also writes this page. All sides of a table run in one process,
+in turns, on the same data, in one thread; CPU time counts, and the best of several turns. Seconds
+depend on the machine, so there are ratios only. Side by side with ours stand the limits: plain
+decompression of the same chunks by zstd, and copies in memory.
 
+```sh
+make bench
+```
 
-class Constant(gym.Env[Any, Any]):
-    """Costs next to nothing, so that what a recorder adds can be seen."""
-
-    observation_space, action_space = OBSERVATION, ACTION
-
-    def __init__(self) -> None:
-        """Prepare the one observation."""
-        self.observation = np.arange(19, dtype=np.float32)
-        self.step_number = 0
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode of LENGTH steps."""
-        self.step_number = 0
-        return self.observation, {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Give the same observation again."""
-        self.step_number += 1
-        return self.observation, 1.0, False, self.step_number == LENGTH, {}
-
-
-def dataset() -> mcaprl.Dataset:
-    """EPISODES times LENGTH random transitions of 19 numbers and 9 actions."""
-    random = np.random.default_rng(0)
-    frames = random.normal(size=(EPISODES, LENGTH + 1, 19)).astype(np.float32)
-    steps = EPISODES * LENGTH
-    ends = np.arange(1, steps + 1) % LENGTH == 0
-    return mcaprl.Dataset.from_arrays(
-        observations=frames[:, :-1].reshape(steps, 19),
-        next_observations=frames[:, 1:].reshape(steps, 19),
-        actions=random.integers(9, size=steps),
-        rewards=random.normal(size=steps),
-        terminated=np.zeros(steps, bool),
-        truncated=ends,
-        action_space=ACTION,
-    )
-
-
-def run_env(env: gym.Env[Any, Any]) -> None:
-    """Step through all episodes."""
-    for _ in range(EPISODES):
-        env.reset()
-        for _ in range(LENGTH):
-            env.step(3)
-    env.close()
-
-
-def write_with_mcap(data: mcaprl.Dataset, path: Path) -> None:
-    """The same messages, one call each, by the `mcap` package's own Writer."""
-    name, text = step_schema(OBSERVATION, ACTION)
-    dtype = message_dtype(text)
-    assert dtype is not None
-    messages = np.zeros(len(data), dtype)
-    messages["encapsulation"] = 0x0100
-    messages["observation"], messages["action"] = data.observations, data.actions
-    messages["reward"] = data.rewards
-    size, buffer = dtype.itemsize, messages.tobytes()
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start("ros2")
-        schema = writer.register_schema(name, "ros2msg", text.encode())
-        channel = writer.register_channel("/rl/step", "cdr", schema)
-        for row in range(len(messages)):
-            writer.add_message(channel, row, buffer[row * size : (row + 1) * size], row, row)
-        writer.finish()
-
-
-def read_with_mcap(path: Path) -> Any:
-    """Into the same columns, one message each, by `mcap` and `mcap-ros2-support`."""
-    columns: dict[str, list[Any]] = {"observation": [], "action": [], "reward": []}
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        for _, _, _, message in reader.iter_decoded_messages(["/rl/step"]):
-            for field, values in columns.items():
-                values.append(getattr(message, field))
-    return {field: np.array(values) for field, values in columns.items()}
-
-
-def decompress(path: Path) -> None:
-    """Nothing but zstd over the chunks of `/rl/step`: what a reader cannot do without."""
-    reader = McapReader(path)
-    channel = reader.channel_of("/rl/step")
-    assert channel is not None
-    for chunk in reader.chunks:
-        if channel.id in chunk.message_index_offsets:
-            start = chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size
-            zstandard.decompress(reader.view[start : start + chunk.compressed_size])
-
-
-def best_seconds(sides: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """CPU seconds of each side, the best of ROUNDS turns."""
-    best = dict.fromkeys(sides, float("inf"))
-    for _ in range(ROUNDS):
-        for name, side in sides.items():
-            start = time.process_time()
-            side()
-            best[name] = min(best[name], time.process_time() - start)
-    return best
+"""
 
 
 def main() -> None:
-    """Measure, print ratios, and write them to results.json."""
-    data = dataset()
-    with tempfile.TemporaryDirectory() as folder:
-        log, other, scratch = (Path(folder) / f"{name}.mcap" for name in ("log", "other", "new"))
-        data.save(log)
-        write_with_mcap(data, other)
+    """Measure everything that is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--transitions", type=int, default=1_000_000, help="of the vector log")
+    parser.add_argument("--largest", type=int, default=10_000_000, help="log of the growth table")
+    arguments = parser.parse_args()
+    sizes = tuple(size for size in (10**4, 10**5, 10**6, 10**7) if size <= arguments.largest)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tables = [*logs.tables(folder, arguments.transitions), *growth.tables(folder, sizes)]
+        tables += sims.tables()
+    write_results(tables, arguments.transitions)
 
-        def record() -> None:
-            run_env(mcaprl.RecordMcap(Constant(), scratch, overwrite=True))
 
-        recording = best_seconds({"bare": lambda: run_env(gym.Wrapper(Constant())), "ours": record})
-        writing = best_seconds(
-            {
-                "ours": lambda: data.save(scratch, overwrite=True),
-                "mcap": lambda: write_with_mcap(data, other),
-            }
-        )
-        reading = best_seconds(
-            {
-                "zstd": lambda: decompress(log),
-                "ours": lambda: mcaprl.open(log).observations,
-                "mcap": lambda: read_with_mcap(log),
-            }
-        )
-        bytes_per_step = log.stat().st_size / len(data)
-    added = recording["ours"] - recording["bare"]
+def write_results(tables: list[Table], transitions: int) -> None:
+    """Write results.json, and the page of the docs from it."""
     results = {
-        "recording, added CPU time per step / that of mcap's Writer": added / writing["mcap"],
-        "bulk write, times faster than mcap's Writer": writing["mcap"] / writing["ours"],
-        "read to columns, times faster than mcap + mcap-ros2-support": reading["mcap"]
-        / reading["ours"],
-        "read to columns, share of plain zstd's speed": reading["zstd"] / reading["ours"],
-        "bytes per transition on disk (raw: 97)": bytes_per_step,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "transitions": transitions,
+        "versions": {name: _version(name) for name in LIBRARIES},
+        "tables": [table.to_json() for table in tables],
     }
-    timed = sims.sides()
-    seconds = best_seconds({name: side.run for name, side in timed.items()})
-    results |= sims.ratios(seconds, timed)
-    for name, value in results.items():
-        print(f"{value:10.2f}  {name}")
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    (ROOT / "benchmarks" / "results.json").write_text(json.dumps(results, indent=2) + "\n")
+    versions = ", ".join(f"{name} {_version(name)}" for name in LIBRARIES)
+    about = (
+        f"The log of vectors has {transitions:,} transitions of 19 float32 in episodes of 1,000;"
+        f" that of images {logs.IMAGE_STEPS:,} of 84x84. Python {platform.python_version()},"
+        f" {versions}.\n\n"
+    )
+    page = _PAGE + about + "\n".join(table.to_markdown() for table in tables)
+    (ROOT / "docs" / "speed.md").write_text(page)
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "(not installed)"
 
 
 if __name__ == "__main__":

@@ -1,15 +1,14 @@
-"""The sims beside highway-env's own environments: steps a second, on one core."""
+"""The sims beside highway-env's own environments, on one core."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.measure import Side, Table, compare
 from mcaprl.sims import make_sim, make_sims
 
 CARS, DRONES = 1024, 64
@@ -17,45 +16,37 @@ QUADROTOR_STEPS = 5
 """A drone's decision of 0.5 s is five steps of 0.1 s, each of 50 steps of its equations."""
 
 
-@dataclass(frozen=True)
-class Side:
-    """What is timed, and how many steps it takes."""
-
-    run: Callable[[], None]
-    steps: int
+STEPS = 1_000_000
+"""So many steps are the task; each side takes a share of them."""
 
 
-def sides() -> dict[str, Side]:
-    """Make all environments; each is to be driven at random, resets included."""
-    return {
-        "racetrack": _single(_highway("highway_env:racetrack-v1"), 100),
-        "lane-keeping": _single(_highway("highway_env:lane-keeping-v0"), 2_000),
-        "car": _single(make_sim("lane"), 50_000),
-        "cars": _batch(make_sims("lane", CARS), 200),
-        "rays": _single(make_sim("lane", observation="rays"), 5_000),
-        "image": _single(make_sim("lane", observation="depth"), 1_000),
-        "quadrotor": _batch(make_sims("powerline", DRONES), 50, QUADROTOR_STEPS),
-        "racer": _single(make_sim("racer"), 20_000),
-    }
-
-
-def ratios(seconds: dict[str, float], timed: dict[str, Side]) -> dict[str, float]:
-    """Compare steps a second, from the seconds that each side took."""
-    rate = {name: timed[name].steps / seconds[name] for name in timed}
-    rows = {
-        "car, one environment": "car",
-        f"car, {CARS} environments in a batch": "cars",
-        "car with 16 rays": "rays",
-        "car with a depth image": "image",
-        f"quadrotor, 0.1 s of flight, {DRONES} in a batch": "quadrotor",
-        "racer with 18 rays": "racer",
-    }
-    found = {
-        f"{label}, steps/s / those of highway-env's racetrack-v1": rate[name] / rate["racetrack"]
-        for label, name in rows.items()
-    }
-    label = "car, one environment, steps/s / those of highway-env's lane-keeping-v0"
-    return found | {label: rate["car"] / rate["lane-keeping"]}
+def tables() -> list[Table]:
+    """Time a step of each sim."""
+    one_car = "car"
+    sides = [
+        _single(one_car, make_sim("lane"), 50_000),
+        _batch(f"car, {CARS} in a batch", make_sims("lane", CARS), 200),
+        _single("car with 16 rays", make_sim("lane", observation="rays"), 5_000),
+        _single("car with a depth image", make_sim("lane", observation="depth"), 1_000),
+        _batch(
+            f"quadrotor, 0.1 s of flight, {DRONES} in a batch",
+            make_sims("powerline", DRONES),
+            50,
+            QUADROTOR_STEPS,
+        ),
+        _single("racer with 18 rays", make_sim("racer"), 20_000),
+        _single("highway-env, lane-keeping-v0", _highway("highway_env:lane-keeping-v0"), 2_000),
+        _single("highway-env, racetrack-v1", _highway("highway_env:racetrack-v1"), 100),
+    ]
+    table = compare(
+        "A step of a sim, actions at random, resets included",
+        sides,
+        goal="a thousand steps of the car in the time of one of highway-env's racetrack",
+        rounds=3,
+        ours=one_car,
+    )
+    table.unit = "CPU time, one car = 1"
+    return [table]
 
 
 def _highway(env_id: str) -> gym.Env[Any, Any]:
@@ -65,7 +56,7 @@ def _highway(env_id: str) -> gym.Env[Any, Any]:
         return gym.make(env_id, disable_env_checker=True)
 
 
-def _single(env: gym.Env[Any, Any], steps: int) -> Side:
+def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
     sim = env.unwrapped
     sim.action_space.seed(0)
     actions = [sim.action_space.sample() for _ in range(steps)]
@@ -77,10 +68,10 @@ def _single(env: gym.Env[Any, Any], steps: int) -> Side:
             if terminated or truncated:
                 sim.reset()
 
-    return Side(run, steps)
+    return Side(name, run, share=steps / STEPS)
 
 
-def _batch(env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:
+def _batch(name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:
     random = np.random.default_rng(0)
     count = len(env.unwrapped.action_meanings)
     actions = random.integers(count, size=(steps, env.num_envs))
@@ -90,4 +81,4 @@ def _batch(env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) 
         for action in actions:
             env.step(action)
 
-    return Side(run, steps * env.num_envs * each)
+    return Side(name, run, share=steps * env.num_envs * each / STEPS)

@@ -15,8 +15,10 @@ from typing import Any
 import click
 
 from mcaprl._version import __version__
+from mcaprl.cli.annotate import annotate
 from mcaprl.cli.evaluate import evaluate
-from mcaprl.cli.logs import check, info, layout
+from mcaprl.cli.export import export
+from mcaprl.cli.logs import check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
 from mcaprl.cli.train_offline import train_offline
@@ -30,7 +32,19 @@ def cli() -> None:
     """The robot's log is the dataset: record, learn from and replay MCAP files."""
 
 
-_COMMANDS = (record, train_online, train_offline, evaluate, replay, info, check, layout)
+_COMMANDS = (
+    record,
+    train_online,
+    train_offline,
+    evaluate,
+    annotate,
+    export,
+    replay,
+    info,
+    check,
+    recover,
+    layout,
+)
 for _command in _COMMANDS:
     cli.add_command(_command)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -13,17 +12,21 @@ from typing import Any
 import click
 
 from mcaprl.cli.show import print_facts, print_json, size, write_json
-from mcaprl.errors import CorruptLogError, LogError, OutputExistsError, UsageError, import_extra
+from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.lint import Finding, lint
-from mcaprl.recorder.log_reader import describe
+from mcaprl.recorder.log_layout import attached_layout
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.moments import moments_of
 from mcaprl.recorder.reader import find_logs, open_logs
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.scene import DepthSource
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import SIMS, make_sim
+
+# What `recover` exits with when something of the old file is missing in the new one.
+_WITH_LOSSES = 3
 
 
 @click.command()
@@ -33,7 +36,16 @@ from mcaprl.sims import SIMS, make_sim
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool) -> int:
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="That read chunks at a time; pays for large logs.",
+)
+def info(
+    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
+) -> int:
     """Tell what is in DATA: files, folders or globs of logs."""
     paths = find_logs(data)
     if report is not None:
@@ -41,14 +53,17 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
         import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dataset = open_logs(paths)
+        dataset = open_logs(paths, threads=threads)
     facts = describe_dataset(dataset)
     facts["size_bytes"] = sum(path.stat().st_size for path in paths)
+    facts["storage"] = dataset.storage
     findings = lint(dataset)
     facts["problems"] = [str(warning.message) for warning in caught] + [
         str(finding) for finding in findings if finding.severity == "problem"
     ]
     facts["findings"] = [asdict(finding) for finding in findings]
+    moments = [moment for path in paths for moment in moments_of(path)]
+    facts["moments"] = [asdict(moment) for moment in moments]
     if report is not None:
         from mcaprl.recorder.report import dataset_page, dataset_picture
 
@@ -61,6 +76,8 @@ def info(data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool
         print_json(facts)
     else:
         _print_facts(facts, findings, dataset, len(paths))
+        for moment in moments:
+            click.echo(moment)
     return int(strict and bool(facts["problems"]))
 
 
@@ -93,6 +110,34 @@ def check(files: tuple[str, ...], as_json: bool) -> int:
 
 
 @click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--keep-unfinished",
+    is_flag=True,
+    help="Keep episodes whose end is missing, marked truncated, as far as they are there.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
+    """Write what is left of FILE, cut off or damaged, to OUT, which is whole then.
+
+    Exits with 0 if nothing is lost, with 3 if something is, with 1 if nothing can be kept.
+    """
+    found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+    losses = [*map(str, found.damages), *map(str, found.dropped)]
+    losses += [f"{found.strays} messages of episodes that are not kept"] if found.strays else []
+    if as_json:
+        print_json({"ok": not found.has_losses, **asdict(found)})
+    else:
+        ended = f", {found.ended} of them without their end" if found.ended else ""
+        click.echo(f"{out}: {found.episodes} episodes{ended}, {found.messages} messages")
+        for loss in losses:
+            click.echo(f"lost: {loss}")
+    return _WITH_LOSSES if found.has_losses else 0
+
+
+@click.command()
 @click.argument("source", metavar="SIM|FILE")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
@@ -103,7 +148,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
     is_file = source not in SIMS and (Path(source).is_file() or source.endswith(".mcap"))
-    found = _layout_of_file(Path(source)) if is_file else _layout_of_sim(source)
+    found = attached_layout(McapReader(Path(source))) if is_file else _layout_of_sim(source)
     write_json(out, found)
     click.echo(f"{out}: in Foxglove, open the layout menu and import this file")
 
@@ -150,6 +195,7 @@ def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
         ("simulated time", f"{facts['duration_s']:.1f} s"),
         ("mean return", f"{facts['mean_return']:.3f} (from {low:.3f} to {high:.3f})"),
         ("observations", _short(facts["observations"])),
+        ("kept in", facts["storage"]),
         ("actions", _short(facts["actions"])),
         ("taken", _counts(facts["action_counts"]) or "-"),
         ("policies", ", ".join(facts["policies"]) or "unknown"),
@@ -172,20 +218,6 @@ def _short(text: str) -> str:
     return line if len(line) <= 90 else f"{line[:40]} ... {line[-40:]}"
 
 
-def _layout_of_file(path: Path) -> dict[str, Any]:
-    """The layout that is attached to a log; made from its topics if none is."""
-    reader = McapReader(path)
-    attached = reader.attachment(LAYOUT_NAME)
-    if attached is None:
-        description = describe(reader)
-        return layout_of(description, [channel.topic for channel in reader.channels.values()])
-    try:
-        found: dict[str, Any] = json.loads(attached)
-    except ValueError as error:
-        raise CorruptLogError(f"{path}: attachment {LAYOUT_NAME} is no JSON") from error
-    return found
-
-
 def _layout_of_sim(sim: str) -> dict[str, Any]:
     """The layout that a recording of the sim would carry: one is made and thrown away."""
     with tempfile.TemporaryDirectory() as folder:
@@ -195,4 +227,4 @@ def _layout_of_sim(sim: str) -> dict[str, Any]:
         env = RecordMcap(sim_env, path, camera=camera)
         env.reset(seed=0)
         env.close()
-        return _layout_of_file(path)
+        return attached_layout(McapReader(path))

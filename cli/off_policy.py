@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mcaprl.cli.policies import policy_names
+from mcaprl.cli.policies import policy_names, trained_policies
 from mcaprl.cli.show import print_table, progress
-from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.recorder.reader import open_logs
 
 if TYPE_CHECKING:
@@ -116,22 +114,8 @@ def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPol
         if name == "random":
             found[name] = None
             continue
-        if name == "pilot":
-            raise UsageError(
-                "the pilot reads the sim's state, which no log has: pass --sim instead"
-            )
-        if not Path(name).exists():
-            raise UnknownNameError("policy", name, ["random", "the path of a trained run"])
-        from mcaprl.offline.policy import load_policies
-
-        loaded = load_policies(Path(name))
+        loaded = trained_policies(name, dataset)
         for policy in loaded:
-            for role in ("observation_space", "action_space"):
-                if getattr(policy, role) != getattr(dataset, role):
-                    raise PolicyError(
-                        f"{name} was trained on {role} {getattr(policy, role)};"
-                        f" the log has {getattr(dataset, role)}"
-                    )
             found[policy.name if len(loaded) > 1 else shown[name]] = policy
     return found
 

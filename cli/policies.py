@@ -8,7 +8,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims.rollout import Policy, check_fit
 
 SCRIPTED = ("pilot", "random")
@@ -42,10 +43,39 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     if not path.exists():
         raise UnknownNameError("policy", name, [*SCRIPTED, *_neighbours(path)])
     loaded: list[Policy | None] = []
-    for policy in _load(path):
+    for policy in load_trained(path):
         check_fit(policy, env)
         loaded.append(policy)
     return loaded
+
+
+def trained_policy(name: str, dataset: Dataset) -> Any:
+    """The policy of a run, of its first seed, to be asked about a log; see `trained_policies`."""
+    return trained_policies(name, dataset)[0]
+
+
+def trained_policies(name: str, dataset: Dataset) -> list[Any]:
+    """The policies of all seeds of a run, to be asked about a log.
+
+    Raises:
+        UsageError: the name is that of a scripted policy.
+        UnknownNameError: there is no such path.
+        PolicyError: the path holds none, or it was trained on other spaces than the log's.
+    """
+    if name in SCRIPTED:
+        raise UsageError(
+            f"{name} has no network to ask about a log: pass the path of a trained run, or --sim"
+        )
+    path = Path(name)
+    if not path.exists():
+        raise UnknownNameError("policy", name, ["the path of a trained run", *_neighbours(path)])
+    policies = load_trained(path)
+    for policy in policies:
+        for role in ("observation_space", "action_space"):
+            trained, logged = getattr(policy, role), getattr(dataset, role)
+            if trained not in (None, logged):
+                raise PolicyError(f"{name} was trained on {role} {trained}; the log has {logged}")
+    return policies
 
 
 def policy_names(names: Sequence[str]) -> dict[str, str]:
@@ -57,7 +87,18 @@ def policy_names(names: Sequence[str]) -> dict[str, str]:
     }
 
 
-def _load(path: Path) -> list[Policy]:
+def is_policy(path: Path) -> bool:
+    """Whether a path is a trained policy, and no log."""
+    kept = ("best_model.zip", "policy.json")
+    return path.suffix == ".zip" or (path.is_dir() and any(any(path.rglob(n)) for n in kept))
+
+
+def load_trained(path: Path) -> list[Policy]:
+    """Load the policies of all seeds of a run, or the one of a file.
+
+    Raises:
+        PolicyError: there are none, or a file is broken.
+    """
     if path.is_file() or any(path.rglob("best_model.zip")):
         from mcaprl.online.policy import load_policies as load_online
 

@@ -44,6 +44,8 @@ class Recording:
         camera: record metric depth images.
         compression: of chunks.
         overwrite: replace a file that is there.
+        append: go on behind the last episode of a file that is there.
+        rotate_mb: begin another file behind the episode that made one as large; None for one file.
     """
 
     sim: str
@@ -59,6 +61,8 @@ class Recording:
     camera: bool
     compression: str
     overwrite: bool
+    append: bool
+    rotate_mb: float | None
 
 
 @click.command()
@@ -87,6 +91,12 @@ class Recording:
 @click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
 @click.option("--compression", default="zstd", show_default=True, type=click.Choice(COMPRESSIONS))
 @click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+@click.option("--append", is_flag=True, help="Go on behind the last episode of a file.")
+@click.option(
+    "--rotate-mb",
+    type=click.FloatRange(0, min_open=True),
+    help="Begin another file (OUT-00000.mcap, OUT-00001.mcap, ...) when one has this many MB.",
+)
 def record(envs: int, sim_arguments: dict[str, Any], no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 
@@ -104,7 +114,7 @@ def record(envs: int, sim_arguments: dict[str, Any], no_scene: bool, **request: 
             results = run_recording(whole, on_episode)
         else:
             results = run_shards(whole, envs, on_episode)
-    _print_summary(whole.out, results)
+    _print_summary(whole, results)
 
 
 def _check_request(whole: Recording, envs: int) -> None:
@@ -112,27 +122,36 @@ def _check_request(whole: Recording, envs: int) -> None:
         raise UsageError("record needs --episodes N or --steps N, one of the two")
     if math.isnan(whole.epsilon):
         raise UsageError("--epsilon nan: give a probability from 0 to 1")
+    if envs > 1 and whole.append:
+        raise UsageError("--append goes on in one file, and --envs writes several: leave out one")
     if envs > 1 and whole.out.suffix == ".mcap":
         raise UsageError(
             f"--envs {envs} writes a file of each into a folder; {whole.out} is no name for one"
         )
 
 
-def _print_summary(out: Path, results: list[EpisodeResult]) -> None:
+def _print_summary(whole: Recording, results: list[EpisodeResult]) -> None:
     returns = np.array([result.total_reward for result in results])
     length = sum(result.length for result in results)
-    files = [out] if out.is_file() else sorted(out.glob("*.mcap"))
-    bytes_ = sum(path.stat().st_size for path in files)
+    bytes_ = sum(path.stat().st_size for path in _files(whole.out))
     click.echo(
-        f"{out}: {len(results)} episodes, {length} steps, mean return {returns.mean():.2f}"
+        f"{whole.out}: {len(results)} episodes, {length} steps, mean return {returns.mean():.2f}"
         f" (standard deviation {returns.std():.2f}), {size(bytes_)}"
     )
+
+
+def _files(out: Path) -> list[Path]:
+    """What was written: a file, its parts, or the shards in a folder."""
+    if out.is_file():
+        return [out]
+    return sorted(out.glob("*.mcap") if out.is_dir() else out.parent.glob(f"{out.stem}-*.mcap"))
 
 
 def run_recording(
     recording: Recording, on_episode: Callable[[EpisodeResult], None] | None = None
 ) -> list[EpisodeResult]:
     """Record one file in this process."""
+    megabytes = recording.rotate_mb
     env = make_sim(recording.sim, **recording.sim_options)
     with closing(env):
         policy = policies_of(recording.policy, env)[0]
@@ -145,6 +164,8 @@ def run_recording(
             seed=recording.seed,
             compression=recording.compression,
             overwrite=recording.overwrite,
+            append=recording.append,
+            max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
             scene=recording.scene,
             camera=recording.camera,
         )
@@ -159,7 +180,8 @@ def run_recording(
                 seed=recording.seed,
                 episodes=recording.episodes,
                 steps=recording.steps,
-                first_episode=recording.first_episode,
+                # Appended episodes have the seeds that they would have had in one recording.
+                first_episode=recording.first_episode + recorder.episodes,
                 on_action=tell_probability,
                 on_episode=on_episode,
             )

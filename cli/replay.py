@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import tempfile
+import threading
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,6 +16,11 @@ import gymnasium as gym
 from mcaprl.cli.show import progress
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.live import LiveServer
+from mcaprl.recorder.log_layout import attached_layout
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.playback import Player, Track
+from mcaprl.recorder.prefix import prefixes_of, side_by_side
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.verify import verify
 from mcaprl.sims import make_sim
@@ -20,37 +29,36 @@ from mcaprl.sims import make_sim
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("--episode", type=click.IntRange(0), help="This one only, counted from 0.")
+@click.option(
+    "--speed",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0, min_open=True),
+    help="Simulated seconds in a second.",
+)
+@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535))
 @click.option("--verify", "verifies", is_flag=True, help="Step the sim again and compare.")
 @click.option("--sim", help="Step this sim instead of the one that the log names.")
-def replay(files: tuple[str, ...], episode: int | None, verifies: bool, sim: str | None) -> int:
-    """Play FILE... to Foxglove, or step the sim through it again with --verify."""
+def replay(
+    files: tuple[str, ...],
+    episode: int | None,
+    speed: float,
+    loop: bool,
+    port: int,
+    verifies: bool,
+    sim: str | None,
+) -> int:
+    """Play FILE... to Foxglove, or step the sim through it again with --verify.
+
+    Several files play side by side: all start at the same time, each below a word of its own.
+    """
     paths = find_logs(files)
     if verifies:
         same = [_verify(path, episode, sim) for path in paths]
         return int(not all(same))
+    _play(paths, episode, speed=speed, loops=loop, port=port)
     return 0
-
-
-def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
-    """Compare one file with the sim and tell what was found; whether all is the same."""
-    dataset = open_logs(path)
-    check_episode(dataset, episode, path)
-    with closing(sim_of(dataset, path, sim)) as env, progress("stepping", len(dataset)) as advance:
-        found = verify(dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1)))
-    if found.unseeded:
-        shown = ", ".join(map(str, found.unseeded[:10])) + ", ..." * (len(found.unseeded) > 10)
-        click.echo(
-            f"{path}: the log has no seed of {len(found.unseeded)} episodes, so they were not"
-            f" compared: {shown}"
-        )
-    if found.difference is not None:
-        click.echo(f"{path}: {found.difference}")
-    elif found.episodes:
-        click.echo(
-            f"{path}: {found.episodes} episodes and {found.steps} steps compared: every"
-            " observation, reward and end is the same, bit for bit"
-        )
-    return found.difference is None and found.episodes > 0
 
 
 def sim_of(dataset: Dataset, path: Path, sim: str | None = None) -> gym.Env[Any, Any]:
@@ -75,3 +83,61 @@ def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
     last = len(dataset.episodes) - 1
     if episode is not None and episode > last:
         raise UsageError(f"--episode {episode}: {path} has episodes 0 to {last}")
+
+
+def _play(
+    paths: Sequence[Path], episode: int | None, *, speed: float, loops: bool, port: int
+) -> None:
+    """Serve until Ctrl-C."""
+    datasets = [open_logs(path, columns=[]) for path in paths]
+    windows = []
+    for path, dataset in zip(paths, datasets, strict=True):
+        check_episode(dataset, episode, path)
+        chosen = dataset.episodes if episode is None else dataset.episodes[episode : episode + 1]
+        windows.append((int(chosen[0].log_time_ns[0]), int(chosen[-1].log_time_ns[-1])))
+    readers = [McapReader(path) for path in paths]
+    tracks = [Track(*pair) for pair in zip(readers, windows, strict=True)]
+    player = Player(tracks, speed=speed, loops=loops)
+    starts = [int(e.log_time_ns[0]) for e in datasets[0].episodes] if episode is None else []
+    prefixes = prefixes_of(paths)
+    layout = side_by_side([attached_layout(reader) for reader in readers], prefixes)
+    server = LiveServer(
+        player,
+        prefixes=prefixes,
+        episode_starts_ns=starts,
+        name=", ".join(path.name for path in paths),
+        port=port,
+    )
+    with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
+        layout_path = Path(folder) / "foxglove-layout.json"
+        layout_path.write_text(json.dumps(layout))
+        click.echo(f"open {server.app_url}")
+        click.echo(f"or connect any viewer of the Foxglove protocol to {server.url}")
+        click.echo(f"layout to import: {layout_path}")
+        click.echo("Ctrl-C ends it")
+        try:
+            server.run(threading.Event())
+        except KeyboardInterrupt:
+            click.echo("ended")
+
+
+def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
+    """Compare one file with the sim and tell what was found; whether all is the same."""
+    dataset = open_logs(path)
+    check_episode(dataset, episode, path)
+    with closing(sim_of(dataset, path, sim)) as env, progress("stepping", len(dataset)) as advance:
+        found = verify(dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1)))
+    if found.unseeded:
+        shown = ", ".join(map(str, found.unseeded[:10])) + ", ..." * (len(found.unseeded) > 10)
+        click.echo(
+            f"{path}: the log has no seed of {len(found.unseeded)} episodes, so they were not"
+            f" compared: {shown}"
+        )
+    if found.difference is not None:
+        click.echo(f"{path}: {found.difference}")
+    elif found.episodes:
+        click.echo(
+            f"{path}: {found.episodes} episodes and {found.steps} steps compared: every"
+            " observation, reward and end is the same, bit for bit"
+        )
+    return found.difference is None and found.episodes > 0

@@ -44,6 +44,7 @@ class _TrainCommand(click.Command):
     help="Of torch; more than one pays only with big batches on an idle machine.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
+@click.option("--follow", is_flag=True, help="Learn from logs that are still being written, too.")
 @click.option("--other-data", is_flag=True, help="When resuming, go on even with other DATA.")
 def train_offline(
     data: tuple[str, ...],
@@ -53,19 +54,23 @@ def train_offline(
     seed: int,
     threads: int,
     resume: bool,
+    follow: bool,
     other_data: bool,
     **settings: Any,
 ) -> None:
     """Learn a policy from DATA: files, folders or globs of logs.
 
     A number behind a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
-    twice as often as others. All seeds are trained side by side and do not depend on each other.
-    Settings that are not given have the algorithm's own defaults; with --resume, the run's.
+    twice as often as others. With --follow, another process may still write DATA: each episode is
+    taken up when it is finished, until all updates are made. All seeds are trained side by side and
+    do not depend on each other. Settings that are not given have the algorithm's own defaults; with
+    --resume, the run's.
     """
     import torch
 
     from mcaprl.offline.algorithms import choose_algorithm
     from mcaprl.offline.curves import draw_curves
+    from mcaprl.offline.follow import GrowingLogs
     from mcaprl.offline.run_folder import CONFIG_NAME, read_config
     from mcaprl.offline.sources import open_weighted
     from mcaprl.offline.train import describe_seeds, train
@@ -80,7 +85,8 @@ def train_offline(
     _, defaults = choose_algorithm(algo)
     check_settings(algo, defaults, given)
     config = type(defaults)(**given)
-    dataset, weights = open_weighted(data)
+    growing = GrowingLogs(data) if follow else None
+    dataset, weights = (growing.dataset, None) if growing else open_weighted(data)
     click.echo(
         f"{algo} learns from {len(dataset.episodes)} episodes, {len(dataset)} transitions,"
         f" mean return {dataset.statistics.mean_return:.2f}"
@@ -93,7 +99,9 @@ def train_offline(
         seed=seed,
         weights=weights,
         resume=resume,
-        other_data=other_data,
+        # Logs that grew since are not what the checkpoints are of.
+        other_data=other_data or follow,
+        follow=growing,
     )
     for line in describe_seeds(summaries):
         click.echo(line)

@@ -9,8 +9,13 @@ from typing import Any
 import click
 
 from mcaprl.cli.options import sim_options
+from mcaprl.cli.policies import is_policy, load_trained
 from mcaprl.cli.settings import setting_options
 from mcaprl.cli.show import print_table
+from mcaprl.errors import UsageError
+from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.reader import open_logs
+from mcaprl.sims.rollout import Policy
 
 
 class _TrainCommand(click.Command):
@@ -52,6 +57,13 @@ class _TrainCommand(click.Command):
     type=click.Path(path_type=Path),
     help="Log every transition while training; with several seeds a folder.",
 )
+@click.option(
+    "--from",
+    "sources",
+    multiple=True,
+    metavar="DATA|POLICY",
+    help="Begin with logs in the replay buffer, or with a policy's weights; may be given twice.",
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @sim_options
 def train_online(
@@ -63,6 +75,7 @@ def train_online(
     seed: int,
     threads: int,
     record: Path | None,
+    sources: tuple[str, ...],
     resume: bool,
     sim_arguments: dict[str, Any],
     **settings: Any,
@@ -83,7 +96,17 @@ def train_online(
     task = choose_task(
         sim, algo, sim_arguments, given, preset=preset, resumed=out if resume else None
     )
-    summaries = train(task, out, seeds=seeds, seed=seed, record=record, resume=resume)
+    data, policy = _experience(sources)
+    summaries = train(
+        task,
+        out,
+        seeds=seeds,
+        seed=seed,
+        record=record,
+        data=data,
+        policy=policy,
+        resume=resume,
+    )
     rows = [
         [
             str(summary.folder),
@@ -101,3 +124,13 @@ def train_online(
         rows,
     )
     click.echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")
+
+
+def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, Policy | None]:
+    """The logs, and the policy, among what is to be begun with."""
+    policies = [source for source in sources if is_policy(Path(source))]
+    if len(policies) > 1:
+        raise UsageError(f"an agent begins with one policy, not with {' and '.join(policies)}")
+    logs = [source for source in sources if source not in policies]
+    data = open_logs(logs) if logs else None
+    return data, load_trained(Path(policies[0]))[0] if policies else None

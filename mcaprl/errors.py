@@ -8,6 +8,7 @@
     ├── LogError              a log cannot be read or written as asked     (exit code 1)
     │   ├── NotMcapError        the file is no MCAP file
     │   ├── NoStepsError        the file has no `/rl/step` topic, or no finished episode
+    │   │   └── NoEpisodesError   it has the topic, but no finished episode (yet)
     │   └── CorruptLogError     the file's bytes contradict each other
     ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
     ├── PolicyError           a saved policy cannot be used                (exit code 1)
@@ -79,6 +80,10 @@ class NotMcapError(LogError):
 
 class NoStepsError(LogError):
     """The file holds no transitions: no `/rl/step` topic, or no finished episode."""
+
+
+class NoEpisodesError(NoStepsError):
+    """The file is a log, but no episode of it is finished."""
 
 
 class CorruptLogError(LogError):

@@ -72,7 +72,7 @@ class Observations:
         """Each `count` observations that follow each other as one; the last one's mask counts."""
         if count == 1:
             return self
-        rows = len(self) // count
+        rows = self.vector.shape[0] // count
         images = tuple(
             image.view(rows, count, *image.shape[1:]).permute(0, 2, 3, 1, 4).flatten(3)
             for image in self.images
@@ -92,6 +92,9 @@ class ObservationEncoder:
         space: of one observation.
         width: V, the numbers of its vector.
         image_shapes: (height, width, channels) of each picture.
+        images: the leaves that are pictures.
+        numbers: the leaves that make the vector, and their spaces.
+        mask: the leaf that is the action mask, if there is one.
         shift: (V,) float32, taken off the vector.
         scale: (V,) float32, the vector is divided by it then.
     """
@@ -104,19 +107,19 @@ class ObservationEncoder:
         """
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
-        self._mask = leaves.pop((MASK_KEY,), None)
-        if self._mask is not None and self._mask.shape != (n_actions,):
-            shape = self._mask.shape
+        self.mask = leaves.pop((MASK_KEY,), None)
+        if self.mask is not None and self.mask.shape != (n_actions,):
+            shape = self.mask.shape
             raise SpaceError(f"{MASK_KEY} has shape {shape}, there are {n_actions} actions")
         kinds = [(leaf, _part_of(space, leaf.path)) for leaf in leaves.values()]
-        self._images = [leaf for leaf, part in kinds if _is_image(part)]
-        self._numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
+        self.images = [leaf for leaf, part in kinds if _is_image(part)]
+        self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
         if not kinds:
             raise SpaceError(f"the observation holds nothing but {MASK_KEY}")
-        self.image_shapes = [(*leaf.shape, 1)[:3] for leaf in self._images]
-        widths = [_width(part) for _, part in self._numbers]
+        self.image_shapes = [(*leaf.shape, 1)[:3] for leaf in self.images]
+        widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
-        bytes_ = [part.dtype == np.uint8 for _, part in self._numbers]
+        bytes_ = [part.dtype == np.uint8 for _, part in self.numbers]
         self.shift = np.zeros(self.width, np.float32)
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
@@ -142,11 +145,11 @@ class ObservationEncoder:
         Raises:
             SpaceError: they have other shapes.
         """
-        for leaf in self._leaves():
+        for leaf in self.leaves:
             _check_shape(leaf, observations)
         images = [
             torch.from_numpy(np.require(leaf.of(observations), np.uint8, ["C", "W"]))
-            for leaf in self._images
+            for leaf in self.images
         ]
         shaped = zip(images, self.image_shapes, strict=True)
         return Observations(
@@ -158,25 +161,27 @@ class ObservationEncoder:
     def is_stack(self, observations: Any, count: int) -> bool:
         """Whether these are `count` observations in a row each: (B, count, *shape)."""
         return all(
-            np.shape(leaf.of(observations))[1:] == (count, *leaf.shape) for leaf in self._leaves()
+            np.shape(leaf.of(observations))[1:] == (count, *leaf.shape) for leaf in self.leaves
         )
 
-    def _leaves(self) -> list[Leaf]:
-        mask = [] if self._mask is None else [self._mask]
-        return [*self._images, *(leaf for leaf, _ in self._numbers), *mask]
+    @property
+    def leaves(self) -> list[Leaf]:
+        """All parts of an observation: pictures, numbers, mask."""
+        mask = [] if self.mask is None else [self.mask]
+        return [*self.images, *(leaf for leaf, _ in self.numbers), *mask]
 
     def _vector(self, observations: Any) -> NDArray[Any]:
-        rows = len(self._leaves()[0].of(observations))
-        parts = [_numbers(leaf.of(observations), part) for leaf, part in self._numbers]
+        rows = len(self.leaves[0].of(observations))
+        parts = [_numbers(leaf.of(observations), part) for leaf, part in self.numbers]
         vector = np.concatenate(parts, 1) if parts else np.empty((rows, 0), np.float32)
         if self.shift.any():
             vector = vector - self.shift
         return vector / self.scale if (self.scale != 1).any() else vector
 
     def _allowed(self, observations: Any) -> Tensor | None:
-        if self._mask is None:
+        if self.mask is None:
             return None
-        allowed = np.asarray(self._mask.of(observations)).astype(bool)
+        allowed = np.asarray(self.mask.of(observations)).astype(bool)
         # Behind the end of an episode nothing may be allowed; no value there is ever used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 

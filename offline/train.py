@@ -33,6 +33,7 @@ from mcaprl.offline.checkpoint import (
     save_checkpoint,
 )
 from mcaprl.offline.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.learner import Learner, NotFiniteError
 from mcaprl.offline.metrics import MetricsWriter
 from mcaprl.offline.observations import ObservationEncoder
@@ -85,6 +86,7 @@ def train(
     weights: NDArray[np.float64] | None = None,
     resume: bool = False,
     other_data: bool = False,
+    follow: GrowingLogs | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[RunSummary]:
     """Train on a dataset; the same seed, data and machine give the same weights.
@@ -100,6 +102,8 @@ def train(
             all alike.
         resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
         other_data: when resuming, go on even if the checkpoints are from other data.
+        follow: logs that `dataset` was read from and that grow; each episode that is finished
+            while the networks learn is learned from, too.
         progress: called with each row of metrics; None shows a bar where stderr is a terminal.
 
     Returns:
@@ -132,7 +136,7 @@ def train(
         warnings.warn(message, stacklevel=2)
     gamma = config.gamma if isinstance(config, BootstrapConfig) else 1.0
     watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
-    run = _Run(folder, dataset, watched, largest_return(dataset, gamma))
+    run = _Run(folder, dataset, watched, largest_return(dataset, gamma), held_out, follow)
     summaries = []
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
         for start in _starts(folder, range(seed, seed + seeds)):
@@ -172,12 +176,16 @@ class _Run:
         dataset: that it learns from.
         held_out: transitions to judge the networks by, if any.
         limit: no return can be larger in size.
+        never_drawn: numbers of the held-out episodes.
+        follow: the logs, if they may grow.
     """
 
     folder: RunFolder
     dataset: Dataset
     held_out: HeldOut | None
     limit: float
+    never_drawn: NDArray[np.int64]
+    follow: GrowingLogs | None
 
     def train(self, learner: Learner, report: ProgressCallback) -> list[RunSummary]:
         """Make all updates that are left to a learner's seeds."""
@@ -192,8 +200,9 @@ class _Run:
                 if learner.step < updates
             ]
             while learner.step < updates:
-                terms = self._train_to_next_stop(learner, metrics)
-                warned = warned or self._warn(terms)
+                learner = self._with_new_episodes(learner)
+                before, terms = terms, self._train_to_next_stop(learner, metrics)
+                warned = warned or self._warn(before, terms)
                 for seed, mine in zip(learner.seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
         seconds = time.perf_counter() - began
@@ -226,6 +235,12 @@ class _Run:
             self._save(learner)
         return values
 
+    def _with_new_episodes(self, learner: Learner) -> Learner:
+        """The learner, now and then with the episodes that were logged meanwhile."""
+        if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
+            return learner
+        return with_more_data(learner, self.follow.dataset, self.never_drawn)
+
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.
 
@@ -248,10 +263,12 @@ class _Run:
                 f" {good}. Look for huge values in the data, or lower the learning rate"
             ) from error
 
-    def _warn(self, terms: list[dict[str, float]]) -> bool:
+    def _warn(self, before: list[dict[str, float]], now: list[dict[str, float]]) -> bool:
         """Tell of values that run away, once; gives whether it was told."""
-        for mine in terms:
-            if message := divergence_warning(mine, self.limit):
+        for earlier, later in zip(before, now, strict=True):
+            if "mean_q" not in earlier:
+                continue
+            if message := divergence_warning(earlier["mean_q"], later["mean_q"], self.limit):
                 warnings.warn(message, stacklevel=2)
                 return True
         return False
@@ -274,7 +291,7 @@ def _earlier_encoder(folder: RunFolder) -> ObservationEncoder | None:
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
     """Of the data, and of their weights where these differ."""
-    if (weights == weights[0]).all():
+    if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
 

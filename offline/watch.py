@@ -73,7 +73,7 @@ def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
     count = round(fraction * n_episodes)
     if fraction > 0 and n_episodes >= 10:
         count = max(count, 1)
-    count = min(count, n_episodes - 1)
+    count = max(0, min(count, n_episodes - 1))
     return np.sort(np.random.default_rng(0).permutation(n_episodes)[:count])
 
 
@@ -125,15 +125,15 @@ def horizon_warning(config: TrainingConfig) -> str | None:
     )
 
 
-def divergence_warning(terms: dict[str, float], limit: float) -> str | None:
-    """What to say of values beyond twice the largest possible return.
+def divergence_warning(before: float, value: float, limit: float) -> str | None:
+    """What to say of values beyond twice the largest possible return that go on growing.
 
     Args:
-        terms: of one batch.
+        before: mean value of an earlier batch; fresh networks may begin anywhere.
+        value: mean value of this one.
         limit: the largest possible return.
     """
-    value = terms.get("mean_q", 0.0)
-    if abs(value) <= MAX_EXCESS * limit:
+    if abs(value) <= max(MAX_EXCESS * limit, 1.0) or abs(value) <= abs(before):
         return None
     return (
         f"values diverge: the mean of a batch is {value:.4g}, and no return can be beyond"

@@ -13,6 +13,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.utils import ConstantSchedule
 
 from mcaprl.online.algorithms import make_model
 from mcaprl.online.callbacks import BetweenRollouts, CopyTargetByEpisodes, EveryInterval
@@ -25,7 +26,9 @@ from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
 from mcaprl.online.recording import describe_actions, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.online.warm_start import fill_buffer, sample_observations, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
+from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims.rollout import episode_seed
 
 LOG_INTERVAL = 1_000
@@ -51,6 +54,7 @@ class Agent:
         scale: Scale,
         *,
         record: Path | None = None,
+        resume: bool = False,
     ) -> None:
         """Make an agent with fresh weights, its environments, and its log.
 
@@ -61,19 +65,22 @@ class Agent:
             seed: of the agent.
             scale: of scores.
             record: log to write; None records nothing, neither training nor evaluations.
+            resume: go on from the folder's checkpoint and behind the log's last episode, where
+                there are such.
 
         Raises:
             SpaceError, OutputExistsError, LogError: the log cannot be written.
         """
         self.points: list[CurvePoint] = []
         self.resumed_at = 0
+        self._began_with_policy = False
         self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
-        self._records = record is not None
+        self._records, self._resumes = record is not None, resume
         with ExitStack() as stack:
             batch = stack.enter_context(closing(task.batch(task.config.envs)))
             recorder = None
             if record is not None:
-                recorder = recorded(batch, record, algo=task.algo, seed=seed)
+                recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
             env = stack.enter_context(closing(BatchedVecEnv(recorder or batch)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             self._eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
@@ -90,16 +97,41 @@ class Agent:
             task.sim_options,
         )
 
+    def start_from(self, data: Dataset | None, policy: Any) -> None:
+        """Begin with experience: logged transitions in the replay buffer, a policy's weights.
+
+        Data make the random steps at the beginning needless. A policy's agent explores as it
+        would at the end of its training.
+
+        Args:
+            data: None has none.
+            policy: with Q-values; None has none.
+
+        Raises:
+            UsageError: the algorithm cannot.
+            SpaceError: the spaces differ.
+            PolicyError: the policy's network is another.
+        """
+        model: Any = self.model
+        if data is not None:
+            fill_buffer(model, data)
+            model.learning_starts = 0
+        if policy is not None:
+            space = self._eval_env.observation_space
+            take_weights(model, policy, sample_observations(space))
+            model.learning_starts = 0
+            model.exploration_rate = model.exploration_final_eps
+            self._explore_as_at_the_end()
+
     def close(self) -> None:
         """Close environments and log."""
         self._envs.close()
 
-    def learn(self, report: ProgressCallback, *, resume: bool = False) -> None:
+    def learn(self, report: ProgressCallback) -> None:
         """Train to the end, evaluating on the way.
 
         Args:
             report: told how far it is, each `LOG_INTERVAL` steps.
-            resume: go on from the folder's checkpoint, if there is one.
 
         Raises:
             TrainingError: the checkpoint is of another task, or broken.
@@ -113,7 +145,7 @@ class Agent:
             on_new_best=self._keep_best,
             on_point=self._add_point,
         )
-        if resume and self._checkpoint.exists():
+        if self._resumes and self._checkpoint.exists():
             self._load(evaluation)
         done = self.resumed_at = self.model.num_timesteps
         if done >= config.steps:
@@ -143,16 +175,24 @@ class Agent:
 
     def _save(self) -> None:
         points = [asdict(point) for point in self.points]
-        save_checkpoint(self._checkpoint, self.model, self._task, {"points": points})
+        extra = {"points": points, "began_with_policy": self._began_with_policy}
+        save_checkpoint(self._checkpoint, self.model, self._task, extra)
 
     def _load(self, evaluation: Evaluation) -> None:
         extra = load_checkpoint(self._checkpoint, self.model, self._task)
         self.points = [CurvePoint(**point) for point in extra["points"]]
+        if extra["began_with_policy"]:
+            self._explore_as_at_the_end()
         done, envs = self.model.num_timesteps, self._task.config.envs
         evaluation.resume(done // envs, max(p.mean_return for p in self.points))
         # The environments cannot go on where they were, but must not begin as they first did.
         assert self.model.env is not None
         self.model.env.seed(episode_seed(self._seed, done))
+
+    def _explore_as_at_the_end(self) -> None:
+        self._began_with_policy = True
+        model: Any = self.model
+        model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
 
     def _keep_best(self) -> None:
         save_policy(self._folder / BEST_NAME, self.model, self._description)

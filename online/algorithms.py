@@ -8,6 +8,7 @@ from typing import Any, Final, cast
 from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,6 +21,7 @@ from mcaprl.online.config import (
     PPOConfig,
 )
 from mcaprl.online.double_dqn import DoubleDQN
+from mcaprl.online.frame_buffer import FrameReplayBuffer
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         policy_kwargs=policy_kwargs,
         seed=seed,
         device="auto",
-        **config.arguments(),
+        **_arguments(config, env.observation_space),
     )
     if isinstance(config, DQNConfig) and config.exploration_decay:
         cast(DQN, model).exploration_schedule = ExponentialSchedule(
@@ -98,6 +100,16 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
             config.steps,
         )
     return model
+
+
+def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
+    """The settings; where pictures would be stored twice, with a buffer that stores them once."""
+    arguments = config.arguments()
+    parts = space.values() if isinstance(space, spaces.Dict) else [space]
+    if isinstance(config, DQNConfig) and any(is_image_space(part) for part in parts):
+        extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
+        arguments |= {"replay_buffer_class": FrameReplayBuffer, "replay_buffer_kwargs": extra}
+    return arguments
 
 
 @dataclass(frozen=True)
@@ -117,5 +129,4 @@ class ExponentialSchedule:
 def _policy_name(space: spaces.Space[Any]) -> str:
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"
-    is_picture = isinstance(space, spaces.Box) and len(space.shape) == 3
-    return "CnnPolicy" if is_picture else "MlpPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"

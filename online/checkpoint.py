@@ -23,6 +23,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import Tensor
 
 from mcaprl.errors import TrainingError
+from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.task import Task
 from mcaprl.tensor_files import read_tensors, write_tensors
 
@@ -36,6 +37,7 @@ _COUNTERS = (
     "_n_calls",
     "_current_progress_remaining",
     "exploration_rate",
+    "learning_starts",
 )
 
 
@@ -102,37 +104,42 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
 
 
-def _buffer_arrays(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
-    """Its columns by name; those of dict observations one by one."""
-    arrays: dict[str, NDArray[Any]] = {}
+def _buffer_of(model: BaseAlgorithm) -> Any:
+    return model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+
+
+def _sb3_columns(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
+    """The filled rows of a buffer of SB3's; those of dict observations one by one."""
+    columns: dict[str, NDArray[Any]] = {}
     for name, value in vars(buffer).items():
-        if isinstance(value, np.ndarray):
-            arrays[name] = value
-        elif isinstance(value, dict):
-            parts = {f"{name}.{key}": part for key, part in value.items()}
-            arrays |= {key: part for key, part in parts.items() if isinstance(part, np.ndarray)}
-    return arrays
+        parts = {f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {}
+        columns |= {k: v for k, v in {name: value, **parts}.items() if isinstance(v, np.ndarray)}
+    return {name: column[: buffer.size()] for name, column in columns.items()}
 
 
 def _buffer_tensors(model: BaseAlgorithm) -> dict[str, Tensor]:
-    """The filled rows of the replay buffer; nothing where the algorithm has none."""
-    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    """What the replay buffer holds; nothing where the algorithm has none."""
+    buffer = _buffer_of(model)
     if buffer is None:
         return {}
-    rows = buffer.size()
+    frames = isinstance(buffer, FrameReplayBuffer)
+    columns = buffer.columns() if frames else _sb3_columns(buffer)
     place = torch.tensor([buffer.pos, int(buffer.full)])
-    columns = _buffer_arrays(buffer)
-    return {"place": place, **{k: torch.from_numpy(v[:rows]) for k, v in columns.items()}}
+    return {"place": place, **{name: torch.from_numpy(part) for name, part in columns.items()}}
 
 
 def _load_buffer(model: BaseAlgorithm, tensors: dict[str, Tensor]) -> None:
-    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    buffer = _buffer_of(model)
     if buffer is None:
         return
     place = tensors.pop("place").tolist()
     buffer.pos, buffer.full = place[0], bool(place[1])
-    for name, column in _buffer_arrays(buffer).items():
-        column[: buffer.size()] = tensors[name].numpy()
+    columns = {name: tensor.numpy() for name, tensor in tensors.items()}
+    if isinstance(buffer, FrameReplayBuffer):
+        buffer.restore(columns)
+    else:
+        for name, rows in _sb3_columns(buffer).items():
+            rows[:] = columns[name]
 
 
 def _generators(model: BaseAlgorithm) -> tuple[dict[str, Tensor], dict[str, Any]]:

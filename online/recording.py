@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +17,8 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.vector_wrapper import RecordVecMcap
 
 
@@ -40,13 +42,36 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
     return paths
 
 
-def recorded(env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int) -> RecordVecMcap:
+def recorded(
+    env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int, resume: bool = False
+) -> RecordVecMcap:
     """Record what a batch of environments does from now on, with a row for each step of learning.
+
+    Args:
+        env: to be recorded.
+        path: of the log.
+        algo: who acts.
+        seed: of the agent.
+        resume: go on behind the last episode of a log that is there. If its recorder was killed,
+            it is recovered first, and the damaged file is kept beside it.
 
     Raises:
         SpaceError, OutputExistsError, LogError: as `RecordVecMcap`.
     """
-    return RecordVecMcap(env, path, policy=algo, policy_version=0, seed=seed)
+
+    def wrap(append: bool) -> RecordVecMcap:
+        return RecordVecMcap(env, path, policy=algo, policy_version=0, seed=seed, append=append)
+
+    if not (resume and path.exists()):
+        return wrap(append=False)
+    try:
+        return wrap(append=True)
+    except LogError:
+        whole = path.with_name(f"{path.name}.whole")
+        recover_log(path, whole, overwrite=True)
+        os.replace(path, path.with_name(f"{path.name}.damaged"))
+        os.replace(whole, path)
+        return wrap(append=True)
 
 
 def describe_actions(recorder: RecordVecMcap, model: BaseAlgorithm) -> Callable[[Any], None]:

@@ -40,7 +40,7 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
         "buffer_size": 100_000,
         "target_update_interval": 1_000,
     },
-    SIMS["powerline"]: {**_FAR_SIGHTED, "steps": 120_000, "buffer_size": 200_000},
+    SIMS["powerline"]: {**_FAR_SIGHTED, "steps": 200_000, "buffer_size": 200_000},
     SIMS["racer"]: {**_FAR_SIGHTED, "steps": 100_000, "buffer_size": 100_000},
     SIMS["highway-lane"]: {
         **_STEADY,

@@ -34,6 +34,7 @@ from mcaprl.online.policy import BEST_NAME, load_policy
 from mcaprl.online.recording import log_paths
 from mcaprl.online.task import CONFIG_NAME, Task, read_config
 from mcaprl.progress import ProgressCallback, terminal_progress
+from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluate import evaluate
 
@@ -72,6 +73,8 @@ def train(
     seeds: int = 1,
     seed: int = 0,
     record: str | Path | None = None,
+    data: Dataset | None = None,
+    policy: Any = None,
     resume: bool = False,
     progress: ProgressCallback | None = None,
 ) -> list[RunSummary]:
@@ -83,6 +86,8 @@ def train(
         seeds: how many agents to train, one after the other.
         seed: of the first; the others count up from it.
         record: log of every transition, written while it happens; with several seeds a folder.
+        data: logged transitions to begin the replay buffer with.
+        policy: a trained one with Q-values, whose weights to begin with.
         resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
         progress: called now and then; None shows a bar where stderr is a terminal.
 
@@ -93,6 +98,7 @@ def train(
         UnknownNameError: there is no such sim.
         OutputExistsError: `out` or `record` is taken.
         SpaceError: the algorithm cannot learn with these observations or actions.
+        PolicyError: `policy` has another network than the agent.
         TrainingError: `out` cannot be written, or has a run of another task.
     """
     if seeds < 1 or seed < 0:
@@ -102,7 +108,7 @@ def train(
     config = task.config
     with closing(make_sim(task.sim, **task.sim_options)) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(Path(out), task, env, logs)
+        run = _Run(Path(out), task, env, logs, data, policy)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -123,6 +129,8 @@ class _Run:
     task: Task
     env: gym.Env[Any, Any]
     logs: dict[int, Path]
+    data: Dataset | None
+    policy: Any
 
     def open(self, resume: bool) -> None:
         """Make the folder, or make sure that it is this run's."""
@@ -148,9 +156,18 @@ class _Run:
         folder.mkdir(exist_ok=True)
         began_s = time.perf_counter()
         env_id = self.env.spec.id if self.env.spec else self.task.sim
-        agent = Agent(self.task, env_id, folder, seed, selection, record=self.logs.get(seed))
+        agent = Agent(
+            self.task,
+            env_id,
+            folder,
+            seed,
+            selection,
+            record=self.logs.get(seed),
+            resume=resume,
+        )
         with closing(agent):
-            agent.learn(report, resume=resume)
+            agent.start_from(self.data, self.policy)
+            agent.learn(report)
         score = evaluate(
             self.env,
             [load_policy(folder / BEST_NAME)],

@@ -1,27 +1,27 @@
-"""Reads a log from end to end and tells everything that is wrong with it."""
+"""Reads a log from end to end and tells everything that is wrong with it.
+
+    the file     summary, CRC of all data                          (here)
+    its chunks   CRCs, indexes against contents, what the summary tells of them  (chunk_check)
+    the log      metadata against schema, episodes, steps in order, pictures     (episode_check)
+
+Each chunk is decompressed once, and looked at as a whole: a check takes as long as reading does.
+"""
 
 from __future__ import annotations
 
-import warnings
+import struct
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, DataEnd
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
-from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, chunk_records, message_index
-from mcaprl.recorder.log_reader import LogReader
+from mcaprl.recorder.chunk_check import Contradiction, check_chunk, check_statistics, place
+from mcaprl.recorder.chunks import RECORD_HEADER_BYTES
+from mcaprl.recorder.episode_check import EpisodeCheck
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import parse_record
-from mcaprl.recorder.rows import add_up
-
-_REWRITE = "read what is left with mcaprl.open and save it anew"
 
 
 @dataclass(frozen=True)
@@ -54,118 +54,82 @@ def check_log(path: str | Path) -> list[Problem]:
     Returns:
         What is wrong with it, in the order of the file; empty if nothing is.
     """
-    found: list[Problem] = []
-
-    def report(what: str, where: str, next_: str = _REWRITE) -> None:
-        found.append(Problem(str(path), what, where, next_))
-
+    path = Path(path)
     try:
         reader = McapReader(path)
     except LogError as error:
-        report(_without_path(error, path), "opening the file", "restore it from a copy")
-        return found
-    if not reader.complete:
-        report(
-            "the file has no summary: its writer was killed or is still at work",
-            f"after byte {reader.data_end}",
-            "finished episodes can be read; save them anew to get a whole file",
-        )
-    _check_data_crc(reader, report)
+        is_damaged = isinstance(error, CorruptLogError)
+        what_next = _recover(path) if is_damaged else "restore it from a copy"
+        return [Problem(str(path), _without_path(error, path), "opening the file", what_next)]
+    found = [*_check_file(reader)]
+    try:
+        found += _check_contents(reader, whole=not found)
+    except (LogError, SpaceError) as error:
+        found.append(Contradiction(_without_path(error, path), "/rl/step"))
+    return [Problem(str(path), told.what, told.where, _recover(path)) for told in found]
+
+
+def _check_contents(reader: McapReader, *, whole: bool) -> list[Contradiction]:
+    """Chunk by chunk: what stands in each, and what the log says with all of them."""
+    found: list[Contradiction] = []
+    log = EpisodeCheck(reader) if whole else None
     for chunk in reader.chunks:
-        _check_chunk(reader, chunk, report)
-    if not found:
-        _check_contents(reader.path, report)
+        try:
+            records = reader.chunk_records(chunk)
+            found += check_chunk(reader, chunk, records)
+        except CorruptLogError as error:
+            found.append(Contradiction(_without_path(error, reader.path), place(reader, chunk)))
+            continue
+        if log is not None and not found:
+            log.take(chunk, records)
+    if log is not None and not found:
+        found += [*check_statistics(reader), *log.finish()]
     return found
 
 
-Report = Callable[..., None]
-
-
-def _check_data_crc(reader: McapReader, report: Report) -> None:
-    """The data section's own CRC, which covers what stands outside the chunks as well."""
-    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
-        if opcode == Opcode.DATA_END:
-            try:
-                end: DataEnd = parse_record(opcode, content)
-            except CorruptLogError as error:
-                report(str(error), f"byte {offset}")
-                return
-            crc = end.data_section_crc
-            if crc and zlib.crc32(reader.view[:offset]) != crc:
-                report("the data section does not match its CRC", f"bytes 0 to {offset}")
-            if (
-                reader.complete
-                and offset + RECORD_HEADER_BYTES + len(content) != reader.summary_start
-            ):
-                report("the data section's end is damaged", f"byte {offset}")
-            return
-    if reader.complete:
-        report("the data section has no end", "the records between header and summary")
-
-
-def _check_chunk(reader: McapReader, chunk: ChunkIndex, report: Report) -> None:
-    """One chunk's CRC, and its message indexes against its messages."""
-    offset = chunk.chunk_start_offset
-    try:
-        records = chunk_records(reader.view, offset)
-        times, offsets, channels = _messages_in(records)
-        for channel_id, index_offset in chunk.message_index_offsets.items():
-            index = message_index(reader.view, index_offset, channel_id)
-            mine = channels == channel_id
-            order = np.argsort(index["offset"], kind="stable")
-            told = index[order]
-            if not (
-                np.array_equal(told["offset"], offsets[mine])
-                and np.array_equal(told["log_time"], times[mine])
-            ):
-                known = reader.channels.get(channel_id)
-                topic = known.topic if known else f"channel {channel_id}"
-                report(f"the message index of {topic} is wrong", f"chunk at byte {offset}")
-        unindexed = set(np.unique(channels).tolist()) - set(chunk.message_index_offsets)
-        for channel_id in unindexed:
-            report(f"channel {channel_id} is not in the message index", f"chunk at byte {offset}")
-    except CorruptLogError as error:
-        report(_without_path(error, reader.path), f"chunk at byte {offset}")
-
-
-def _messages_in(records: memoryview) -> tuple[Any, Any, Any]:
-    """Times, offsets and channels of a chunk's messages, in their order."""
-    times, offsets, channels = [], [], []
-    offset, header = 0, MESSAGE_HEADER.itemsize
-    while offset < len(records):
-        end = offset + RECORD_HEADER_BYTES
-        if end > len(records):
-            raise CorruptLogError("a record is cut off")
-        opcode, length = records[offset], int.from_bytes(records[offset + 1 : end], "little")
-        if end + length > len(records):
-            raise CorruptLogError("a record reaches beyond its chunk")
-        if opcode == Opcode.MESSAGE:
-            if RECORD_HEADER_BYTES + length < header:
-                raise CorruptLogError("a message is shorter than its header")
-            message = np.frombuffer(records, MESSAGE_HEADER, 1, offset)[0]
-            times.append(message["log_time"])
-            channels.append(message["channel_id"])
-            offsets.append(offset)
-        offset = end + length
-    return np.array(times, np.uint64), np.array(offsets, np.uint64), np.array(channels, np.uint16)
-
-
-def _check_contents(path: Path, report: Report) -> None:
-    """Metadata, episodes and their order: what reading the dataset verifies."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            dataset = LogReader(path).read()
-    except (LogError, SpaceError) as error:
-        report(_without_path(error, path), "/rl/step", "record it again, or open another file")
-        return
-    for episode in dataset.episodes:
-        total = add_up(episode.rewards)
-        if total != episode.total_reward and not np.isnan(total):
-            report(
-                f"/rl/episode tells a return of {episode.total_reward}, its rewards give {total}",
-                f"episode {episode.index}",
+def _check_file(reader: McapReader) -> list[Contradiction]:
+    """The summary's presence, the CRC of all data, and those of attachments."""
+    found = []
+    if not reader.complete:
+        found.append(
+            Contradiction(
+                "the file has no summary: its writer was killed or is still at work",
+                f"after byte {reader.data_end}",
             )
+        )
+    end = None
+    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
+        if opcode == Opcode.ATTACHMENT and not _is_intact(content):
+            found.append(Contradiction("an attachment does not match its CRC", f"byte {offset}"))
+        if opcode == Opcode.DATA_END:
+            end = offset
+            found += _check_data_end(reader, offset, content)
+            break
+    if reader.complete and end is None:
+        where = "the records between header and summary"
+        found.append(Contradiction("the data section has no end", where))
+    return found
+
+
+def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> list[Contradiction]:
+    if len(content) != 4 or (
+        reader.summary_start and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start
+    ):
+        return [Contradiction("the data section's end is damaged", f"byte {offset}")]
+    (crc,) = struct.unpack("<I", content)
+    if crc and zlib.crc32(reader.view[:offset]) != crc:
+        where = f"bytes 0 to {offset}"
+        return [Contradiction("the data section does not match its CRC", where)]
+    return []
+
+
+def _is_intact(content: memoryview) -> bool:
+    (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
+    return not crc or zlib.crc32(content[:-4]) == crc
+
+
+def _recover(path: Path) -> str:
+    return f"run `mcaprl recover {path} OUT`"
 
 
 def _without_path(error: Exception, path: str | Path) -> str:

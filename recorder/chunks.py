@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import lz4.frame
@@ -37,9 +38,10 @@ INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 # 32 KB of zstd can inflate to 1 GiB; no sane writer makes chunks of this size.
 MAX_CHUNK_BYTES = 256 * 2**20
 
-_CHUNK_START = struct.Struct("<BQQQQII")
+_CHUNK_START, _INDEX_START = struct.Struct("<BQQQQII"), struct.Struct("<BQHI")
 
 
+@lru_cache(maxsize=64)
 def record_dtype(payload: np.dtype[Any]) -> np.dtype[Any]:
     """A message record: its header's fields, then `payload`."""
     return np.dtype(
@@ -90,6 +92,21 @@ class ChunkHeader:
     crc: int
     compression: str
     data: slice
+
+    def to_record(self) -> bytes:
+        """The Chunk record up to its data, which follows it."""
+        name, data_bytes = self.compression.encode(), int(self.data.stop - self.data.start)
+        length = _CHUNK_START.size - RECORD_HEADER_BYTES + len(name) + 8 + data_bytes
+        start: bytes = _CHUNK_START.pack(
+            Opcode.CHUNK,
+            length,
+            self.start_time,
+            self.end_time,
+            self.uncompressed_bytes,
+            self.crc,
+            len(name),
+        )
+        return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
 
 def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
@@ -162,10 +179,9 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
     Raises:
         CorruptLogError: there is none of that channel.
     """
-    head = struct.Struct("<BQHI")
     try:
-        opcode, _, channel, entries_bytes = head.unpack_from(file, offset)
-        start = offset + head.size
+        opcode, _, channel, entries_bytes = _INDEX_START.unpack_from(file, offset)
+        start = offset + _INDEX_START.size
         count, rest = divmod(entries_bytes, INDEX_ENTRY.itemsize)
         if opcode == Opcode.MESSAGE_INDEX and channel == channel_id and rest == 0:
             return np.frombuffer(file, INDEX_ENTRY, count, start)

@@ -50,11 +50,13 @@ class Topic:
         """
         self.name = name
         self._reader = reader
-        self.parts = [
-            Part(reader, channel, span)
-            for channel in reader.channels_of(name)
-            for span in reader.spans(channel)
-        ]
+        self.parts: list[Part] = []
+        for channel in reader.channels_of(name):
+            spans = reader.spans(channel)
+            # A channel without messages may be of any type.
+            if spans:
+                type_ = _type_of(reader, channel)
+                self.parts += [Part(reader, channel, type_, span) for span in spans]
         self._counts = [len(part.span.index) for part in self.parts]
         self._stops = np.cumsum(self._counts, dtype=np.int64)
 
@@ -71,6 +73,11 @@ class Topic:
         return times
 
     @property
+    def channels(self) -> int:
+        """How many channels have messages of it."""
+        return len({part.channel.id for part in self.parts})
+
+    @property
     def channel_ids(self) -> NDArray[np.uint16]:
         """(N,) of each message, likewise."""
         ids = np.array([part.channel.id for part in self.parts], np.uint16)
@@ -80,7 +87,7 @@ class Topic:
     def chunks_rise(self) -> bool:
         """Whether it is one channel, and no chunk begins before the one before it has ended."""
         chunks = [part.span.chunk for part in self.parts]
-        return len({part.channel.id for part in self.parts}) == 1 and all(
+        return self.channels == 1 and all(
             a is not None and b is not None and a.message_end_time <= b.message_start_time
             for a, b in pairwise(chunks)
         )
@@ -161,14 +168,11 @@ class Part:
         type: of the messages.
     """
 
-    def __init__(self, reader: McapReader, channel: Channel, span: Span) -> None:
-        """Learn their type; none is read.
-
-        Raises:
-            LogError: messages are encoded in a way that is not known.
-        """
-        self.span, self.channel = span, channel
-        self.type = _type_of(reader, channel)
+    def __init__(
+        self, reader: McapReader, channel: Channel, type_: MessageType, span: Span
+    ) -> None:
+        """Point at them; none is read."""
+        self.span, self.channel, self.type = span, channel, type_
         self._reader = reader
 
     @property

@@ -6,19 +6,19 @@
                         before. A viewer that jumps into the file fetches the last message of each
                         topic, and that is all there is to see
 /tf, /tf_static         frames: at each step, and likewise
-/telemetry              named numbers to plot
+/telemetry              named numbers to plot: the environment's own, and the return so far
 /camera/depth           metric depth, millimetres
 """
 
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
 from mcaprl.recorder import messages
+from mcaprl.recorder.layout import RETURN_SO_FAR
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
 from mcaprl.recorder.rows import ImageColumn
 from mcaprl.recorder.scene import (
@@ -30,7 +30,7 @@ from mcaprl.recorder.scene import (
     marker_array,
     transforms,
 )
-from mcaprl.recorder.schema import ENCAPSULATION, telemetry_schema
+from mcaprl.recorder.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.signals import HoldSignals
 
 ROSOUT, SCENE, SCENE_STATIC = "/rosout", "/scene", "/scene/static"
@@ -45,7 +45,15 @@ _SCENE_PERIOD_NS = 200_000_000
 class Display:
     """Collects an episode's display messages and writes them in chunks of their own."""
 
-    def __init__(self, log: LogWriter, source: object, *, scene: bool, camera: bool) -> None:
+    def __init__(
+        self,
+        log: LogWriter,
+        source: object,
+        *,
+        scene: bool,
+        camera: bool,
+        log_lines: bool = True,
+    ) -> None:
         """Prepare for `source`, an unwrapped environment, with methods of the protocols or without.
 
         Args:
@@ -53,7 +61,9 @@ class Display:
             source: what is to be shown.
             scene: whether to record shapes, frames and telemetry.
             camera: whether to record the depth camera; it is anyway if observations are images.
+            log_lines: whether to tell of episodes' starts and ends.
         """
+        self._log_lines = log_lines
         self._log = log
         self._messages: list[tuple[int, int, bytes]] = []
         self._bytes = 0
@@ -90,6 +100,7 @@ class Display:
             Whether the topics were announced just now.
         """
         self._start_ns, self._step_ns = start_ns, step_ns
+        self._return_so_far = 0.0
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
         is_first = not self._channels
         if is_first:
@@ -102,8 +113,14 @@ class Display:
             self._depth_images.begin(start_ns, step_ns)
         return is_first
 
-    def observe(self, step: int) -> None:
-        """Show the environment as it is after `step` steps, if anything of it can be shown."""
+    def observe(self, step: int, reward: float) -> None:
+        """Show the environment as it is after `step` steps, if anything of it can be shown.
+
+        Args:
+            step: from the episode's start.
+            reward: of the last one; 0 at the start.
+        """
+        self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
             self._held = (time_ns, self._scene.scene())
@@ -111,10 +128,9 @@ class Display:
                 self._draw_held()
             self._emit(TF, time_ns, transforms(self._scene.frames(), time_ns))
         if self._telemetry is not None:
-            values = self._telemetry.telemetry()
+            values = {RETURN_SO_FAR: self._return_so_far, **self._telemetry.telemetry()}
             numbers = [values.get(name, math.nan) for name in self.telemetry_names]
-            data = struct.pack(f"<I{len(numbers)}f", ENCAPSULATION, *numbers)
-            self._emit(TELEMETRY, time_ns, data)
+            self._emit(TELEMETRY, time_ns, telemetry_message(numbers))
         if self._depth is not None and self._depth_images is not None:
             if step >= self._depth_images.full_at:
                 with HoldSignals():
@@ -141,8 +157,12 @@ class Display:
             self._static = {}
         self._messages, self._bytes, self._held = [], 0, None
 
+    def forget_what_stands(self) -> None:
+        """Show again what does not move, since another file begins."""
+        self._static = {}
+
     def _announce(self) -> None:
-        types = {ROSOUT: "rcl_interfaces/msg/Log"}
+        types = {ROSOUT: "rcl_interfaces/msg/Log"} if self._log_lines else {}
         if self._scene is not None:
             self.follow_frame = next((frame.name for frame in self._scene.frames()), "")
             types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
@@ -151,7 +171,7 @@ class Display:
             topic: self._log.add_channel(topic, name) for topic, name in types.items()
         }
         if self._telemetry is not None:
-            self.telemetry_names = tuple(self._telemetry.telemetry())
+            self.telemetry_names = tuple({RETURN_SO_FAR: 0.0, **self._telemetry.telemetry()})
             name, text = telemetry_schema(self.telemetry_names)
             self._channels[TELEMETRY] = self._log.mcap.add_channel(TELEMETRY, name, text)
         if self._depth is not None:
@@ -159,6 +179,8 @@ class Display:
             self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
 
     def _say(self, time_ns: int, text: str) -> None:
+        if not self._log_lines:
+            return
         line = messages.new(
             "rcl_interfaces/msg/Log",
             stamp=messages.stamp(time_ns),

@@ -11,15 +11,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mcaprl.recorder.metadata import LogMetadata
-from mcaprl.recorder.spaces import observation_leaves
+from mcaprl.recorder.spaces import action_leaf, observation_leaves
 
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 # Observations of more numbers than this get a series for each of the first ones only.
 MAX_SERIES = 24
-# Of the telemetry, what says how well an agent follows its course.
-PLOTTED_ENDINGS = ("speed_m_s", "offset_m")
-MAX_PLOTTED = 4
+RETURN_SO_FAR = "return_so_far"
+# Of the telemetry, what says how well an agent follows its course, by the ends of names.
+PLOTTED_ENDINGS = {"speed": "speed_m_s", "offsets": "offset_m"}
 # The depth image's colours span this much, millimetres.
 DEPTH_RANGE_MM = (0, 50_000)
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
@@ -44,7 +44,7 @@ def layout_of(
     panels: dict[str, dict[str, Any]] = {}
     views = _views(metadata, topics, follow_frame, panels)
     plots = _plots(metadata, topics, telemetry_names, panels)
-    panels["StateTransitions!actions"] = _state_transitions(metadata)
+    panels["StateTransitions!actions"] = _state_transitions(metadata, topics)
     below: list[Node] = ["StateTransitions!actions"]
     if "/rosout" in topics:
         panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/rosout"}
@@ -58,6 +58,11 @@ def layout_of(
         "playbackConfig": {"speed": 1},
         "layout": root,
     }
+
+
+def is_values_topic(topic: str) -> bool:
+    """Whether a topic tells what a policy thinks of the steps."""
+    return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 
 def _views(
@@ -90,24 +95,63 @@ def _plots(
     telemetry_names: Sequence[str],
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
-    """One plot of the rewards, one for each unit of the telemetry, one of observations."""
-    series = {"reward": {"reward": "/rl/step.reward"}}
-    if VALUES_TOPIC in topics:
-        names = metadata.action_names().values()
-        series["q_values"] = {
-            f"Q {name}": f"{VALUES_TOPIC}.q[{index}]" for index, name in enumerate(names)
-        }
-    shown = [name for name in telemetry_names if name.endswith(PLOTTED_ENDINGS)][:MAX_PLOTTED]
-    for name in shown:
-        series[name] = {name: f"/telemetry.{name}"}
-    if not shown:
-        series["observation"] = _observation_series(metadata)
-    nodes: list[Node] = []
-    for title, paths in series.items():
+    """Plots of reward and return, and below them tabs with all other numbers of the log."""
+    returns = {"return of episode": "/rl/episode.total_reward"}
+    if RETURN_SO_FAR in telemetry_names:
+        returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
+    always = {"reward": {"reward": "/rl/step.reward"}, "return": returns}
+    tabs = {
+        **_value_series(metadata, topics),
+        **_telemetry_series(telemetry_names),
+        "observations": _observation_series(metadata),
+        "actions": _action_series(metadata),
+    }
+    for title, paths in [*always.items(), *tabs.items()]:
         if paths:
-            panels[f"Plot!{title}"] = _plot(title.replace("_", " "), paths)
-            nodes.append(f"Plot!{title}")
-    return nodes
+            panels[f"Plot!{title}"] = _plot(title, paths)
+    panels["Tab!numbers"] = {
+        "activeTabIdx": 0,
+        "tabs": [
+            {"title": title, "layout": f"Plot!{title}"} for title, paths in tabs.items() if paths
+        ],
+    }
+    return [*(f"Plot!{title}" for title in always), "Tab!numbers"]
+
+
+def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Speeds, and offsets: what says how well an agent follows its course, by unit."""
+    return {
+        title: {name: f"/telemetry.{name}" for name in names if name.endswith(ending)}
+        for title, ending in PLOTTED_ENDINGS.items()
+    }
+
+
+def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Of each annotating policy: its values of the actions, its surprise, its doubt."""
+    series = {}
+    for topic in topics:
+        if not is_values_topic(topic):
+            continue
+        title = topic.removeprefix("/rl/")
+        q_values = enumerate(metadata.action_names().values())
+        series[title] = {f"Q {name}": f"{topic}.q[{index}]" for index, name in q_values}
+        fields = ("td_error", "advantage", "entropy")
+        series[f"{title}: errors"] = {field: f"{topic}.{field}" for field in fields}
+    return series
+
+
+def _action_series(metadata: LogMetadata) -> dict[str, str]:
+    """A series for each number of an action; for each discrete action the moments it was taken."""
+    names = metadata.action_names()
+    if names:
+        taken = {
+            name: f"/rl/step{{action=={value}}}{{final==false}}.action"
+            for value, name in names.items()
+        }
+        return dict(list(taken.items())[:MAX_SERIES])
+    leaf = action_leaf(metadata.action_space)
+    suffixes = [f"[{index}]" for index in range(leaf.size)] if leaf.shape else [""]
+    return {f"action{suffix}": f"/rl/step.action{suffix}" for suffix in suffixes[:MAX_SERIES]}
 
 
 def _observation_series(metadata: LogMetadata) -> dict[str, str]:
@@ -124,12 +168,16 @@ def _observation_series(metadata: LogMetadata) -> dict[str, str]:
     return dict(list(paths.items())[:MAX_SERIES])
 
 
-def _state_transitions(metadata: LogMetadata) -> dict[str, Any]:
+def _state_transitions(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, Any]:
     paths = [_state("/rl/step.episode", "episode")]
     names = metadata.action_names()
     if names:
         legend = ", ".join(f"{value} {name}" for value, name in names.items())
         paths.insert(0, _state("/rl/step.action", f"action ({legend})"))
+    for topic in filter(is_values_topic, topics):
+        title = topic.removeprefix("/rl/")
+        paths += [_state(f"{topic}.policy_action", f"{title} would take")]
+        paths += [_state(f"{topic}.agrees", f"{title} agrees")]
     return {"foxglovePanelTitle": "Action and episode", "isSynced": True, "paths": paths}
 
 

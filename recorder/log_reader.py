@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError, NoStepsError, SpaceError
+from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
 from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episodes import (
@@ -34,6 +34,8 @@ from mcaprl.recorder.spaces import Leaf, action_leaf, observation_leaves, restri
 from mcaprl.recorder.storage import Storage
 from mcaprl.recorder.transitions import Transitions, spans
 
+# Steps; see `_without`.
+_LONG_EPISODE = 100
 REQUIRED_FIELDS = ("reward", "action", "terminated", "truncated", *COUNTERS)
 
 
@@ -68,7 +70,7 @@ class LogReader:
 
         Raises:
             CorruptLogError: records are missing, doubled or out of order.
-            NoStepsError: there is no finished episode.
+            NoEpisodesError: there is no finished episode.
         """
         # What is told is believed only as far as it agrees with what is read then.
         told = told_lengths(self._told) if self._reader.complete else np.empty(0, np.int64)
@@ -137,7 +139,7 @@ class LogReader:
 
     def _check_fields(self, wanted: Sequence[str]) -> None:
         if not len(self._steps):
-            raise NoStepsError(f"{self.path} has no finished episode")
+            raise NoEpisodesError(f"{self.path} has no finished episode")
         fields = self._steps.fields
         missing = [name for name in wanted if name not in fields]
         if missing:
@@ -152,10 +154,10 @@ class LogReader:
         """Tell of records behind the last finished episode.
 
         Raises:
-            NoStepsError: there is no finished one.
+            NoEpisodesError: there is no finished one.
         """
         if not len(lengths):
-            raise NoStepsError(f"{self.path} has no finished episode")
+            raise NoEpisodesError(f"{self.path} has no finished episode")
         behind = len(self._steps) - int(lengths.sum()) - len(lengths)
         if behind or not self._reader.complete:
             warnings.warn(
@@ -169,19 +171,20 @@ class LogReader:
         self, metadata: LogMetadata, columns: Columns, lengths: NDArray[np.int64]
     ) -> Dataset:
         leaves = self._leaves(metadata)
-        told = told_episodes(self._told, columns[LOG_TIME][np.cumsum(lengths + 1) - 1])
-        actual = ~columns["final"].astype(bool)
+        finals = np.cumsum(lengths + 1) - 1
+        told = told_episodes(self._told, columns[LOG_TIME][finals])
+        episodes = summaries(self.path, columns, lengths, told)
         action = action_leaf(metadata.action_space)
-        probs = columns.get("behavior_prob", np.full(len(actual), np.nan, np.float32))
+        probs = columns.get("behavior_prob", np.full(len(columns["final"]), np.nan, np.float32))
         transitions = Transitions(
             frames=tuple(self._frames(leaf, columns) for leaf in leaves),
             log_time_ns=columns[LOG_TIME],
-            actions=_as_leaf(self.path, columns, action)[actual],
-            rewards=columns["reward"][actual].astype(np.float64, copy=False),
-            terminated=columns["terminated"][actual].astype(bool),
-            truncated=columns["truncated"][actual].astype(bool),
-            behavior_probs=probs[actual].astype(np.float32, copy=False),
-            episodes=summaries(self.path, columns, lengths, told),
+            episodes=episodes,
+            actions=_without(_as_leaf(self.path, columns, action), finals),
+            rewards=_without(columns["reward"].astype(np.float64, copy=False), finals),
+            terminated=_without(columns["terminated"].astype(bool), finals),
+            truncated=_without(columns["truncated"].astype(bool), finals),
+            behavior_probs=_without(probs.astype(np.float32, copy=False), finals),
         )
         if self._selection.columns is not None:
             metadata = replace(
@@ -271,3 +274,14 @@ def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
         f"{path}: {STEP_TOPIC} does not fit the spaces in the metadata: {leaf.name} is"
         f" {column.dtype} {column.shape[1:]}, its space {leaf.dtype} {leaf.shape}"
     )
+
+
+def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
+    """A column without some of its rows; it is overwritten."""
+    if len(column) < _LONG_EPISODE * len(rows):
+        return np.delete(column, rows, axis=0)
+    # Where much stands between them, moving that is cheaper than another column.
+    starts, stops = rows[:-1] + 1, rows[1:]
+    for moved, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True), 1):
+        column[start - moved : stop - moved] = column[start:stop]
+    return column[: len(column) - len(rows)]

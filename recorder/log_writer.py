@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.errors import LogError
 from mcaprl.recorder import messages
 from mcaprl.recorder.chunks import message_rows
 from mcaprl.recorder.mcap_writer import McapWriter
-from mcaprl.recorder.metadata import METADATA_NAME, LogMetadata
+from mcaprl.recorder.metadata import METADATA_NAME, SAME_WHEN_APPENDED, LogMetadata
 from mcaprl.recorder.schema import (
     ENCAPSULATION,
     LEARNER_TEXT,
@@ -39,6 +40,8 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
 LEARNER_TOPIC = "/rl/learner"
+INTERRUPTED = "interrupted"
+"""Why an episode ended that the recorder, not the environment, broke off."""
 # Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
@@ -102,12 +105,14 @@ class LogWriter:
         *,
         compression: str = "zstd",
         overwrite: bool = False,
+        append: bool = False,
     ) -> None:
-        """Create the file and announce its topics.
+        """Create the file, or open it to append, and announce its topics.
 
         Raises:
             SpaceError: a log cannot hold these spaces. No file is made then.
-            OutputExistsError, LogError: the file cannot be created.
+            OutputExistsError, LogError: the file cannot be created, or appended to; then it stays
+                as it is.
         """
         leaves = observation_leaves(metadata.observation_space)
         self.metadata = metadata
@@ -118,10 +123,24 @@ class LogWriter:
         assert dtype is not None, "/rl/step has a fixed length by construction"
         self._step_dtype = dtype
         strings = metadata.to_strings()
-        self.mcap = McapWriter(path, compression=compression, overwrite=overwrite)
+        self.mcap = McapWriter(path, compression=compression, overwrite=overwrite, append=append)
+        if self.mcap.untouched:
+            self._check_same(strings)
         self.mcap.add_metadata(METADATA_NAME, strings)
         self._step_channel = self.mcap.add_channel(STEP_TOPIC, name, text, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
+
+    def _check_same(self, strings: dict[str, str]) -> None:
+        """Make sure that a file that is appended to was recorded from such an environment."""
+        found = self.mcap.metadata(METADATA_NAME) or {}
+        for name in SAME_WHEN_APPENDED:
+            here, there = strings[name], found.get(name, "not known")
+            if here != there:
+                self.mcap.abandon()
+                raise LogError(
+                    f"{self.mcap.path} cannot be appended to: its {name} is {there:.200}, the"
+                    f" recording's {here:.200}; record to another file"
+                )
 
     def add_channel(self, topic: str, type_name: str) -> int:
         """Announce a topic of a known ROS type; returns its channel id."""

@@ -82,7 +82,7 @@ class McapReader:
             LogError: it cannot be opened.
         """
         self.path = Path(path)
-        self.view = _map(self.path)
+        self.view = map_file(self.path)
         if bytes(self.view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
             raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
         self.schemas: dict[int, Schema] = {}
@@ -92,6 +92,8 @@ class McapReader:
         self.data_end = 0
         self._counts: dict[int, int] = {}
         self._loose = LooseMessages()
+        # Who asks for a chunk's example asks for all of it next.
+        self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
         footer = self._footer()
         self.complete = footer is not None
@@ -170,10 +172,15 @@ class McapReader:
         Raises:
             CorruptLogError: the chunk is damaged.
         """
-        try:
-            return chunk_records(self.view, chunk.chunk_start_offset)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
+        start = chunk.chunk_start_offset
+        last, records = self._last_chunk
+        if last != start:
+            try:
+                records = chunk_records(self.view, start)
+            except CorruptLogError as error:
+                raise CorruptLogError(f"{self.path}: {error}") from error
+            self._last_chunk = start, records
+        return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
         """Yield log_time and bytes of a topic's messages, one by one.
@@ -206,11 +213,12 @@ class McapReader:
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """The first attachment of a name; None if there is none.
+        """The last attachment of a name; None if there is none.
 
         Raises:
             CorruptLogError: it does not match its CRC.
         """
+        found = None
         for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
             if opcode == Opcode.ATTACHMENT:
                 attachment = self._parse(opcode, content, offset)
@@ -218,10 +226,10 @@ class McapReader:
                     (crc,) = struct.unpack("<I", content[-4:])
                     if crc and zlib.crc32(content[:-4]) != crc:
                         raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
-                    return bytes(attachment.data)
+                    found = bytes(attachment.data)
             if opcode == Opcode.DATA_END:
                 break
-        return None
+        return found
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.
@@ -367,7 +375,13 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
 
 
-def _map(path: Path) -> memoryview:
+def map_file(path: Path) -> memoryview:
+    """The bytes of a file, mapped into memory.
+
+    Raises:
+        NotMcapError: it is empty.
+        LogError: it cannot be read.
+    """
     try:
         with path.open("rb") as file:
             if not file.seek(0, io.SEEK_END):

@@ -121,6 +121,9 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     Raises:
         CorruptLogError: a record is damaged, or reaches beyond the chunk.
     """
+    uniform = _uniform_indexes(chunk)
+    if uniform is not None:
+        return ChunkContents([], uniform)
     topics, loose, end = [], LooseMessages(), 0
     for offset, opcode, content in records_of(chunk, 0):
         if opcode == Opcode.MESSAGE:
@@ -131,6 +134,25 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     if end != len(chunk):
         raise CorruptLogError("a record reaches beyond its chunk")
     return ChunkContents(topics, loose.indexes())
+
+
+def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
+    """Indexes of a chunk of nothing but messages of one length; None if it is another."""
+    if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
+        return None
+    size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]
+    if size < MESSAGE_HEADER.itemsize or len(chunk) % size:
+        return None
+    heads = np.ndarray(len(chunk) // size, MESSAGE_HEADER, chunk, strides=(size,))
+    if (heads["opcode"] != Opcode.MESSAGE).any() or (heads["length"] != heads["length"][0]).any():
+        return None
+    entries = np.empty(len(heads), INDEX_ENTRY)
+    entries["log_time"] = heads["log_time"]
+    entries["offset"] = np.arange(len(heads), dtype=np.uint64) * np.uint64(size)
+    ids = heads["channel_id"]
+    if (ids == ids[0]).all():
+        return {int(ids[0]): entries}
+    return {int(channel_id): entries[ids == channel_id] for channel_id in np.unique(ids)}
 
 
 def _chunk_index(content: memoryview) -> ChunkIndex:

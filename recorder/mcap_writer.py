@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from collections.abc import Callable, Sequence
-from io import FileIO
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,107 +18,154 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
-    Footer,
     Header,
     McapRecord,
     Message,
     Metadata,
-    MetadataIndex,
     Schema,
-    Statistics,
-    SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl._version import __version__
-from mcaprl.errors import LogError, OutputExistsError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, compressor
+from mcaprl.errors import LogError, UnknownNameError
+from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, ChunkHeader, compressor
+from mcaprl.recorder.log_file import create, release, reopen
+from mcaprl.recorder.mcap_append import Standing, what_is_written
+from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
 # Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
 # themselves so much that a slower search halves them.
-_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 6
+_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 9
 
 
 class McapWriter:
-    """Writes one MCAP file of profile `ros2` with CDR messages."""
+    """Writes one MCAP file of CDR messages, or several that follow each other.
+
+    Attributes:
+        path: of the file that is being written.
+        position: its length so far; of one that is appended to, without its summary.
+        untouched: whether it is one that was there before, and nothing has been written yet.
+    """
 
     def __init__(
-        self, path: str | Path, *, compression: str = "zstd", overwrite: bool = False
+        self,
+        path: str | Path,
+        *,
+        compression: str = "zstd",
+        overwrite: bool = False,
+        append: bool = False,
+        profile: str = "ros2",
     ) -> None:
-        """Create the file.
+        """Create the file, or open it to append.
 
         Args:
             path: where to; folders above it are made.
             compression: of chunks: `zstd`, `lz4` or `none`.
             overwrite: replace a file that is there.
+            append: go on behind the last record of a file that is there.
+            profile: of a new file.
 
         Raises:
-            OutputExistsError: there is a file, and `overwrite` is not set.
-            LogError: it cannot be created.
+            OutputExistsError: there is a file, and neither `overwrite` nor `append` is set.
+            LogError: it cannot be written, another writer is at work on it, or it is not whole.
         """
         if compression not in COMPRESSIONS:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
-        self.path = Path(path)
-        self._compression = compression
+        self._compression, self._profile = compression, profile
         self._compress_rows = compressor(compression, _ROWS_LEVEL)
         self._compress_messages = compressor(compression, _MESSAGES_LEVEL)
-        self._schema_ids: dict[tuple[str, str], int] = {}
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._sequences: list[int] = []
-        self._chunk_indexes: list[ChunkIndex] = []
-        self._metadata_indexes: list[MetadataIndex] = []
-        self._attachment_indexes: list[AttachmentIndex] = []
-        self._position = 0
-        self._crc = 0
-        self._file = _create(self.path, overwrite)
-        self._write(MCAP0_MAGIC)
-        self._write_record(Header("ros2", f"mcaprl {__version__}"))
+        # What every file begins with, in this order.
+        self._standing: list[Standing] = []
+        if append and Path(path).exists():
+            self._continue(Path(path))
+        else:
+            self._begin(Path(path), overwrite)
 
     @property
     def closed(self) -> bool:
         """Whether the file is finished."""
         return self._file.closed
 
+    @property
+    def schemas(self) -> Mapping[int, Schema]:
+        """Those announced, by id."""
+        return self._summary.schemas
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Those announced, by id."""
+        return self._summary.channels
+
+    @property
+    def end_time_ns(self) -> int:
+        """The largest log_time in the file; -1 if it has no messages."""
+        return max((chunk.message_end_time for chunk in self._summary.chunks), default=-1)
+
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Announce a topic of `ros2msg` messages; returns its channel id."""
-        schema_id = self._schema_ids.get((schema_name, schema_text))
+        """Announce a topic of `ros2msg` messages, or find it; returns its channel id.
+
+        Raises:
+            LogError: the file has messages of another type on that topic.
+        """
+        schemas, channels = self._summary.schemas, self._summary.channels
+        wanted = ("ros2msg", schema_name, schema_text.encode())
+        schema_id = next(
+            (s.id for s in schemas.values() if (s.encoding, s.name, s.data) == wanted),
+            None,
+        )
+        for channel in channels.values():
+            if channel.topic == topic and channel.schema_id == schema_id:
+                return channel.id
+            if channel.topic == topic:
+                raise LogError(
+                    f"{self.path} has messages of another type on {topic}: record to another file"
+                )
         if schema_id is None:
-            schema_id = len(self._schemas) + 1
-            schema = Schema(schema_id, schema_text.encode(), "ros2msg", schema_name)
-            self._write_record(schema)
-            self._schemas.append(schema)
-            self._schema_ids[schema_name, schema_text] = schema_id
-        channel = Channel(len(self._channels) + 1, topic, "cdr", metadata or {}, schema_id)
-        self._write_record(channel)
-        self._channels.append(channel)
-        self._sequences.append(0)
-        return channel.id
+            schema_id = max(schemas, default=0) + 1
+            self.announce(Schema(schema_id, schema_text.encode(), "ros2msg", schema_name))
+        channel_id = max(channels, default=0) + 1
+        self.announce(Channel(channel_id, topic, "cdr", metadata or {}, schema_id))
+        return channel_id
+
+    def metadata(self, name: str) -> dict[str, str] | None:
+        """The metadata record of a name; None if the file has none."""
+        found = [r for r in self._standing if isinstance(r, Metadata) and r.name == name]
+        return found[0].metadata if found else None
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Write a metadata record."""
-        offset = self._position
-        self._write_record(Metadata(name, metadata))
-        self._metadata_indexes.append(MetadataIndex(offset, self._position - offset, name))
+        """Write a metadata record, unless the file has one of that name."""
+        if self.metadata(name) is None:
+            self.announce(Metadata(name, metadata))
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        """Write an attachment; `time_ns` is when it was made."""
-        offset = self._position
-        self._write_record(Attachment(time_ns, time_ns, name, media_type, data))
-        length = self._position - offset
-        self._attachment_indexes.append(
-            AttachmentIndex(offset, length, time_ns, time_ns, len(data), name, media_type)
-        )
+        """Write an attachment made at `time_ns`, unless the file has one of that name."""
+        if all(record.name != name for record in self._summary.attachments):
+            self.announce(Attachment(time_ns, time_ns, name, media_type, data))
+
+    def announce(self, record: Standing) -> None:
+        """Write a record that stands outside of chunks, in this file and those that follow it."""
+        self._write_standing(record)
+        self._standing.append(record)
+
+    def start_next(self, path: Path) -> None:
+        """Finish the file and go on in another, with the same channels, metadata and attachments.
+
+        Raises:
+            OutputExistsError: there is a file.
+            LogError: it cannot be written.
+        """
+        self.close()
+        self._begin(path, overwrite=False)
+        for record in self._standing:
+            self._write_standing(record)
 
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write messages of one channel and length as one chunk.
@@ -155,34 +201,54 @@ class McapWriter:
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
         self._write_chunk(memoryview(builder.end()), indexes, self._compress_messages)
 
+    def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
+        """Write a chunk's records as they are.
+
+        Args:
+            records: Message records of announced channels, their sequence numbers included.
+            indexes: of `chunks.INDEX_ENTRY`, by channel id.
+        """
+        for channel_id, index in indexes.items():
+            self._summary.counts[channel_id] += len(index)
+        self._write_chunk(records, dict(indexes), self._compress_rows)
+
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
         if self.closed:
             return
+        if self.untouched:
+            release(self._file)
+            return
         self._write_record(DataEnd(self._crc))
-        start = self._position
-        builder = RecordBuilder()
-        groups: list[SummaryOffset] = []
-        for opcode, records in self._summary_groups():
-            group_start = builder.count
-            for record in records:
-                record.write(builder)
-            if builder.count > group_start:
-                length = builder.count - group_start
-                groups.append(
-                    SummaryOffset(
-                        group_opcode=opcode, group_start=start + group_start, group_length=length
-                    )
-                )
-        offsets_start = start + builder.count
-        for group in groups:
-            group.write(builder)
-        summary = builder.end()
-        Footer(start, offsets_start, 0).write(builder)
-        footer = builder.end()
-        crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
-        self._write(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
-        self._file.close()
+        self._write(self._summary.to_bytes(self.position))
+        release(self._file)
+
+    def abandon(self) -> None:
+        """Close a file that was not finished; a finished one is left alone."""
+        with contextlib.suppress(OSError):
+            release(self._file)
+
+    def _begin(self, path: Path, overwrite: bool) -> None:
+        self._file, self.untouched = create(path, overwrite=overwrite), False
+        self.path, self.position, self._crc, self._summary = path, 0, 0, Summary()
+        self._write(MCAP0_MAGIC)
+        self._write_record(Header(self._profile, f"mcaprl {__version__}"))
+
+    def _continue(self, path: Path) -> None:
+        """Take up a file behind its last record. It stays as it is until something is written."""
+        self._file, self.path, self.untouched = reopen(path), path, True
+        try:
+            written = what_is_written(path)
+        except BaseException:
+            release(self._file)
+            raise
+        self._summary, self._standing = written.summary, written.standing
+        self.position, self._crc = written.end, written.crc
+
+    def _cut_off_summary(self) -> None:
+        self._file.truncate(self.position)
+        self._file.seek(self.position)
+        self.untouched = False
 
     def _write_chunk(
         self,
@@ -195,24 +261,25 @@ class McapWriter:
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
         data = compress(records)
         name = "" if self._compression == "none" else self._compression
-        builder = RecordBuilder()
-        Chunk(
+        header = ChunkHeader(
+            start_time=start_time,
+            end_time=end_time,
+            uncompressed_bytes=len(records),
+            crc=zlib.crc32(records),
             compression=name,
-            data=data,
-            message_start_time=start_time,
-            message_end_time=end_time,
-            uncompressed_crc=zlib.crc32(records),
-            uncompressed_size=len(records),
-        ).write(builder)
-        offset, chunk_bytes = self._position, builder.count
-        index_offsets = {}
+            data=slice(0, len(data)),
+        )
+        # The records go to the file as they are: a copy of them would cost as much as the rest.
+        head = header.to_record()
+        offset, chunk_bytes = self.position, len(head) + len(data)
+        index_offsets, builder = {}, RecordBuilder()
         for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset + builder.count
+            index_offsets[channel_id] = offset + chunk_bytes + builder.count
             _write_message_index(builder, channel_id, index)
-        index_bytes = builder.count - chunk_bytes
+        index_bytes = builder.count
         with HoldSignals():
-            self._write(builder.end())
-            self._chunk_indexes.append(
+            self._write(head, data, builder.end())
+            self._summary.chunks.append(
                 ChunkIndex(
                     chunk_start_offset=offset,
                     chunk_length=chunk_bytes,
@@ -227,49 +294,33 @@ class McapWriter:
             )
 
     def _next_sequences(self, channel_id: int, count: int) -> NDArray[np.uint32]:
-        first = self._sequences[channel_id - 1]
-        self._sequences[channel_id - 1] += count
+        first = self._summary.counts[channel_id]
+        self._summary.counts[channel_id] += count
         return np.arange(first, first + count).astype(np.uint32)
 
-    def _summary_groups(self) -> list[tuple[Opcode, Sequence[McapRecord]]]:
-        return [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
-        ]
-
-    def _statistics(self) -> Statistics:
-        chunks = self._chunk_indexes
-        counts = {c.id: n for c, n in zip(self._channels, self._sequences, strict=True)}
-        return Statistics(
-            attachment_count=len(self._attachment_indexes),
-            channel_count=len(self._channels),
-            channel_message_counts=counts,
-            chunk_count=len(chunks),
-            message_count=sum(counts.values()),
-            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
-            metadata_count=len(self._metadata_indexes),
-            schema_count=len(self._schemas),
-        )
+    def _write_standing(self, record: McapRecord) -> None:
+        offset = self.position
+        self._write_record(record)
+        self._summary.note(record, offset, self.position - offset)
 
     def _write_record(self, record: McapRecord) -> None:
         builder = RecordBuilder()
         record.write(builder)
         self._write(builder.end())
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
         """Write all of it or none: what stands in the file stays a whole number of records."""
         try:
             with HoldSignals():
-                rest = memoryview(data)
-                while rest:
-                    rest = rest[self._file.write(rest) :]
-                self._crc = zlib.crc32(data, self._crc)
-                self._position += len(data)
+                if self.untouched:
+                    self._cut_off_summary()
+                for part in parts:
+                    rest = memoryview(part)
+                    while rest:
+                        rest = rest[self._file.write(rest) :]
+                for part in parts:
+                    self._crc = zlib.crc32(part, self._crc)
+                self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up()
             raise LogError(
@@ -277,26 +328,11 @@ class McapWriter:
                 " the episodes finished before are in the file"
             ) from error
 
-    def abandon(self) -> None:
-        """Close a file that was not finished; a finished one is left alone."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-
     def _give_up(self) -> None:
         """Leave a file that readers can scan: cut off behind the last whole record, and closed."""
         with contextlib.suppress(OSError):
-            self._file.truncate(self._position)
+            self._file.truncate(self.position)
         self.abandon()
-
-
-def _create(path: Path, overwrite: bool) -> FileIO:
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return FileIO(path, "w" if overwrite else "x")
-    except OSError as error:
-        raise LogError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _write_message_index(builder: RecordBuilder, channel_id: int, index: NDArray[Any]) -> None:

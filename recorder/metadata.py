@@ -34,6 +34,17 @@ from mcaprl.recorder.spaces import leaves_of, space_from_json, space_to_json
 
 FORMAT_VERSION = "1"
 METADATA_NAME = "mcaprl.dataset"
+# What recordings that share a file must agree on; the rest may change, and tells of the first one.
+SAME_WHEN_APPENDED = (
+    "format_version",
+    "env_id",
+    "env_kwargs",
+    "observation_space",
+    "action_space",
+    "observation_names",
+    "action_meanings",
+    "step_duration_ns",
+)
 DEFAULT_STEP_DURATION_NS = 100_000_000
 # What a spec says of drawing, and of how environments are brought together.
 _NOT_OF_ONE_ENV = (

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, UsageError
+from mcaprl.errors import LogError, NoEpisodesError, UsageError
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.log_reader import LogReader, Selection
 from mcaprl.recorder.storage import Storage
 
+Answer = TypeVar("Answer")
 Episodes = int | slice | Sequence[int]
 
 
@@ -28,7 +31,8 @@ def open_logs(
     """Read logs, or a part of them; what is not asked for is not read.
 
     All chunks read are checked against their CRCs. A log that was cut off, or is still being
-    written, gives its finished episodes and a warning.
+    written, gives its finished episodes and a warning; one of several that has none yet is left
+    out, with a warning.
 
     Args:
         data: a file, a folder of `.mcap` files, a glob, or a sequence of these. Logs of one call
@@ -55,15 +59,36 @@ def open_logs(
     selection = Selection(columns=chosen, images=images, threads=threads)
     logs = [LogReader(path, selection) for path in find_logs(data)]
     if episodes is None:
-        return Dataset.concatenate([log.read() for log in logs])
+        return Dataset.concatenate([part for _, part in _ask(logs, LogReader.read)])
     return _read_episodes(logs, episodes)
 
 
+def _ask(
+    logs: Sequence[LogReader], ask: Callable[[LogReader], Answer]
+) -> list[tuple[LogReader, Answer]]:
+    """What each log answers, but for those of several that have no finished episode yet.
+
+    Raises:
+        NoEpisodesError: none has one.
+    """
+    answers = []
+    for log in logs:
+        try:
+            answers.append((log, ask(log)))
+        except NoEpisodesError as error:
+            if len(logs) == 1:
+                raise
+            warnings.warn(f"{error}: left out", stacklevel=4)
+    if not answers:
+        raise NoEpisodesError(f"none of {len(logs)} logs has a finished episode")
+    return answers
+
+
 def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
-    counts = [len(log.lengths) for log in logs]
-    numbers = _numbers(episodes, sum(counts))
+    counted = _ask(logs, lambda log: len(log.lengths))
+    numbers = _numbers(episodes, sum(count for _, count in counted))
     parts, first = [], 0
-    for log, count in zip(logs, counts, strict=True):
+    for log, count in counted:
         mine = numbers[(first <= numbers) & (numbers < first + count)]
         if len(mine):
             parts.append(log.read(mine - first))
@@ -96,6 +121,8 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
     """
     if not isinstance(data, str | Path):
         every = [path for part in data for path in find_logs(part)]
+        if not every:
+            raise LogError("no data: the list of files is empty")
         # A file that is meant twice counts once.
         return list({path.resolve(): path for path in every}.values())
     path = Path(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.errors import UsageError
+from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
-from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
+from mcaprl.recorder.log_file import refuse_if_taken
+from mcaprl.recorder.log_writer import STEP_TOPIC, EpisodeSummary, LogWriter
+from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import LogMetadata
 
 
@@ -54,24 +58,47 @@ class Recording:
         *,
         compression: str,
         overwrite: bool,
+        append: bool,
+        max_file_bytes: int | None,
         start_time_ns: int | None,
     ) -> None:
-        """Create the file; see `RecordMcap`, whose arguments these are.
+        """Create the file, or open it to append; see `RecordMcap`, whose arguments these are.
 
         Raises:
-            UsageError: the times would not rise.
+            UsageError: the times would not rise, or a file would have no room.
             SpaceError, OutputExistsError, LogError: as `LogWriter`.
         """
         self._description = description
         self.step_ns = description.step_duration_ns
-        self.next_start_ns = time.time_ns() if start_time_ns is None else start_time_ns
-        if self.step_ns < 1 or self.next_start_ns < 0:
+        first_ns = time.time_ns() if start_time_ns is None else start_time_ns
+        if self.step_ns < 1 or first_ns < 0:
             raise UsageError(
-                f"a step of {self.step_ns} ns from {self.next_start_ns} ns on: times must rise"
+                f"a step of {self.step_ns} ns from {first_ns} ns on: times must rise"
                 " from 0 or later; give step_duration_s and start_time_ns"
             )
-        self.episodes = 0
-        self.log = LogWriter(path, description, compression=compression, overwrite=overwrite)
+        if append and overwrite:
+            raise UsageError("append keeps what overwrite replaces: choose one of the two")
+        self._parts = None
+        if max_file_bytes is not None:
+            self._parts = _Parts(Path(path), max_file_bytes, overwrite=overwrite, append=append)
+            path = self._parts.current
+        self.log = LogWriter(
+            path, description, compression=compression, overwrite=overwrite, append=append
+        )
+        try:
+            self.episodes = _episodes_in(self.log) if append else 0
+            end_ns = self.log.mcap.end_time_ns
+            if start_time_ns is not None and first_ns <= end_ns:
+                raise UsageError(
+                    f"{path} ends at {end_ns} ns: start_time_ns {first_ns} must be later"
+                )
+        except BaseException:
+            self.log.mcap.abandon()
+            raise
+        # Number of the first episode in the file; any that it had before are its own.
+        self._first_in_file = 0
+        follows = start_time_ns is None and end_ns >= 0
+        self.next_start_ns = max(first_ns, end_ns + self.step_ns) if follows else first_ns
 
     @property
     def closed(self) -> bool:
@@ -90,16 +117,30 @@ class Recording:
             if seed is not None and not 0 <= seed < 2**63:
                 raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
 
-    def show(self, display: Display, policy: str) -> None:
-        """Begin the next episode for viewers; with the first one comes the layout."""
-        start_ns = self.next_start_ns
+    def begin(self, display: Display, policy: str) -> None:
+        """Begin the next episode for viewers, in a file that has room for it.
+
+        With the first episode comes the layout.
+        """
+        mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
+        has_episodes = self.episodes > self._first_in_file
+        if parts is not None and has_episodes and mcap.position >= parts.max_file_bytes:
+            mcap.start_next(parts.next())
+            display.forget_what_stands()
+            self._first_in_file = self.episodes
         if display.begin(start_ns, self.step_ns, self.episodes, policy):
             layout = layout_of(
                 self._description, display.topics, display.telemetry_names, display.follow_frame
             )
-            self.log.mcap.add_attachment(
+            mcap.add_attachment(
                 LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns
             )
+
+    def close(self) -> None:
+        """Finish the log. A file that was begun for an episode that did not come is removed."""
+        self.log.close()
+        if self.episodes == self._first_in_file > 0 and self._parts is not None:
+            self.log.mcap.path.unlink()
 
     def summary(
         self,
@@ -130,6 +171,58 @@ class Recording:
         """Count an episode that is wholly written."""
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1
+
+
+class _Parts:
+    """Names of files that follow each other: `lane.mcap` becomes `lane-00000.mcap` and so on."""
+
+    def __init__(self, family: Path, max_file_bytes: int, *, overwrite: bool, append: bool) -> None:
+        if max_file_bytes < 1:
+            raise UsageError(f"max_file_bytes {max_file_bytes}: a file has at least one byte")
+        self.max_file_bytes, self._family = max_file_bytes, family
+        pattern = re.escape(family.stem) + r"-(\d{5})" + re.escape(family.suffix)
+        old = [path for path in family.parent.glob("*") if re.fullmatch(pattern, path.name)]
+        if old and not (overwrite or append):
+            raise OutputExistsError(
+                f"{min(old)} exists: choose another path, append, or pass --overwrite"
+            )
+        if overwrite:
+            for path in old:
+                refuse_if_taken(path)
+            for path in old:
+                path.unlink()
+        last = max((path.stem for path in old), default="0") if append else "0"
+        self._number = int(last[-5:])
+
+    @property
+    def current(self) -> Path:
+        """The file to be written now."""
+        name = f"{self._family.stem}-{self._number:05d}{self._family.suffix}"
+        return self._family.with_name(name)
+
+    def next(self) -> Path:
+        """The file behind it."""
+        self._number += 1
+        return self.current
+
+
+def _episodes_in(log: LogWriter) -> int:
+    """How many episodes a log has that is appended to.
+
+    Raises:
+        LogError: the last one is not finished.
+    """
+    path = log.mcap.path
+    steps = Topic(McapReader(path), STEP_TOPIC)
+    if not len(steps):
+        return 0
+    last = steps.read(("episode", "final"), np.array([np.argmax(steps.times)]))
+    if not last["final"][0]:
+        raise LogError(
+            f"{path} cannot be appended to, since its last episode is not finished: run"
+            f" `mcaprl recover {path} OUT` and append to OUT"
+        )
+    return int(last["episode"][0]) + 1
 
 
 def reason_of(told: Any, terminated: bool) -> str:

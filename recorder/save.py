@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, OutputExistsError
 from mcaprl.recorder.arrays import with_fresh_times
+from mcaprl.recorder.log_file import refuse_if_taken
 from mcaprl.recorder.log_writer import LogWriter
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.spaces import observation_leaves
@@ -44,6 +45,7 @@ def save_log(
     path = Path(path)
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass overwrite=True")
+    refuse_if_taken(path)
     # Beside it first: the log that is replaced may be the one that is being saved.
     unfinished = path.with_name(f"{path.name}.part")
     log = LogWriter(unfinished, metadata, compression=compression, overwrite=True)

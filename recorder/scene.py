@@ -34,9 +34,9 @@ MARKER_TYPES = {
 _ADD, _DELETE_ALL = 0, 3
 _FOREVER = (0, 0)
 # What is rounded to binary fractions that no viewer can show takes half the space in a log.
-_POINTS_PER_M = 2**8
-_POSITIONS_PER_M = 2**12
-_ROTATIONS_PER_ONE = 2**16
+_POINTS_PER_M = 2**6
+_POSITIONS_PER_M = 2**10
+_ROTATIONS_PER_ONE = 2**14
 
 
 class Shape(Protocol):

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import struct
 from collections.abc import Iterable
 from typing import Any
 
@@ -114,6 +115,38 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
     return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
+def telemetry_message(values: Iterable[float]) -> bytes:
+    """A message of `telemetry_schema`.
+
+    Values are rounded to 16 significant bits, more than four digits: a plot shows no more, and the
+    digits behind would be the greater part of what viewers need in a log.
+    """
+    mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
+    rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
+    return struct.pack(f"<I{len(rounded)}f", ENCAPSULATION, *rounded.tolist())
+
+
+def values_schema(actions: int) -> tuple[str, str]:
+    """Name and definition text of what a policy thinks of a step: `/rl/values`.
+
+    float32[A] q            value of each action; NaN if the policy has none
+    float32[A] preference   of each action: probabilities, or the softmax of the values
+    float32 value           of the state: the largest of q
+    float32 advantage       of the logged action: its q less `value`
+    float32 td_error        r + gamma max q(next) - q of the logged action
+    float32 entropy         of `preference`: 0 where it is sure, 1 where all are alike
+    int64 policy_action     what the policy would do
+    bool agrees             whether that is the logged action
+
+    Args:
+        actions: A, how many there are.
+    """
+    fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
+    fields += [("float32", actions, "preference")]
+    fields += [("float32", 0, name) for name in ("value", "advantage", "td_error", "entropy")]
+    return _named("Values", [*fields, ("bool", 0, "agrees")])
+
+
 def message_dtype(text: str) -> np.dtype[Any] | None:
     """The memory layout of a ROS 2 message definition, encapsulation header included.
 
@@ -153,7 +186,7 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
 
 def is_intact(name: str, text: bytes) -> bool:
     """Whether a definition is the one that its name was made for; others' names tell nothing."""
-    match = re.fullmatch(r"mcaprl_msgs/msg/(?:Step|Telemetry)([0-9a-f]{8})", name)
+    match = re.fullmatch(r"mcaprl_msgs/msg/(?:Step|Telemetry|Values)([0-9a-f]{8})", name)
     return match is None or match[1] == _digest(text)
 
 

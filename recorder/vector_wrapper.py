@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
+from mcaprl.recorder.log_writer import INTERRUPTED
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
 from mcaprl.recorder.rows import add_up, as_declared, converters
@@ -58,6 +59,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         seed: int | None = None,
         compression: str = "zstd",
         overwrite: bool = False,
+        append: bool = False,
+        max_file_bytes: int | None = None,
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
@@ -73,13 +76,18 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             seed: of the recording, for the metadata.
             compression: `zstd`, `lz4` or `none`.
             overwrite: replace a file that is there.
+            append: go on behind the last episode of a file that is there, which must have been
+                recorded from an environment of the same id, arguments and spaces.
+            max_file_bytes: begin another file behind the episode that made one as large as this.
+                `lane.mcap` then is `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of
+                whole episodes; `mcaprl.open` reads their folder as one.
             step_duration_s: simulated seconds between two observations; default: as `RecordMcap`.
             start_time_ns: log_time of the first record, since the Unix epoch; default: now.
 
         Raises:
             SpaceError: a log cannot hold the environments' spaces.
             UsageError: the times would not rise, or the autoreset mode is not known.
-            OutputExistsError, LogError: the file cannot be created.
+            OutputExistsError, LogError: the file cannot be created, or appended to.
         """
         if not isinstance(env, gym.vector.VectorEnv):
             raise UsageError(
@@ -101,6 +109,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             description,
             compression=compression,
             overwrite=overwrite,
+            append=append,
+            max_file_bytes=max_file_bytes,
             start_time_ns=start_time_ns,
         )
         log, count = self._recording.log, self.num_envs
@@ -119,13 +129,18 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._learner = OpenRows(log.learner_rows(), count, log.write_steps)
         self._take_spaces()
         self._every = np.arange(count)
-        self._episodes = [OpenEpisode("", math.nan) for _ in range(count)]
+        self._open = [OpenEpisode("", math.nan) for _ in range(count)]
         # Transitions of each environment's open episode, and whether it has one.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # Which environments reset themselves in the next step.
         self._due = np.zeros(count, np.bool_)
         self._full_at = 0
+
+    @property
+    def episodes(self) -> int:
+        """Finished episodes of the log, with those that it had before it was appended to."""
+        return self._recording.episodes
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset all environments, or those of `options["reset_mask"]`, and begin their episodes.
@@ -197,7 +212,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             with HoldSignals():
                 if not self._recording.closed:
                     self._interrupt(self._every)
-                    self._recording.log.close()
+                    self._recording.close()
         finally:
             super().close(**kwargs)
 
@@ -249,7 +264,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     def _begin(self, number: int, values: list[NDArray[Any]], episode: OpenEpisode) -> None:
         """Begin an episode of one environment with its row of the observations."""
         self._put(number, 0, [value[number] for value in values])
-        self._episodes[number], self._steps[number] = episode, 0
+        self._open[number], self._steps[number] = episode, 0
         self._running[number], self._due[number] = True, False
 
     def _end_some(
@@ -288,14 +303,14 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         with HoldSignals():
             for number in numbers.tolist():
                 if self._running[number] and self._steps[number] and not self._recording.closed:
-                    self._end(number, False, True, "interrupted")
+                    self._end(number, False, True, INTERRUPTED)
             self._running[numbers] = self._due[numbers] = False
             self._steps[numbers] = 0
             self._display.clear()
 
     def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
         """Write an episode as if it had been recorded alone, behind the last one."""
-        recording, episode, fields = self._recording, self._episodes[number], self._columns.fields
+        recording, episode, fields = self._recording, self._open[number], self._columns.fields
         steps = episode.steps = int(self._steps[number])
         # Whatever goes wrong now, this episode is not written a second time.
         self._running[number], self._steps[number] = False, 0
@@ -307,7 +322,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             reason=reason,
         )
         start_ns, step_ns = summary.start_time_ns, recording.step_ns
-        recording.show(self._display, episode.policy)
+        recording.begin(self._display, episode.policy)
         for table in self._images.values():
             table.write(number, steps + 1, start_ns, step_ns)
         self._display.end(summary)

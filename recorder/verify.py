@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episode import Episode
+from mcaprl.recorder.log_writer import INTERRUPTED
 from mcaprl.recorder.rows import as_declared
 from mcaprl.recorder.spaces import Leaf, observation_leaves
 
-INTERRUPTED = "interrupted"
-"""Why an episode ended that the recorder, not the environment, broke off."""
 _MOST_FIELDS = 8
 
 

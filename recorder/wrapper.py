@@ -16,6 +16,7 @@ import gymnasium as gym
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.display import Display
+from mcaprl.recorder.log_writer import INTERRUPTED
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
 from mcaprl.recorder.rows import ImageColumn, StepColumns, observation_keeper
@@ -46,6 +47,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         seed: int | None = None,
         compression: str = "zstd",
         overwrite: bool = False,
+        append: bool = False,
+        max_file_bytes: int | None = None,
         scene: bool = True,
         camera: bool = False,
         step_duration_s: float | None = None,
@@ -62,6 +65,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             seed: of the recording, for the metadata.
             compression: `zstd`, `lz4` or `none`.
             overwrite: replace a file that is there.
+            append: go on behind the last episode of a file that is there, which must have been
+                recorded from an environment of the same id, arguments and spaces.
+            max_file_bytes: begin another file behind the episode that made one as large as this.
+                `lane.mcap` then is `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of
+                whole episodes; `mcaprl.open` reads their folder as one.
             scene: record what viewers show, where the environment describes it.
             camera: record the environment's metric depth image, too.
             step_duration_s: simulated seconds between two observations; default: the environment's
@@ -71,7 +79,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         Raises:
             SpaceError: a log cannot hold the environment's spaces.
             UsageError: the times would not rise.
-            OutputExistsError, LogError: the file cannot be created.
+            OutputExistsError, LogError: the file cannot be created, or appended to.
         """
         if isinstance(env, gym.vector.VectorEnv):
             raise UsageError(
@@ -91,6 +99,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             description,
             compression=compression,
             overwrite=overwrite,
+            append=append,
+            max_file_bytes=max_file_bytes,
             start_time_ns=start_time_ns,
         )
         log = self._recording.log
@@ -104,6 +114,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._keep_observation = observation_keeper(env.observation_space, self._columns, images)
         self._full_at = 0
         self._open: OpenEpisode | None = None
+
+    @property
+    def episodes(self) -> int:
+        """Finished episodes of the log, with those that it had before it was appended to."""
+        return self._recording.episodes
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -152,12 +167,12 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
                     self._make_room(step)
-                    self._count(episode, step)
+                    self._count(episode, step, float(reward))
                     if terminated or truncated:
                         reason = reason_of(info.get("reason"), bool(terminated))
                         self._end(bool(terminated), bool(truncated), reason)
             elif self._display.shows_steps:
-                self._count(episode, step)
+                self._count(episode, step, float(reward))
             else:
                 episode.steps = step
         except BaseException:
@@ -172,7 +187,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             with HoldSignals():
                 if not self._recording.closed:
                     self._interrupt()
-                    self._recording.log.close()
+                    self._recording.close()
         finally:
             super().close()
 
@@ -184,8 +199,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             image.begin(start_ns, step_ns)
         self._full_at = self._next_full()
         self._keep_observation(observation)
-        recording.show(self._display, episode.policy)
-        self._count(episode, 0)
+        recording.begin(self._display, episode.policy)
+        self._count(episode, 0, 0.0)
         self._open = episode
 
     def _make_room(self, step: int) -> None:
@@ -200,9 +215,9 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """The first step for whose observation there is no room."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
-    def _count(self, episode: OpenEpisode, step: int) -> None:
+    def _count(self, episode: OpenEpisode, step: int, reward: float) -> None:
         if self._display.shows_steps:
-            self._display.observe(step)
+            self._display.observe(step, reward)
         # From here on the step counts.
         episode.steps = step
 
@@ -210,7 +225,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Keep an episode that is broken off; one without a transition leaves no trace."""
         if self._open is not None and self._open.steps > 0:
             with HoldSignals():
-                self._end(False, True, "interrupted")
+                self._end(False, True, INTERRUPTED)
         self._display.clear()
         self._open = None
 

@@ -22,7 +22,7 @@ class Body(NamedTuple):
     """Where the body is that the picture follows."""
 
     frame: str
-    """Shapes of this frame are drawn at the body."""
+    """Shapes of this frame turn with the body; those of others than `map` only move with it."""
     x_m: float
     y_m: float
     yaw_rad: float
@@ -97,8 +97,9 @@ class FollowView:
 
     def _fill(self, patch: Patch, body: Body) -> None:
         corners_m = patch.corners_m
-        if patch.frame == body.frame:
-            corners_m = placed(corners_m, body.x_m, body.y_m, body.yaw_rad)
+        if patch.frame != "map":
+            yaw_rad = body.yaw_rad if patch.frame == body.frame else 0.0
+            corners_m = placed(corners_m, body.x_m, body.y_m, yaw_rad)
         away_m = corners_m - [body.x_m, body.y_m]
         scale_px = SIDE_PX / self._width_m
         self.canvas.polygon(SIDE_PX / 2 + away_m * [scale_px, -scale_px], patch.color)

@@ -19,7 +19,7 @@ from mcaprl.sims.geometry import point_at
 from mcaprl.sims.lane_obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
 from mcaprl.sims.lane_rays import ray_lines
 from mcaprl.sims.lane_rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
-from mcaprl.sims.scene import Color, Frame, Shape, raised, yaw_rotation
+from mcaprl.sims.scene import Color, Frame, Shape, path, raised, yaw_rotation
 
 GRASS: Color = (0.36, 0.44, 0.33, 1.0)
 ASPHALT: Color = (0.21, 0.22, 0.24, 1.0)
@@ -148,7 +148,6 @@ def moving_shapes(
         trail_m: the last positions of the car, (x, y) in the map; at least one.
         has_rays: whether the car sees by rays.
     """
-    trail = np.array([*trail_m, trail_m[-1]])
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
     link = np.array([(car.x_m, car.y_m), nearest])
@@ -156,7 +155,7 @@ def moving_shapes(
     axle = np.array([WHEELBASE_M / 2, 0.0, 1.0])
     tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
     return (
-        Shape("trail", "line", TRAIL, raised(trail, 0.06), size=(0.25, 0.0, 0.0)),
+        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
         Shape("lookahead", "points", LOOK, raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
         Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
         Shape("steering", "arrow", LOOK, np.array([axle, tip]), size=(0.12, 0.3, 0.4), frame="car"),

@@ -128,7 +128,6 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     """
 
     metadata = METADATA
-    trail_length = 60
 
     def __init__(
         self,

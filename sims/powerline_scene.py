@@ -19,7 +19,7 @@ from mcaprl.sims import powerline_camera as camera
 from mcaprl.sims import powerline_world as world
 from mcaprl.sims.powerline_rules import Flight
 from mcaprl.sims.quadrotor import ROTOR_OFFSET_M, Drone
-from mcaprl.sims.scene import Color, Frame, Shape
+from mcaprl.sims.scene import Color, Frame, Shape, path
 from mcaprl.sims.vectors import Vector, norm
 
 Floats = NDArray[np.float64]
@@ -36,6 +36,10 @@ TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
+UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
+"""An arrow of no length points nowhere, and viewers complain."""
+CORNERS_PER_M = 16
+"""Corners of surfaces are rounded so: a log holds them in a third of the space."""
 SHADES = 10
 """Surfaces are drawn in so many brightnesses, by how they face the sun."""
 SUN = np.array([0.45, 0.35, 0.82])
@@ -57,7 +61,7 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
     classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)
     shapes = []
     for shade in range(SHADES):
-        points = triangles[classes == shade].reshape(-1, 3)
+        points = np.rint(triangles[classes == shade].reshape(-1, 3) * CORNERS_PER_M) / CORNERS_PER_M
         if len(points):
             bright = 0.45 + 0.75 * (shade + 0.5) / SHADES
             red, green, blue = (min(1.0, bright * part) for part in color)
@@ -185,23 +189,24 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     position = flight.drone.position_m
     place = world.nearest_on_line(position)
     here = np.array(ros(position))
-    link = np.array([here, ros(place.point_m)])
-    trail = world.to_ros(np.array([*trail_m, trail_m[-1]]))
-    ahead = np.array([ros(world.point_on_line(place.along_m + 6.0))])
-    arrow = np.array([here, here + np.array(ros(flight.command_m_s)) + [0.0, 0.0, 1e-3]])
+    # What starts at the drone is given from there: it hangs on it, and repeats itself in a log.
+    level, origin = "base_stabilized", np.zeros(3)
+    link = np.array([origin, ros(place.point_m) - here])
+    ahead = np.array([ros(world.point_on_line(place.along_m + 6.0)) - here])
+    arrow = np.array([origin, np.array(ros(flight.command_m_s)) + UP_A_LITTLE])
     speed_m_s = norm(flight.drone.velocity_m_s)
     return (
-        Shape("trail", "line", TRAIL, trail, size=(0.15, 0.0, 0.0)),
-        Shape("offset", "line", LOOK, link, size=(0.08, 0.0, 0.0)),
-        Shape("ahead", "points", LOOK, ahead, size=(0.4, 0.4, 0.4)),
-        Shape("command", "arrow", WHITE, arrow, size=(0.12, 0.3, 0.4)),
+        Shape("trail", "line", TRAIL, world.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
+        Shape("offset", "line", LOOK, link, size=(0.08, 0.0, 0.0), frame=level),
+        Shape("ahead", "points", LOOK, ahead, size=(0.4, 0.4, 0.4), frame=level),
+        Shape("command", "arrow", WHITE, arrow, size=(0.12, 0.3, 0.4), frame=level),
         Shape(
             name="speed",
             kind="text",
             color=WHITE,
             size=(1.0, 1.0, 0.8),
             position=(0.0, 0.0, 1.6),
-            frame="base_stabilized",
+            frame=level,
             text=f"{speed_m_s:.1f} m/s",
         ),
     )

@@ -23,7 +23,7 @@ from mcaprl.sims.racer_track import (
     asphalt,
     to_map,
 )
-from mcaprl.sims.scene import Color, Frame, Shape, raised, yaw_rotation
+from mcaprl.sims.scene import Color, Frame, Shape, path, raised, yaw_rotation
 
 Floats = NDArray[np.float64]
 
@@ -124,11 +124,10 @@ def moving_shapes(
         car: now.
         trail_m: the last positions of the car, (x, y) in the map; at least one.
     """
-    trail = np.array([*trail_m, trail_m[-1]])
     gate_m = to_map(track.gates_px[int(car.next_gate)].reshape(2, 2))
     rays_m = to_map(ray_ends(track.walls_px, car))
     return (
-        Shape("trail", "line", TRAIL, raised(trail, 0.06), size=(0.15, 0.0, 0.0)),
+        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.15, 0.0, 0.0)),
         Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
         Shape("rays", "segments", RAY, raised(rays_m, 0.4), size=(0.1, 0.0, 0.0)),
         Shape("hits", "points", HIT, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),

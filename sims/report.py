@@ -216,9 +216,14 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
             continue
         if shape.kind == "line":
             axes.plot(shape.points[:, 0], shape.points[:, 1], color=PALE, lw=1, zorder=0)
+        elif shape.kind == "segments":
+            pairs = shape.points[:, :2].reshape(-1, 2, 2)
+            # Not-a-number ends a stroke.
+            strokes = np.pad(pairs, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+            axes.plot(*strokes.reshape(-1, 2).T, color=PALE, lw=1, zorder=0)
         elif shape.kind == "box" and shape.size[2] > _FLAT_M:
             corners = _box_corners(shape)
-            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0, zorder=0)
+            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0.8, zorder=0)
 
 
 def _box_corners(shape: Shape) -> Any:

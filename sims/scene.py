@@ -7,6 +7,7 @@ A sim describes its world with two frozen types, `Shape` and `Frame`. Axes are t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -73,6 +74,11 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
     (0.0, 0.0, 0.0, 1.0)
     """
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
+
+
+def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
+    """Give places as the points of a line, which needs two: a single place comes twice."""
+    return np.array(points if len(points) > 1 else [*points, *points])
 
 
 def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:

@@ -96,7 +96,9 @@ def record(
             rows.append((observation_space.sample(), reward, *ends))
         episodes.append(rows)
     env = ScriptedEnv(observation_space, action_space, episodes)
-    recorder = RecordMcap(env, path, step_duration_s=0.05, start_time_ns=10**18, **options)
+    recorder = RecordMcap(
+        env, path, **{"step_duration_s": 0.05, "start_time_ns": 10**18, **options}
+    )
     with closing(recorder):
         for number, rows in enumerate(episodes):
             observation, _ = recorder.reset(seed=100 + number)

@@ -111,7 +111,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert run(ask) == 0
     assert "do not choose by this order" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
-    assert "the pilot reads the sim's state" in line
+    assert "pilot has no network to ask about a log" in line
 
 
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,6 +125,23 @@ def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
     assert first.episodes[0].epsilon == 0.3
     own, other = 0.3 / 6 + 0.7, 0.3 / 6
     assert set(first.behavior_probs) == {np.float32(own), np.float32(other)}
+
+
+def test_appended_and_rotated_recordings_are_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["record", "CartPole-v1", "--policy", "random", "--seed", "2"]
+    assert run([*common, "--episodes", "5", "--out", "one.mcap"]) == 0
+    expected = mcaprl.open("one.mcap").fingerprint
+    for episodes in ("3", "2"):
+        assert run([*common, "--episodes", episodes, "--out", "two.mcap", "--append"]) == 0
+    assert mcaprl.open("two.mcap").fingerprint == expected
+    for episodes in ("3", "2"):
+        arguments = ["--episodes", episodes, "--out", "parts/a.mcap", "--rotate-mb", "0.005"]
+        assert run([*common, *arguments, "--append"]) == 0
+    assert len(list(Path("parts").iterdir())) > 1
+    assert mcaprl.open("parts").fingerprint == expected
+    capsys.readouterr()
+    assert run([*common, "--episodes", "2", "--out", "x", "--append", "--envs", "2"]) == 2
+    assert "leave out one" in capsys.readouterr().err
 
 
 def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -173,7 +190,7 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
     # Enough copies of the target for the horizon of gamma, or it warns.
-    small += ["--gamma", "0.5", "--target-interval", "6"]
+    small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
     capsys.readouterr()

@@ -12,7 +12,7 @@ from highway_env.envs.lane_keeping_env import LaneKeepingEnv
 from highway_env.envs.racetrack_env import RacetrackEnv
 
 from mcaprl.errors import MissingExtraError, UnknownNameError, UsageError
-from mcaprl.sims import make_sim
+from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.highway_lane import (
     ACTION_MEANINGS,
     LOOKAHEADS_M,
@@ -213,3 +213,15 @@ def test_it_keeps_nothing_of_earlier_episodes() -> None:
 
 def test_each_road_decides_at_its_own_rate() -> None:
     assert [made(road=road).step_duration_s for road in ROADS] == [0.1, 0.2, 0.2]
+
+
+def test_many_are_stepped_one_after_the_other() -> None:
+    """As environments of others are: each as it is alone, from the seed after the last one's."""
+    many, alone = make_sims("highway-lane", 2), made()
+    seen, _ = many.reset(seed=7)
+    for row, seed in enumerate((7, 8)):
+        np.testing.assert_array_equal(seen[row], alone.reset(seed=seed)[0])
+    seen, rewards, _, _, infos = many.step(np.array([4, 4]))
+    expected, reward, _, _, info = alone.step(4)
+    np.testing.assert_array_equal(seen[1], expected)
+    assert (rewards[1], infos["progress_m"][1]) == (reward, info["progress_m"])

@@ -119,13 +119,14 @@ def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
                 store.deserialize_cdr(message.data, schema.name)
             )
     assert {marker.ns for marker in shown["/scene/static"][0].markers} >= {"road", "lines"}
-    # One for each observation, and one at the end of each episode.
-    assert len(shown["/scene"]) == len(shown["/tf"]) == len(data.rewards) + 2
+    # One at least at each episode's start and end, at most one for each observation.
+    for topic in ("/scene", "/tf"):
+        assert 4 <= len(shown[topic]) <= len(data.rewards) + 2
     place = shown["/tf"][0].transforms[0]
     assert (place.header.frame_id, place.child_frame_id) == ("map", "car")
     panels = json.loads(layout.read_text())["configById"]
     assert panels["3D!scene"]["followTf"] == "car"
-    assert any("lateral_offset_m" in name for name in panels)
+    assert "lateral_offset_m" in json.dumps(panels)
 
 
 def test_what_was_logged_can_be_driven_again(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -22,9 +23,12 @@ from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownN
 from mcaprl.offline.bc import BCConfig
 from mcaprl.offline.bcq import BCQConfig
 from mcaprl.offline.cql import CQLConfig
+from mcaprl.offline.curves import draw_curves, read_curve
 from mcaprl.offline.dqn import DoubleDQNConfig, DQNConfig
 from mcaprl.offline.iql import IQLConfig
-from mcaprl.offline.train import train
+from mcaprl.offline.policy import load_policy
+from mcaprl.offline.train import describe_seeds, train
+from mcaprl.offline.watch import choose_held_out, divergence_warning, monte_carlo_returns
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset import Dataset
 from tests.offline_tasks import corridor
@@ -74,13 +78,13 @@ def rows(run: Path, seed: int = 0) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def assert_same_result(run: Path, expected: Path) -> None:
+def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
     """Weights, moments, generators and curve, bit for bit."""
     for name in ("policy.safetensors", "checkpoint.safetensors"):
-        found, wanted = (load_file(folder / "seed-0" / name) for folder in (run, expected))
+        found, wanted = (load_file(folder / f"seed-{seed}" / name) for folder in (run, expected))
         assert found.keys() == wanted.keys()
         assert all(torch.equal(found[key], tensor) for key, tensor in wanted.items())
-    curves = [(folder / "seed-0" / "metrics.csv").read_bytes() for folder in (run, expected)]
+    curves = [(folder / f"seed-{seed}" / "metrics.csv").read_bytes() for folder in (run, expected)]
     assert curves[0] == curves[1]
 
 
@@ -345,3 +349,170 @@ def test_nothing_is_printed_where_no_terminal_is(
 def test_importing_the_package_loads_no_torch() -> None:
     script = "import sys, mcaprl.offline; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dataset:
+    """Episodes of a walk whose observation is the step; every step pays 1."""
+    steps = np.concatenate([np.arange(length, dtype=np.float32) for length in lengths])[:, None]
+    last = np.concatenate([np.arange(1, length + 1) == length for length in lengths])
+    return Dataset.from_arrays(
+        observations=steps,
+        actions=np.zeros(len(steps), np.int64),
+        rewards=np.ones(len(steps)),
+        terminated=last,
+        truncated=np.zeros(len(steps), bool),
+        next_observations=steps + 1,
+        env_id="Crossing-v0",
+        action_space=spaces.Discrete(n_actions),
+    )
+
+
+def test_seeds_that_stopped_at_different_updates_go_on_bit_for_bit(tmp_path: Path) -> None:
+    # As if a kill had come between the two seeds' checkpoints at update 80.
+    train(corridor(), SHORT_CQL, tmp_path / "whole", seeds=2, progress=silent)
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "cut", seeds=2, progress=StopAt(90))
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "early", seeds=2, progress=StopAt(50))
+    name = Path("seed-1", "checkpoint.safetensors")
+    (tmp_path / "cut" / name).write_bytes((tmp_path / "early" / name).read_bytes())
+    summaries = train(
+        corridor(), SHORT_CQL, tmp_path / "cut", seeds=2, resume=True, progress=silent
+    )
+    assert [summary.resumed_at for summary in summaries] == [80, 40]
+    for seed in (0, 1):
+        assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
+
+
+def test_other_data_are_taken_if_asked_for(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, normalize=True)
+    with pytest.raises(Stopped):
+        train(corridor(), config, tmp_path / "run", progress=StopAt(50))
+    before = load_policy(tmp_path / "run").encoder
+    other = corridor({(1, 0): 3, (2, 1): 1, (3, 1): 2})
+    with pytest.raises(TrainingError, match=r"other data;.*--other-data"):
+        train(other, config, tmp_path / "run", resume=True, progress=silent)
+    (summary,) = train(
+        other, config, tmp_path / "run", resume=True, other_data=True, progress=silent
+    )
+    assert summary.resumed_at == 40
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["data"] == other.fingerprint
+    # The weights are used to the old normalisation.
+    after = load_policy(tmp_path / "run").encoder
+    assert np.array_equal(before.shift, after.shift)
+    train(other, config, tmp_path / "run", resume=True, progress=silent)
+
+
+def test_weights_are_part_of_the_data(tmp_path: Path) -> None:
+    data = crossing()
+    weights = np.array([1.0, 2.0, 1.0])
+    train(data, SHORT_CQL, tmp_path / "run", weights=weights, progress=silent)
+    train(data, SHORT_CQL, tmp_path / "run", weights=weights, resume=True, progress=silent)
+    with pytest.raises(TrainingError, match="other data"):
+        train(data, SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+    with pytest.raises(UsageError, match="3 numbers of at least 0"):
+        train(data, SHORT_CQL, tmp_path / "other", weights=-weights, progress=silent)
+
+
+@pytest.mark.parametrize("leave", [True, False])
+def test_a_start_that_came_to_nothing_blocks_no_other(tmp_path: Path, leave: bool) -> None:
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=StopAt(20))
+    if not leave:
+        (tmp_path / "run" / "seed-0" / "mine.txt").write_text("")
+        with pytest.raises(OutputExistsError):
+            train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
+        return
+    train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["algo"] == "bc"
+    assert len(rows(tmp_path / "run")) == 10
+    events = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+    events.Reload()
+    assert "train/td_loss" not in events.Tags()["scalars"]
+
+
+def test_held_out_episodes_are_not_learned_from_but_judged(tmp_path: Path) -> None:
+    # Rewards are 1 in twelve episodes out of 24, chosen to be those held out.
+    held_out = choose_held_out(24, 0.5)
+    data = crossing((10,) * 24)
+    paid = np.isin(np.arange(24), held_out).repeat(10)
+    columns = {
+        name: getattr(data, name)
+        for name in ("observations", "actions", "terminated", "truncated", "next_observations")
+    }
+    data = Dataset.from_arrays(rewards=paid.astype(float), **columns)
+    config = DQNConfig(**{**SHORT, "held_out": 0.5}, gamma=0.0, learning_rate=0.01)
+    (summary,) = train(data, config, tmp_path / "run", progress=silent)
+    assert summary.terms["mean_q"] == pytest.approx(0.0, abs=0.1)
+    assert summary.terms["held_out_return"] == 1.0
+    assert summary.terms["held_out_td_error"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_returns_of_episodes_by_hand() -> None:
+    data = crossing((3, 2))
+    returns = monte_carlo_returns(data, np.array([0, 1]), 0.5)
+    assert returns.tolist() == [1.75, 1.5, 1, 1.5, 1]
+    assert monte_carlo_returns(data, np.array([1]), 0.0).tolist() == [1, 1]
+
+
+def test_a_return_that_was_cut_off_too_soon_is_not_known() -> None:
+    observations = np.zeros((6, 1), np.float32)
+    data = Dataset.from_arrays(
+        observations=observations,
+        actions=np.zeros(6, np.int64),
+        rewards=np.ones(6),
+        terminated=np.zeros(6, bool),
+        truncated=np.arange(6) == 5,
+        next_observations=observations,
+    )
+    returns = monte_carlo_returns(data, np.array([0]), 0.5)
+    # Five steps before the cut, what is missing counts for 1/32 of its worth; four, for 1/16.
+    assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
+
+
+@pytest.mark.parametrize(("episodes", "count"), [(1, 0), (9, 0), (10, 1), (200, 10)])
+def test_about_a_twentieth_of_the_episodes_is_held_out(episodes: int, count: int) -> None:
+    assert len(choose_held_out(episodes, 0.05)) == count
+
+
+def test_too_few_copies_for_the_horizon_are_told(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, gamma=0.99)
+    with pytest.warns(UserWarning, match="3 copies .* 3% of what gamma 0.99 looks ahead to"):
+        train(corridor(), config, tmp_path / "run", progress=silent)
+
+
+def test_values_that_run_away_are_told_once(tmp_path: Path) -> None:
+    # The second action is never seen, and chased by its own value.
+    data = crossing((50,), n_actions=2)
+    config = DQNConfig(**{**SHORT, "updates": 400, "learning_rate": 0.01}, gamma=0.99)
+    with pytest.warns(UserWarning, match="values diverge") as caught:
+        train(data, replace(config, target_interval=1), tmp_path / "run", progress=silent)
+    (warning,) = caught
+    # Every step pays 1, so no return is above 1 / (1 - .99).
+    assert "beyond 100;" in str(warning.message)
+
+
+@pytest.mark.parametrize(
+    ("before", "value", "tells"),
+    [(10.0, 21.0, True), (10.0, 19.0, False), (30.0, 25.0, False), (-10.0, -21.0, True)],
+)
+def test_values_diverge_if_they_grow_beyond_twice_what_is_possible(
+    before: float, value: float, tells: bool
+) -> None:
+    assert (divergence_warning(before, value, 10.0) is not None) == tells
+
+
+def test_seeds_are_described_with_mean_and_interval(tmp_path: Path) -> None:
+    summaries = train(corridor(), BCConfig(**SHORT), tmp_path / "run", seeds=3, progress=silent)
+    *lines, mean = describe_seeds(summaries)
+    assert [str(summary.folder) in line for summary, line in zip(summaries, lines, strict=True)]
+    losses = [summary.terms["loss"] for summary in summaries]
+    assert f"loss {np.mean(losses):.4g} [" in mean
+
+
+def test_curves_are_drawn_from_all_seeds(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=silent)
+    path = draw_curves(tmp_path / "run")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    curve = read_curve(tmp_path / "run" / "seed-1" / "metrics.csv")
+    assert curve["update"].tolist() == list(range(10, 101, 10))

@@ -105,7 +105,7 @@ def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) ->
 
 def test_it_trains_offline_as_it_is(tmp_path: Path) -> None:
     _, log = trained(tmp_path / "run")
-    config = CQLConfig(updates=20, hidden=(8,), log_interval=10)
+    config = CQLConfig(updates=20, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     (summary,) = train_offline(log, config, tmp_path / "offline", progress=silent)
     assert summary.updates == 20
 

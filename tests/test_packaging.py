@@ -29,7 +29,11 @@ def modules() -> list[str]:
 
 
 def test_every_folder_is_a_package() -> None:
-    roots = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests", "mcaprl"}
+    roots = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {
+        "tests",
+        "mcaprl",
+        "benchmarks",
+    }
     assert {f"mcaprl.{name}" for name in roots} | {"mcaprl"} == set(PACKAGES) == set(FOLDERS)
     assert roots == {"recorder", "sims", "offline", "online", "cli"}
 

@@ -106,7 +106,7 @@ def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:
     [
         ({"rules": "clasic"}, "unknown rules 'clasic': did you mean classic"),
         ({"camera": "up"}, "known: down, front"),
-        ({"plant": "plane"}, "known: point, quad"),
+        ({"plant": "plane"}, "known: None, point, quad"),
         ({"start": "pole"}, "known: anywhere, line"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from pathlib import Path
 from typing import Any, get_args
@@ -13,9 +12,10 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
+from mcaprl.cli import run
 from mcaprl.recorder import messages
 from mcaprl.recorder.columns import Topic
-from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.layout import layout_of
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.scene import (
@@ -26,8 +26,10 @@ from mcaprl.recorder.scene import (
     depth_millimetres,
     marker_array,
 )
+from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.pilots import make_pilot
 from mcaprl.sims.scene import Kind, Shape
+from tests.layouts import check_layout, series_of
 
 EPISODES, STEPS = 2, 12
 
@@ -75,21 +77,36 @@ def test_moving_topics_have_one_message_a_step(log: Path) -> None:
         assert [time for time, _ in read(log, topic, type_name)] == times, topic
 
 
-def test_static_topics_come_again_with_each_episode(log: Path) -> None:
-    starts = [times[0] for times in step_times(log)]
+def test_static_topics_come_once_if_nothing_changes(log: Path) -> None:
+    start = step_times(log)[0][0]
     scenes = read(log, "/scene/static", "visualization_msgs/msg/MarkerArray")
-    assert [time for time, _ in scenes] == starts
-    assert [time for time, _ in read(log, "/tf_static", "tf2_msgs/msg/TFMessage")] == starts
+    assert [time for time, _ in scenes] == [start]
+    assert [time for time, _ in read(log, "/tf_static", "tf2_msgs/msg/TFMessage")] == [start]
     for _, scene in scenes:
         names = [marker.ns for marker in scene.markers[1:]]
         assert len(names) == len(set(names)), "a marker is known by its name"
         assert len(names) > 20
 
 
+def test_a_scene_that_changes_often_is_thinned_out(tmp_path: Path) -> None:
+    """The racer takes ten steps a second; the scene is drawn five times, and at the end."""
+    path = tmp_path / "racer.mcap"
+    with closing(mcaprl.RecordMcap(gym.make("mcaprl/Racer-v0"), path)) as recorder:
+        for _ in range(2):
+            recorder.reset(seed=0)
+            for _ in range(5):
+                recorder.step(0)
+    times = step_times(path)
+    drawn = [time for time, _ in read(path, "/scene", "visualization_msgs/msg/MarkerArray")]
+    assert drawn == [episode[step] for episode in times for step in (0, 2, 4, 5)]
+    moved = [time for time, _ in read(path, "/tf", "tf2_msgs/msg/TFMessage")]
+    assert moved == [time for episode in times for time in episode]
+
+
 def test_each_scene_message_stands_alone(log: Path) -> None:
     """A viewer that jumps anywhere clears the topic and draws what this one message has."""
     for topic in ("/scene", "/scene/static"):
-        for time, array in read(log, topic, "visualization_msgs/msg/MarkerArray"):
+        for _, array in read(log, topic, "visualization_msgs/msg/MarkerArray"):
             first, *rest = array.markers
             assert first.action == 3, "the first marker deletes all"
             assert rest
@@ -97,7 +114,8 @@ def test_each_scene_message_stands_alone(log: Path) -> None:
                 assert marker.action == 0
                 assert marker.type in MARKER_TYPES.values()
                 assert marker.color.a > 0, f"{marker.ns} cannot be seen"
-                assert marker.header.stamp.sec * 10**9 + marker.header.stamp.nanosec == time
+                assert marker.frame_locked
+                assert (marker.header.stamp.sec, marker.header.stamp.nanosec) == (0, 0)
                 assert (marker.lifetime.sec, marker.lifetime.nanosec) == (0, 0)
                 assert all(np.isfinite([p.x, p.y, p.z]).all() for p in marker.points)
 
@@ -119,15 +137,16 @@ def test_frames_form_a_tree_under_map(log: Path) -> None:
     assert used <= {"map", *parents}
     for transform in moving:
         q = transform.transform.rotation
-        assert np.isclose(q.x**2 + q.y**2 + q.z**2 + q.w**2, 1)
+        assert np.isclose(q.x**2 + q.y**2 + q.z**2 + q.w**2, 1, atol=1e-3)
 
 
 def test_car_frame_is_where_the_telemetry_says(log: Path) -> None:
     told = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
     frames = [m.transforms[0] for _, m in read(log, "/tf", "tf2_msgs/msg/TFMessage")]
     assert [frame.child_frame_id for frame in frames] == ["car"] * len(told["x_m"])
-    assert [frame.transform.translation.x for frame in frames] == told["x_m"].tolist()
-    assert [frame.transform.translation.y for frame in frames] == told["y_m"].tolist()
+    for axis in "xy":
+        places = [getattr(frame.transform.translation, axis) for frame in frames]
+        np.testing.assert_allclose(places, told[f"{axis}_m"], rtol=2**-16, atol=2**-10)
     assert (told["speed_m_s"] >= 0).all()
 
 
@@ -153,38 +172,51 @@ def test_log_lines(log: Path) -> None:
 
 
 def test_layout_is_attached_and_classic(log: Path) -> None:
-    reader = McapReader(log)
-    attached = reader.attachment(LAYOUT_NAME)
-    assert attached is not None
-    layout = json.loads(attached)
-    assert set(layout) == {"configById", "layout", "globalVariables", "userNodes", "playbackConfig"}
-    assert sorted(_panels(layout["layout"])) == sorted(layout["configById"])
+    layout = check_layout(log)
     kinds = {panel.split("!")[0] for panel in layout["configById"]}
-    assert kinds == {"3D", "Image", "Plot", "StateTransitions", "RosOut"}
+    assert kinds == {"3D", "Image", "Plot", "StateTransitions", "RosOut", "Tab"}
     assert layout["configById"]["3D!scene"]["followTf"] == "car"
     depth = layout["configById"]["Image!depth"]["imageMode"]
     assert depth["imageTopic"] == "/camera/depth"
+    assert depth["colorMode"] == "colormap"
     assert depth["minValue"] < depth["maxValue"]
 
 
-def test_each_path_in_the_layout_names_one_number_of_the_log(log: Path) -> None:
-    attached = McapReader(log).attachment(LAYOUT_NAME)
-    assert attached is not None
-    layout = json.loads(attached)
-    paths = [
-        path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])
-    ]
-    assert {"/rl/step.reward", "/telemetry.speed_m_s", "/telemetry.lateral_offset_m"} <= set(paths)
-    assert {"/rl/step.action", "/rl/step.episode"} <= set(paths)
-    reader = McapReader(log)
-    for path in paths:
-        topic, _, field = path.partition(".")
-        channel = reader.channel_of(topic)
-        assert channel is not None, path
-        text = reader.schema_of(channel).data.decode()
-        name = field.partition("[")[0]
-        assert any(line.endswith(f" {name}") for line in text.splitlines()), path
-        assert "[" not in path, "the lane sim's plots show numbers that have names"
+@pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
+def test_layouts_name_what_the_log_has(sim: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    env = make_sim(sim)
+    with closing(mcaprl.RecordMcap(env, path)) as recorder:
+        recorder.reset(seed=0)
+        recorder.step(env.action_space.sample())
+    data = mcaprl.open(path)
+    labels = series_of(check_layout(path))
+    assert "reward" in labels
+    assert {"return so far", "return of episode"} & set(labels)
+    assert "episode" in labels
+    assert set(data.observation_names[:24]) <= set(labels)
+    assert set(data.action_names.values()) or "action[0]" in labels
+    assert set(data.action_names.values()) <= set(labels)
+
+
+def test_return_so_far_adds_up(log: Path) -> None:
+    told = Topic(McapReader(log), "/telemetry").read(("return_so_far",))["return_so_far"]
+    rewards = [episode.rewards for episode in mcaprl.open(log).episodes]
+    sums = np.concatenate([[0.0, *np.cumsum(reward)] for reward in rewards])
+    np.testing.assert_allclose(told, sums, rtol=2**-16)
+
+
+@pytest.mark.parametrize(("sim", "episodes"), [("lane", 4), ("powerline", 10), ("racer", 1)])
+def test_a_scene_makes_a_log_at_most_three_times_as_large(
+    sim: str, episodes: int, tmp_path: Path
+) -> None:
+    sizes: list[int] = []
+    for options in ([], ["--no-scene"]):
+        path = tmp_path / f"{len(sizes)}.mcap"
+        command = ["record", sim, "--epsilon", "0.1", "--episodes", str(episodes), *options]
+        assert run([*command, "--out", str(path)]) == 0
+        sizes.append(path.stat().st_size)
+    assert sizes[0] <= 3 * sizes[1]
 
 
 def test_layout_without_a_scene() -> None:
@@ -246,11 +278,3 @@ def test_vectors_are_read_without_the_images(tmp_path: Path) -> None:
     assert frozenset({"/camera/depth"}) in kinds
     data = mcaprl.open(path)
     assert data.observations.shape[1:] == (84, 84, 1)
-
-
-def _panels(node: Any) -> list[str]:
-    if isinstance(node, str):
-        return [node]
-    assert node["direction"] in ("row", "column")
-    assert 0 < node["splitPercentage"] < 100
-    return [*_panels(node["first"]), *_panels(node["second"])]

@@ -1,0 +1,1 @@
+"""Measures this package beside others': `make bench`."""

@@ -1,0 +1,139 @@
+"""Updates per second of Double DQN and CQL beside d3rlpy's and SB3's DQN, as ratios.
+
+    python -m benchmarks.learning
+
+One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
+time on one thread, the best of ROUNDS turns. Needs d3rlpy and stable-baselines3 beside mcaprl.
+Prints the ratios and writes them to benchmarks/learning.json.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import d3rlpy
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3 import DQN
+from stable_baselines3.common.logger import configure
+
+import mcaprl
+from mcaprl.offline.algorithms import ALGORITHMS
+from mcaprl.offline.buffer import TransitionBuffer
+
+ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
+ROUNDS = 7
+TURN_S = 1.0
+HIDDEN = [256, 256]
+RESULTS = Path(__file__).with_name("learning.json")
+Update = Callable[[], object]
+
+
+def transitions() -> mcaprl.Dataset:
+    """Random transitions in episodes of 1000."""
+    random = np.random.default_rng(0)
+    frames = random.normal(size=(ROWS // EPISODE, EPISODE + 1, WIDTH)).astype(np.float32)
+    return mcaprl.Dataset.from_arrays(
+        observations=frames[:, :-1].reshape(ROWS, WIDTH),
+        next_observations=frames[:, 1:].reshape(ROWS, WIDTH),
+        actions=random.integers(ACTIONS, size=ROWS),
+        rewards=random.normal(size=ROWS),
+        terminated=np.zeros(ROWS, bool),
+        truncated=np.arange(1, ROWS + 1) % EPISODE == 0,
+        action_space=spaces.Discrete(ACTIONS),
+    )
+
+
+def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Update:
+    """One update of so many seeds."""
+    config = ALGORITHMS[algo].config_type(batch_size=batch_size)
+    buffer = TransitionBuffer.from_dataset(data, config.packing)
+    return ALGORITHMS[algo](config, buffer, range(seeds)).update
+
+
+def d3rlpys(data: mcaprl.Dataset, config: str, batch_size: int) -> Update:
+    """One update of d3rlpy, its batch drawn from its own buffer."""
+    log = d3rlpy.dataset.MDPDataset(
+        data.observations,
+        data.actions,
+        data.rewards.astype(np.float32),
+        data.terminated.astype(np.float32),
+        data.truncated.astype(np.float32),
+        action_space=d3rlpy.ActionSpace.DISCRETE,
+        action_size=ACTIONS,
+    )
+    encoder = d3rlpy.models.VectorEncoderFactory(HIDDEN)
+    settings: dict[str, Any] = {"batch_size": batch_size, "encoder_factory": encoder}
+    learner = getattr(d3rlpy.algos, config)(**settings, target_update_interval=500).create("cpu")
+    learner.build_with_dataset(log)
+    return lambda: learner.update(log.sample_transition_batch(batch_size))
+
+
+def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
+    """Ten updates of SB3's DQN, which is not double."""
+
+    class Spaces(gym.Env[Any, Any]):
+        observation_space = spaces.Box(-np.inf, np.inf, (WIDTH,), np.float32)
+        action_space = spaces.Discrete(ACTIONS)
+
+    settings: dict[str, Any] = {"policy_kwargs": {"net_arch": HIDDEN}, "batch_size": batch_size}
+    model = DQN("MlpPolicy", Spaces(), buffer_size=ROWS, device="cpu", **settings)
+    model.set_logger(configure(None, []))
+    assert model.replay_buffer is not None
+    rows = zip(data.observations, data.next_observations, data.actions, data.rewards, strict=True)
+    for observation, following, action, reward in rows:
+        model.replay_buffer.add(
+            observation[None], following[None], action[None, None], reward[None], np.zeros(1), [{}]
+        )
+    return lambda: model.train(gradient_steps=10, batch_size=batch_size)
+
+
+def best_rates(sides: dict[str, tuple[Update, int]]) -> dict[str, float]:
+    """Updates per CPU second of each side, in its best turn; a call makes so many updates."""
+    best = dict.fromkeys(sides, 0.0)
+    for _ in range(ROUNDS):
+        for name, (update, count) in sides.items():
+            start, done = time.process_time(), 0
+            while (elapsed := time.process_time() - start) < TURN_S:
+                update()
+                done += count
+            best[name] = max(best[name], done / elapsed)
+    return best
+
+
+def main() -> None:
+    """Measure, print ratios, and write them to learning.json."""
+    torch.set_num_threads(1)
+    data = transitions()
+    results: dict[str, float] = {}
+    for size in (256, 32):
+        rates = best_rates(
+            {
+                "ddqn": (ours(data, "double-dqn", size), 1),
+                "cql": (ours(data, "cql", size), 1),
+                "four seeds": (ours(data, "cql", size, seeds=4), 4),
+                "d3rlpy ddqn": (d3rlpys(data, "DoubleDQNConfig", size), 1),
+                "d3rlpy cql": (d3rlpys(data, "DiscreteCQLConfig", size), 1),
+                "sb3 dqn": (sb3s(data, size), 10),
+            }
+        )
+        results |= {
+            f"Double DQN / d3rlpy's, batch {size}": rates["ddqn"] / rates["d3rlpy ddqn"],
+            f"CQL / d3rlpy's, batch {size}": rates["cql"] / rates["d3rlpy cql"],
+            f"Double DQN / SB3's DQN, batch {size}": rates["ddqn"] / rates["sb3 dqn"],
+            f"CQL, four seeds at once / one after the other, batch {size}": rates["four seeds"]
+            / rates["cql"],
+        }
+    for name, value in results.items():
+        print(f"{value:6.2f}  {name}")
+    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""Recording, writing and reading logs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+import mcaprl
+from benchmarks import rivals
+from benchmarks.measure import OURS, Side, Table, compare
+from benchmarks.workloads import EPISODE_STEPS, Constant, images, run_env, vectors
+from mcaprl.recorder.schema import message_dtype
+
+# Message by message a million takes minutes: such sides do this share of it, and are scaled up.
+SLOW_SHARE = 0.1
+IMAGE_STEPS = 20_000
+DEPTH = "/rl/observation/depth"
+
+
+def tables(folder: Path, transitions: int) -> list[Table]:
+    """Measure everything about logs, with files in `folder`."""
+    data = vectors(transitions)
+    part = vectors(int(transitions * SLOW_SHARE))
+    encoded = rivals.messages(part)
+    minari = rivals.MinariFolder(folder / "minari")
+    log = folder / "log.mcap"
+    data.save(log)
+    return [
+        _recording(folder, encoded, minari),
+        _writing(folder, data, part, encoded, minari),
+        _reading(folder, log, data, part, minari),
+        _episode(log),
+        _interleaved(folder, encoded),
+        *_images(folder),
+    ]
+
+
+def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
+    episodes, bare = 100, "the environment alone"
+    messages = (encoded * (1 + episodes * EPISODE_STEPS // len(encoded)))[
+        : episodes * EPISODE_STEPS
+    ]
+    scratch = folder / "recorded.mcap"
+
+    def record() -> None:
+        run_env(mcaprl.RecordMcap(Constant(), scratch, overwrite=True), episodes)
+
+    table = compare(
+        "Recording: CPU time that is added to each step of an environment",
+        [
+            Side(bare, lambda: rivals.record_bare(episodes)),
+            Side(OURS, record, floor=bare),
+            Side(
+                "mcap's Writer, messages ready-made", lambda: rivals.write_mcap(messages, scratch)
+            ),
+            Side(
+                "foxglove-sdk, messages ready-made",
+                lambda: rivals.write_foxglove(messages, scratch),
+            ),
+            Side(
+                "rosbags' Writer, messages ready-made",
+                lambda: rivals.write_rosbags(messages, folder / "bag"),
+            ),
+            Side(
+                "Minari's DataCollector, HDF5",
+                lambda: minari.record(10, "hdf5"),
+                share=10 / episodes,
+                floor=bare,
+            ),
+            Side(
+                "Minari's DataCollector, Arrow",
+                lambda: minari.record(10, "arrow"),
+                share=10 / episodes,
+                floor=bare,
+            ),
+        ],
+        goal="4 times less than mcap's Writer, 2 than foxglove-sdk, 15 than Minari's DataCollector",
+    )
+    table.ratios.pop(bare)
+    return table
+
+
+def _writing(
+    folder: Path,
+    data: mcaprl.Dataset,
+    part: mcaprl.Dataset,
+    encoded: list[bytes],
+    minari: rivals.MinariFolder,
+) -> Table:
+    scratch = folder / "written"
+    return compare(
+        "Writing transitions that are in memory",
+        [
+            Side(OURS, lambda: data.save(folder / "written.mcap", overwrite=True)),
+            Side(
+                "mcap's Writer, messages ready-made",
+                lambda: rivals.write_mcap(encoded, scratch),
+                SLOW_SHARE,
+            ),
+            Side(
+                "foxglove-sdk, messages ready-made",
+                lambda: rivals.write_foxglove(encoded, scratch),
+                SLOW_SHARE,
+            ),
+            Side(
+                "rosbags' Writer, messages ready-made",
+                lambda: rivals.write_rosbags(encoded, folder / "bag"),
+                SLOW_SHARE,
+            ),
+            Side("Minari, HDF5", lambda: minari.write(part, "hdf5"), SLOW_SHARE),
+            Side("Minari, Arrow", lambda: minari.write(part, "arrow"), SLOW_SHARE),
+            Side("h5py, gzip 1", lambda: rivals.write_h5py(part, scratch), SLOW_SHARE),
+            Side("Parquet, zstd 1", lambda: rivals.write_parquet(data, scratch)),
+            Side(
+                "npz, compressed",
+                lambda: rivals.write_npz(part, folder / "written.npz"),
+                SLOW_SHARE,
+            ),
+        ],
+        goal="10 times mcap's Writer, 5 times foxglove-sdk",
+        rounds=3,
+    )
+
+
+def _reading(
+    folder: Path,
+    log: Path,
+    data: mcaprl.Dataset,
+    part: mcaprl.Dataset,
+    minari: rivals.MinariFolder,
+) -> Table:
+    small = folder / "small.mcap"
+    part.save(small)
+    hdf5, parquet, npz = folder / "table.h5", folder / "table.parquet", folder / "table.npz"
+    sides = [
+        Side(OURS, lambda: mcaprl.open(log)),
+        Side("plain zstd of the same chunks", lambda: rivals.plain_zstd(log, "/rl/step")),
+        Side("memcpy of the columns", lambda: [c.copy() for c in rivals.columns_of(data).values()]),
+        Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOW_SHARE),
+        Side("rosbags", lambda: rivals.read_rosbags(small), SLOW_SHARE),
+    ]
+    # A table format is read only where it can be written.
+    for name, write, read, path in (
+        ("h5py, gzip 1", rivals.write_h5py, rivals.read_h5py, hdf5),
+        ("Parquet, zstd 1", rivals.write_parquet, rivals.read_parquet, parquet),
+        ("npz, compressed", rivals.write_npz, rivals.read_npz, npz),
+    ):
+        sides.append(Side(name, _after(partial(write, data, path), partial(read, path))))
+    for kind in ("hdf5", "arrow"):
+        write_part = partial(minari.write, part, kind)
+        read_part = partial(minari.read, f"bench/write-{kind}-v0")
+        sides.append(Side(f"Minari, {kind}", _after(write_part, read_part), SLOW_SHARE))
+    return compare(
+        "Reading a log of vectors into columns, CRCs checked",
+        sides,
+        goal="70 % of plain zstd's speed, 100 times mcap + mcap-ros2-support, 5 times Minari",
+    )
+
+
+def _episode(log: Path) -> Table:
+    episodes = mcaprl.open(log, columns=[]).episodes
+    number = len(episodes) // 2
+    start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
+    return compare(
+        f"Reading one episode of {len(episodes)}",
+        [
+            Side(OURS, lambda: mcaprl.open(log, episodes=number)),
+            Side(
+                "mcap + mcap-ros2-support, by time", lambda: rivals.read_mcap(log, start, stop + 1)
+            ),
+        ],
+        goal="40 times mcap's reader",
+    )
+
+
+def _interleaved(folder: Path, encoded: list[bytes]) -> Table:
+    path = folder / "interleaved.mcap"
+    rivals.write_interleaved(_with_episodes(encoded), path)
+    return compare(
+        "Reading another writer's log, topics interleaved",
+        [
+            Side(OURS, lambda: mcaprl.open(path)),
+            Side("plain zstd of the same chunks", lambda: rivals.plain_zstd(path, "/rl/step")),
+        ],
+        goal="70 % of plain zstd's speed",
+    )
+
+
+def _images(folder: Path) -> list[Table]:
+    packed, plain = folder / "images.mcap", folder / "plain.mcap"
+    data = images(IMAGE_STEPS)
+    data.save(packed)
+    data.save(plain, compression="none")
+    reading = compare(
+        "Reading a log of images and vectors into memory",
+        [
+            Side(OURS, lambda: mcaprl.open(packed, images="memory")),
+            Side(
+                "plain zstd of the same chunks",
+                lambda: rivals.plain_zstd(packed, "/rl/step", DEPTH),
+            ),
+            Side(f"{OURS}, vectors alone", lambda: mcaprl.open(packed, columns=["state"])),
+        ],
+        goal="85 % of plain zstd's speed; vectors alone 30 times cheaper",
+    )
+    memory = mcaprl.open(packed, images="memory", columns=["depth"])
+    mapped = mcaprl.open(plain, images="mapped", columns=["depth"])
+    batches = np.random.default_rng(0).integers(len(data), size=(200, 256))
+    frames = memory.observations["depth"]
+    drawing = compare(
+        "Random batches of 256 transitions with images, warm",
+        [
+            Side(f"{OURS}, on disk", lambda: [mapped.batch(rows) for rows in batches]),
+            Side(f"{OURS}, in memory", lambda: [memory.batch(rows) for rows in batches]),
+            Side("NumPy, one array in memory", lambda: [(frames[r], frames[r]) for r in batches]),
+        ],
+        ours=f"{OURS}, on disk",
+    )
+    return [reading, drawing]
+
+
+def _with_episodes(encoded: list[bytes]) -> list[bytes]:
+    """Number the ready-made messages, so that they are whole episodes."""
+    dtype = message_dtype(rivals.TEXT)
+    assert dtype is not None
+    rows = np.frombuffer(b"".join(encoded), dtype).copy()
+    number = np.arange(len(rows))
+    rows["episode"], rows["step"] = np.divmod(number, EPISODE_STEPS + 1)
+    rows["final"] = rows["step"] == EPISODE_STEPS
+    size, buffer = (
+        rows.itemsize,
+        rows[: len(rows) // (EPISODE_STEPS + 1) * (EPISODE_STEPS + 1)].tobytes(),
+    )
+    return [buffer[start : start + size] for start in range(0, len(buffer), size)]
+
+
+def _after(prepare: Callable[[], object], run: Callable[[], object]) -> Callable[[], object]:
+    """A run that needs something prepared; an ImportError there is told when it runs."""
+    try:
+        prepare()
+    except ImportError as error:
+        reason = str(error)
+
+        def fail() -> object:
+            raise ImportError(reason)
+
+        return fail
+    return run

@@ -1,0 +1,296 @@
+"""The same tasks by other people's libraries, each as its own documentation does them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+import mcaprl
+from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
+from mcaprl.recorder.schema import message_dtype, step_schema
+
+NAME, TEXT = step_schema(OBSERVATION, ACTION)
+COLUMNS = ("observation", "action", "reward")
+
+
+def messages(data: mcaprl.Dataset) -> list[bytes]:
+    """Ready-made CDR of `/rl/step`, so that only the writing is timed."""
+    dtype = message_dtype(TEXT)
+    assert dtype is not None
+    rows = np.zeros(len(data), dtype)
+    rows["encapsulation"] = 0x0100
+    rows["observation"], rows["action"] = data.observations, data.actions
+    rows["reward"] = data.rewards
+    size, buffer = dtype.itemsize, rows.tobytes()
+    return [buffer[start : start + size] for start in range(0, len(buffer), size)]
+
+
+def write_mcap(encoded: list[bytes], path: Path) -> None:
+    """By mcap's Writer, with zstd."""
+    from mcap.writer import CompressionType, Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start("ros2")
+        schema = writer.register_schema(NAME, "ros2msg", TEXT.encode())
+        channel = writer.register_channel("/rl/step", "cdr", schema)
+        for row, message in enumerate(encoded):
+            writer.add_message(channel, row, message, row, row)
+        writer.finish()
+
+
+def write_interleaved(encoded: list[bytes], path: Path) -> None:
+    """By mcap's Writer, with another topic's messages of other lengths between."""
+    from mcap.writer import CompressionType, Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start("ros2")
+        schema = writer.register_schema(NAME, "ros2msg", TEXT.encode())
+        channel = writer.register_channel("/rl/step", "cdr", schema)
+        text = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        chatter = writer.register_channel("/chatter", "cdr", text)
+        for row, message in enumerate(encoded):
+            writer.add_message(channel, row, message, row, row)
+            if row % 4 == 0:
+                count = 1 + row % 30
+                said = b"\0\1\0\0" + count.to_bytes(4, "little") + b"x" * (count - 1) + b"\0"
+                writer.add_message(chatter, row, said, row, row)
+        writer.finish()
+
+
+def write_foxglove(encoded: list[bytes], path: Path) -> None:
+    """By foxglove-sdk, whose writer is in Rust."""
+    import foxglove
+
+    context = foxglove.Context()
+    writer = foxglove.open_mcap(path, allow_overwrite=True, context=context)
+    schema = foxglove.Schema(name=NAME, encoding="ros2msg", data=TEXT.encode())
+    channel = foxglove.Channel("/rl/step", schema=schema, message_encoding="cdr", context=context)
+    for row, message in enumerate(encoded):
+        channel.log(message, log_time=row)
+    writer.close()
+
+
+def write_rosbags(encoded: list[bytes], folder: Path) -> None:
+    """By rosbags, as a bag in MCAP."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(TEXT, NAME))
+    shutil.rmtree(folder, ignore_errors=True)
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/rl/step", NAME, typestore=store)
+        for row, message in enumerate(encoded):
+            bag.write(connection, row, message)
+
+
+def read_mcap(
+    path: Path, start_ns: int | None = None, stop_ns: int | None = None
+) -> dict[str, NDArray[Any]]:
+    """By mcap and mcap-ros2-support, message by message."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages(["/rl/step"], start_time=start_ns, end_time=stop_ns)
+        for _, _, _, message in found:
+            for name, values in columns.items():
+                values.append(getattr(message, name))
+    return {name: np.array(values) for name, values in columns.items()}
+
+
+def read_rosbags(path: Path) -> dict[str, NDArray[Any]]:
+    """By rosbags, message by message."""
+    from rosbags.highlevel import AnyReader
+
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    with AnyReader([path]) as bag:
+        wanted = [connection for connection in bag.connections if connection.topic == "/rl/step"]
+        for connection, _, raw in bag.messages(connections=wanted):
+            message = bag.deserialize(raw, connection.msgtype)
+            for name, values in columns.items():
+                values.append(getattr(message, name))
+    return {name: np.array(values) for name, values in columns.items()}
+
+
+class MinariFolder:
+    """Minari's datasets in a folder of their own."""
+
+    def __init__(self, folder: Path) -> None:
+        """Point Minari at it."""
+        os.environ["MINARI_DATASETS_PATH"] = str(folder)
+        self._folder = folder
+
+    def record(self, episodes: int, data_format: str) -> None:
+        """Step through an environment in Minari's DataCollector."""
+        import minari
+
+        name = f"bench/record-{data_format}-v0"
+        shutil.rmtree(self._folder / name, ignore_errors=True)
+        env = minari.DataCollector(_NoSpec(), data_format=data_format)
+        for _ in range(episodes):
+            env.reset()
+            for _ in range(EPISODE_STEPS):
+                env.step(3)
+        env.create_dataset(name)
+        env.close()
+
+    def write(self, data: mcaprl.Dataset, data_format: str) -> str:
+        """Write a dataset; gives its name back."""
+        import minari
+        from minari.data_collector import EpisodeBuffer
+
+        name = f"bench/write-{data_format}-v0"
+        shutil.rmtree(self._folder / name, ignore_errors=True)
+        buffers = [
+            EpisodeBuffer(
+                id=episode.index,
+                observations=np.concatenate([episode.observations, episode.next_observations[-1:]]),
+                actions=episode.actions,
+                rewards=episode.rewards,
+                terminations=episode.terminated,
+                truncations=episode.truncated,
+                infos={},
+            )
+            for episode in data.episodes
+        ]
+        minari.create_dataset_from_buffers(
+            name,
+            buffers,
+            observation_space=OBSERVATION,
+            action_space=ACTION,
+            data_format=data_format,
+        )
+        return name
+
+    def read(self, name: str) -> list[NDArray[Any]]:
+        """Read all observations, actions and rewards into arrays."""
+        import minari
+
+        episodes = list(minari.load_dataset(name).iterate_episodes())
+        return [
+            np.concatenate([getattr(episode, column) for episode in episodes])
+            for column in ("observations", "actions", "rewards")
+        ]
+
+
+class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
+    """Minari asks an environment for its spec."""
+
+    def __init__(self) -> None:
+        super().__init__(Constant())
+
+
+def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
+    """What the table formats store: the next observations are the next rows'."""
+    return {
+        "observation": data.observations,
+        "action": data.actions,
+        "reward": data.rewards,
+        "terminated": data.terminated,
+        "truncated": data.truncated,
+    }
+
+
+def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
+    """By h5py, in one HDF5 file, chunked and with gzip 1: it has no zstd of its own."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, column in columns_of(data).items():
+            file.create_dataset(
+                name, data=column, chunks=True, compression="gzip", compression_opts=1
+            )
+
+
+def read_h5py(path: Path) -> dict[str, NDArray[Any]]:
+    """By h5py."""
+    import h5py
+
+    with h5py.File(path) as file:
+        return {name: file[name][:] for name in file}
+
+
+def write_parquet(data: mcaprl.Dataset, path: Path) -> None:
+    """By pyarrow, with zstd 1."""
+    import pyarrow
+    import pyarrow.parquet
+
+    table = {}
+    for name, column in columns_of(data).items():
+        if column.ndim == 1:
+            table[name] = pyarrow.array(column)
+        else:
+            flat = pyarrow.array(column.ravel())
+            table[name] = pyarrow.FixedSizeListArray.from_arrays(flat, column.shape[1])
+    pyarrow.parquet.write_table(pyarrow.table(table), path, compression="zstd", compression_level=1)
+
+
+def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
+    """By pyarrow, in this thread."""
+    import pyarrow.parquet
+
+    table = pyarrow.parquet.read_table(path, use_threads=False)
+    columns = {}
+    for name in table.column_names:
+        array = table.column(name).combine_chunks()
+        is_list = hasattr(array, "flatten") and "list" in str(array.type)
+        flat = array.flatten() if is_list else array
+        values = flat.to_numpy(zero_copy_only=False)
+        columns[name] = values.reshape(len(array), -1) if is_list else values
+    return columns
+
+
+def write_npz(data: mcaprl.Dataset, path: Path) -> None:
+    """By NumPy, compressed."""
+    columns = columns_of(data)
+    np.savez_compressed(
+        path,
+        observation=columns["observation"],
+        action=columns["action"],
+        reward=columns["reward"],
+        terminated=columns["terminated"],
+        truncated=columns["truncated"],
+    )
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """By NumPy."""
+    with np.load(path) as file:
+        return {name: file[name] for name in file.files}
+
+
+def compressed_chunks(path: Path, topics: tuple[str, ...]) -> Iterator[memoryview]:
+    """The bytes of the chunks that hold a topic, as they stand in the file."""
+    from mcaprl.recorder.mcap_reader import McapReader
+
+    reader = McapReader(path)
+    ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
+    for chunk in reader.chunks:
+        if ids & set(chunk.message_index_offsets):
+            start = chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size
+            yield reader.view[start : start + chunk.compressed_size]
+
+
+def plain_zstd(path: Path, *topics: str) -> None:
+    """Decompress the chunks of topics, and nothing else: what no reader can do without."""
+    import zstandard
+
+    for data in compressed_chunks(path, topics):
+        zstandard.decompress(data)
+
+
+def record_bare(episodes: int) -> None:
+    """The environment in a wrapper that does nothing."""
+    run_env(gym.Wrapper(Constant()), episodes)

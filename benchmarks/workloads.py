@@ -1,0 +1,89 @@
+"""What is measured: transitions of known size, and an environment that costs nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+import mcaprl
+
+OBSERVATION = spaces.Box(-np.inf, np.inf, (19,), np.float32)
+ACTION = spaces.Discrete(9)
+EPISODE_STEPS = 1000
+IMAGE_SHAPE = (84, 84)
+
+
+class Constant(gym.Env[Any, Any]):
+    """Gives the same observation again and again, so that what a recorder adds can be seen."""
+
+    observation_space, action_space = OBSERVATION, ACTION
+
+    def __init__(self) -> None:
+        """Prepare the one observation."""
+        self.observation = np.arange(19, dtype=np.float32)
+        self.step_number = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self.step_number = 0
+        return self.observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Give the same observation again."""
+        self.step_number += 1
+        return self.observation, 1.0, False, self.step_number == EPISODE_STEPS, {}
+
+
+def run_env(env: gym.Env[Any, Any], episodes: int) -> None:
+    """Step through episodes."""
+    for _ in range(episodes):
+        env.reset()
+        for _ in range(EPISODE_STEPS):
+            env.step(3)
+    env.close()
+
+
+def vectors(transitions: int) -> mcaprl.Dataset:
+    """Random numbers, which no compression makes smaller by much: 19 float32 and 9 actions."""
+    random = np.random.default_rng(0)
+    episodes = transitions // EPISODE_STEPS
+    frames = random.standard_normal((episodes, EPISODE_STEPS + 1, 19), np.float32)
+    return mcaprl.Dataset.from_arrays(
+        observations=frames[:, :-1].reshape(transitions, 19),
+        next_observations=frames[:, 1:].reshape(transitions, 19),
+        action_space=ACTION,
+        **_rest(random, transitions),
+    )
+
+
+def images(transitions: int) -> mcaprl.Dataset:
+    """Depth images of a slope with noise, and vectors."""
+    random = np.random.default_rng(0)
+    frames = transitions + transitions // EPISODE_STEPS
+    slope = np.add.outer(np.arange(84), np.arange(84) // 2).astype(np.uint8)
+    noise = random.integers(0, 8, (frames, *IMAGE_SHAPE), np.uint8)
+    pictures = slope + random.integers(0, 60, (frames, 1, 1), np.uint8) + noise
+    states = random.standard_normal((frames, 19), np.float32)
+    here = np.arange(transitions) + np.arange(transitions) // EPISODE_STEPS
+    return mcaprl.Dataset.from_arrays(
+        observations={"depth": pictures[here], "state": states[here]},
+        next_observations={"depth": pictures[here + 1], "state": states[here + 1]},
+        observation_space=spaces.Dict(
+            {"depth": spaces.Box(0, 255, IMAGE_SHAPE, np.uint8), "state": OBSERVATION}
+        ),
+        action_space=ACTION,
+        **_rest(random, transitions),
+    )
+
+
+def _rest(random: np.random.Generator, transitions: int) -> dict[str, Any]:
+    return {
+        "actions": random.integers(9, size=transitions),
+        "rewards": random.standard_normal(transitions),
+        "terminated": np.zeros(transitions, bool),
+        "truncated": np.arange(1, transitions + 1) % EPISODE_STEPS == 0,
+        "env_id": "CartPole-v1",
+    }

@@ -1,0 +1,141 @@
+"""A trained policy as one ONNX file for a robot: observations in, actions out, nothing else needed.
+
+Inputs are the parts of the observation as the environment gives them, named as in `/rl/step`
+(`observation`, `camera`, ...), with a batch axis before; a policy that stacks k frames takes
+(B, k, *shape), oldest first. Outputs are `action` (B,) int64, values of the action space, and
+`scores` (B, A), of which it takes the largest. Normalisation is inside.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from mcaprl.errors import PolicyError, import_extra
+from mcaprl.offline.observations import Observations
+from mcaprl.offline.policy import Policy
+
+
+class ExportedPolicy(nn.Module):
+    """A policy as a module of plain tensors, for exporters."""
+
+    def __init__(self, policy: Policy) -> None:
+        """Take over a policy's networks and normalisation."""
+        super().__init__()
+        self.scores = policy.scores
+        self.encoder = policy.encoder
+        self.frame_stack = policy.frame_stack
+        self.first_action = int(policy.action_space.start)
+        self.shift = torch.from_numpy(policy.encoder.shift)
+        self.scale = torch.from_numpy(policy.encoder.scale)
+
+    @property
+    def input_names(self) -> list[str]:
+        """A name for each argument of `forward`."""
+        return [leaf.name for leaf in self.encoder.leaves]
+
+    def examples(self, batch_size: int, seed: int = 0) -> tuple[Tensor, ...]:
+        """Arguments for `forward` from random observations."""
+        space = self.encoder.space
+        space.seed(seed)
+        stack = (self.frame_stack,) if self.frame_stack > 1 else ()
+        count = batch_size * self.frame_stack
+        samples = [space.sample() for _ in range(count)]
+        columns = [
+            np.stack([leaf.of(sample) for sample in samples]) for leaf in self.encoder.leaves
+        ]
+        shapes = [(batch_size, *stack, *column.shape[1:]) for column in columns]
+        return tuple(
+            torch.from_numpy(column.reshape(shape))
+            for column, shape in zip(columns, shapes, strict=True)
+        )
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Map observations to `action` and `scores`."""
+        if self.frame_stack > 1:
+            inputs = tuple(part.flatten(0, 1) for part in inputs)
+        observations = self._encode(inputs).stacked(self.frame_stack)
+        scores = self.scores(observations)
+        return scores.argmax(1) + self.first_action, scores
+
+    def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
+        """What `ObservationEncoder.encode` does, in torch."""
+        encoder, rows = self.encoder, inputs[0].shape[0]
+        n_images = len(encoder.images)
+        shaped = zip(inputs[:n_images], encoder.image_shapes, strict=True)
+        images = tuple(image.reshape(-1, *shape) for image, shape in shaped)
+        numbers = inputs[n_images : n_images + len(encoder.numbers)]
+        parts = [
+            _numbers(part, space) for part, (_, space) in zip(numbers, encoder.numbers, strict=True)
+        ]
+        vector = torch.cat(parts, 1) if parts else torch.empty(rows, 0)
+        mask = None
+        if encoder.mask is not None:
+            allowed = inputs[-1].bool()
+            mask = allowed | ~allowed.any(1, keepdim=True)
+        return Observations((vector - self.shift) / self.scale, images, mask)
+
+
+def export_onnx(policy: Policy, path: Path) -> None:
+    """Write a policy as an ONNX file, for a batch of any size.
+
+    Raises:
+        MissingExtraError: onnx or onnxscript is not installed.
+        PolicyError: the file cannot be written.
+    """
+    for package in ("onnx", "onnxscript"):
+        import_extra(package, "export")
+    module = ExportedPolicy(policy).eval()
+    with _quiet():
+        program = torch.onnx.export(
+            module,
+            module.examples(2),
+            input_names=module.input_names,
+            output_names=["action", "scores"],
+            dynamic_shapes=(tuple({0: torch.export.Dim("batch")} for _ in module.input_names),),
+            dynamo=True,
+            verbose=False,
+        )
+    assert program is not None
+    try:
+        program.save(str(path))
+    except OSError as error:
+        raise PolicyError(f"cannot write {path}: {error.strerror}") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter talks of packages that it could use and of its own future."""
+    disabled = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
+
+
+def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
+    """(B, width) of a part of the space: one-hot codes of counters, else the numbers themselves."""
+    flat = values.reshape(values.shape[0], -1)
+    if isinstance(space, spaces.Discrete):
+        counts, starts = [int(space.n)], [int(space.start)]
+    elif isinstance(space, spaces.MultiDiscrete):
+        counts, starts = space.nvec.ravel().tolist(), space.start.ravel().tolist()
+    else:
+        return flat.float()
+    codes = [
+        nn.functional.one_hot(flat[:, k].long() - start, count).float()
+        for k, (count, start) in enumerate(zip(counts, starts, strict=True))
+    ]
+    return torch.cat(codes, 1)

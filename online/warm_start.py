@@ -1,0 +1,147 @@
+"""Starting with experience: a replay buffer filled from logs, weights from a trained policy."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import DQN
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import is_image_space
+from torch import nn
+
+from mcaprl.errors import PolicyError, SpaceError, UsageError
+from mcaprl.online.policy import channels_first
+from mcaprl.recorder.dataset import Dataset
+
+_CHECKED = 64
+"""Observations on which weights that were taken over must give the same values."""
+
+
+def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
+    """Put logged transitions into a replay buffer, before any of the agent's own.
+
+    The buffer has a column for each environment, of steps that follow each other; the log is cut
+    into as many pieces. An episode that is cut counts as truncated there. If there are more
+    transitions than the buffer holds, the last ones are taken.
+
+    Args:
+        model: a fresh one.
+        dataset: with the spaces of the model's environment.
+
+    Returns:
+        How many transitions were taken; a multiple of the environments.
+
+    Raises:
+        UsageError: the algorithm has no replay buffer, or there are too few transitions.
+        SpaceError: the spaces differ.
+    """
+    buffer = model.replay_buffer if isinstance(model, DQN) else None
+    if buffer is None:
+        raise UsageError(f"{type(model).__name__} learns from no logs: it has no replay buffer")
+    _check_space("observation_space", channels_first(dataset.observation_space), model)
+    _check_space("action_space", dataset.action_space, model)
+    rows = min(len(dataset) // buffer.n_envs, buffer.buffer_size)
+    if rows == 0:
+        raise UsageError(f"{len(dataset)} transitions are too few for {buffer.n_envs} environments")
+    last = np.arange(len(dataset) - rows * buffer.n_envs, len(dataset))
+    for steps in last.reshape(buffer.n_envs, rows).T:
+        _add(buffer, dataset, steps, cut=steps[-1] == last[-1])
+    return rows * buffer.n_envs
+
+
+def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> None:
+    """Add one transition of each piece of the log."""
+    batch = dataset.batch(steps)
+    timeouts = (batch.truncated | cut) & ~batch.terminated
+    buffer.add(
+        _channels_first(batch.observations, dataset.observation_space),
+        _channels_first(batch.next_observations, dataset.observation_space),
+        batch.actions,
+        batch.rewards,
+        batch.terminated | timeouts,
+        [{"TimeLimit.truncated": bool(flag)} for flag in timeouts],
+    )
+
+
+def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
+    """Give a DQN the weights of a trained Q-network, layer by layer.
+
+    Args:
+        model: a fresh one.
+        policy: with `name`, `q_values`, and its network as an attribute.
+        observations: (B, *shape) on which both must give the same values.
+
+    Raises:
+        UsageError: the algorithm has no Q-network.
+        PolicyError: the policy has none, or one of another form.
+    """
+    if not isinstance(model, DQN):
+        raise UsageError(f"{type(model).__name__} has no Q-values to start from a policy with")
+    expected = policy.q_values(observations)
+    given, taken = _layers(_network_of(policy)), _layers(model.q_net)
+    shapes = [tuple(layer.weight.shape) for layer in given]
+    own = [tuple(layer.weight.shape) for layer in taken]
+    if shapes != own:
+        raise PolicyError(
+            f"{policy.name} has layers {_chain(shapes)}, the agent {_chain(own)}: pass --hidden"
+        )
+    for source, target in zip(given, taken, strict=True):
+        target.load_state_dict(source.state_dict())
+    model.q_net_target.load_state_dict(model.q_net.state_dict())
+    with torch.inference_mode():
+        values = model.q_net(model.policy.obs_to_tensor(observations)[0]).cpu().numpy()
+    if not np.allclose(values, expected, rtol=1e-4, atol=1e-4):
+        raise PolicyError(
+            f"{policy.name} has a network of another form (normalised inputs, say): its weights"
+            " mean other values in the agent's network"
+        )
+
+
+def sample_observations(space: spaces.Space[Any]) -> Any:
+    """Some observations of a space, to compare networks on."""
+    space.seed(0)
+    drawn = [space.sample() for _ in range(_CHECKED)]
+    if isinstance(space, spaces.Dict):
+        return {key: np.stack([one[key] for one in drawn]) for key in space}
+    return np.stack(drawn)
+
+
+def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> None:
+    own = getattr(model, role)
+    if space != own:
+        raise SpaceError(f"the logs have {role} {space}, the environment {own}")
+
+
+def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
+    """Pictures (N, height, width, channels) as SB3's networks take them; all else as it is."""
+    if isinstance(space, spaces.Dict):
+        return {key: _channels_first(values[key], part) for key, part in space.items()}
+    if is_image_space(space) and channels_first(space) != space:
+        return np.moveaxis(values, -1, 1)
+    return values
+
+
+def _network_of(policy: Any) -> nn.Module:
+    """The module that gives a policy's Q-values."""
+    modules = [value for value in vars(policy).values() if isinstance(value, nn.Module)]
+    if not modules:
+        raise PolicyError(f"{policy.name} has no network to start from")
+    return cast(nn.Module, getattr(modules[0], "q_net", modules[0]))
+
+
+def _layers(network: nn.Module) -> list[Any]:
+    """The layers with weights, in the order of the flow."""
+    return [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
+
+
+def _chain(shapes: list[tuple[int, ...]]) -> str:
+    """Widths from the input to the output.
+
+    >>> _chain([(256, 12), (6, 256)])
+    '12-256-6'
+    """
+    return "-".join(str(width) for width in [shapes[0][1], *(shape[0] for shape in shapes)])

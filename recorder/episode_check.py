@@ -1,0 +1,191 @@
+"""Checks what a log says of itself: metadata against schema, steps in order, episodes, pictures."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from mcap.records import ChunkIndex
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
+from mcaprl.recorder.chunk_check import Contradiction
+from mcaprl.recorder.columns import LOG_TIME, Columns, Part, Topic
+from mcaprl.recorder.episode import Episode
+from mcaprl.recorder.episodes import COUNTERS, episode_lengths, summaries, told_episodes
+from mcaprl.recorder.log_reader import LogReader, described
+from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.rows import add_up
+from mcaprl.recorder.schema import step_schema
+from mcaprl.recorder.spaces import Leaf, observation_leaves
+
+_FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
+_IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
+
+
+class EpisodeCheck:
+    """Takes chunk after chunk, and judges them together at the end."""
+
+    def __init__(self, reader: McapReader) -> None:
+        """Find the topics.
+
+        Raises:
+            LogError: the file has no `/rl/step`, or its metadata is damaged.
+        """
+        self._reader = reader
+        self._steps = Topic(reader, STEP_TOPIC)
+        if not reader.channels_of(STEP_TOPIC):
+            raise NoStepsError(f"no topic {STEP_TOPIC}, so no transitions")
+        if not len(self._steps):
+            raise NoEpisodesError("no finished episode")
+        self._metadata = described(reader)
+        self._images = [
+            (leaf, Topic(reader, leaf.topic))
+            for leaf in (
+                observation_leaves(self._metadata.observation_space) if self._metadata else ()
+            )
+            if leaf.encoding is not None
+        ]
+        self._found: list[Contradiction] = []
+        # What is not of the form in which this library writes is read as any reader does.
+        self._has_our_form = self._metadata is not None and self._schema_fits()
+        self._columns: Columns = {}
+        self._places: dict[int, list[tuple[Part, slice | Leaf]]] = defaultdict(list)
+        if self._has_our_form:
+            self._prepare()
+
+    def take(self, chunk: ChunkIndex, records: memoryview) -> None:
+        """Look at a chunk of the log."""
+        for part, place in self._places.get(chunk.chunk_start_offset, ()):
+            if isinstance(place, slice):
+                self._take_steps(part, records, place)
+            else:
+                self._take_images(part, records, place)
+
+    def finish(self) -> Iterator[Contradiction]:
+        """Tell what contradicts each other.
+
+        Raises:
+            LogError, SpaceError: so much that the log cannot be read.
+        """
+        if not self._has_our_form:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                dataset = LogReader(self._reader.path).read()
+            yield from (found for e in dataset.episodes for found in _check_return(e))
+            return
+        yield from self._found
+        columns, path = self._columns, str(self._reader.path)
+        lengths = episode_lengths(columns, path)
+        frames = int(lengths.sum()) + len(lengths)
+        if frames < len(self._steps):
+            yield Contradiction(
+                f"{len(self._steps) - frames} records of an episode that was not finished",
+                f"the end of {STEP_TOPIC}",
+            )
+        if not len(lengths):
+            return
+        times = columns[LOG_TIME]
+        if (np.diff(times) <= 0).any():
+            row = int(np.argmax(np.diff(times) <= 0)) + 1
+            yield Contradiction("log_times do not rise", f"record {row} of {STEP_TOPIC}")
+        yield from self._check_told(lengths)
+        for leaf, topic in self._images:
+            missing = int((~np.isin(times[:frames], topic.times)).sum())
+            if missing or len(topic) != len(self._steps):
+                yield Contradiction(
+                    f"{len(topic)} pictures for {len(self._steps)} records, {missing} have none",
+                    leaf.topic,
+                )
+
+    def _schema_fits(self) -> bool:
+        """Whether `/rl/step` is one channel of what this library writes for such spaces."""
+        channels = self._reader.channels_of(STEP_TOPIC)
+        assert self._metadata is not None
+        name, text = step_schema(self._metadata.observation_space, self._metadata.action_space)
+        schema = self._reader.schema_of(channels[0])
+        fits = schema.name == name and schema.data.decode(errors="replace") == text
+        if schema.name.startswith("mcaprl_msgs/msg/Step") and not fits:
+            raise CorruptLogError(f"the schema {schema.name} is not that of the metadata's spaces")
+        return fits and len(channels) == 1
+
+    def _prepare(self) -> None:
+        """Note which messages of which chunk belong to what."""
+        start = 0
+        for part in self._steps.parts:
+            stop = start + len(part.span.index)
+            self._place(part, slice(start, stop))
+            start = stop
+        for leaf, topic in self._images:
+            for part in topic.parts:
+                self._place(part, leaf)
+        self._columns = {name: np.empty(start, self._steps.fields[name]) for name in _FIELDS} | {
+            LOG_TIME: self._steps.times
+        }
+
+    def _place(self, part: Part, place: slice | Leaf) -> None:
+        if part.span.chunk is None:
+            self._has_our_form = False
+        else:
+            self._places[part.span.chunk.chunk_start_offset].append((part, place))
+
+    def _take_steps(self, part: Part, records: memoryview, rows: slice) -> None:
+        found = part.alike(records, part.span.index, _FIELDS)
+        if found is None:
+            raise CorruptLogError(f"messages of {STEP_TOPIC} have not the form of their schema")
+        for name in _FIELDS:
+            self._columns[name][rows] = found[name]
+
+    def _take_images(self, part: Part, records: memoryview, leaf: Leaf) -> None:
+        found = part.alike(records, part.span.index, _IMAGE_FIELDS)
+        if found is None or not _is_image(found, leaf):
+            raise CorruptLogError(f"pictures on {leaf.topic} are not as the metadata's space says")
+
+    def _check_told(self, lengths: NDArray[np.int64]) -> Iterator[Contradiction]:
+        """What `/rl/episode` tells, against the records."""
+        columns, topic = self._columns, Topic(self._reader, EPISODE_TOPIC)
+        finals = np.cumsum(lengths + 1) - 1
+        told = told_episodes(topic, columns[LOG_TIME][finals])
+        if len(told) not in (0, len(lengths)):
+            yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
+        whole = summaries(self._reader.path, columns, lengths, told)
+        for number, (final, summary) in enumerate(zip(finals.tolist(), whole, strict=True)):
+            rows = slice(final - summary.length, final)
+            yield from _check_summary(summary, number, {n: c[rows] for n, c in columns.items()})
+
+
+def _check_summary(summary: EpisodeSummary, number: int, rows: Columns) -> Iterator[Contradiction]:
+    pairs = [
+        ("a return", summary.total_reward, add_up(rows["reward"])),
+        ("a start", summary.start_time_ns, int(rows[LOG_TIME][0])),
+        ("terminated", summary.terminated, bool(rows["terminated"][-1])),
+        ("truncated", summary.truncated, bool(rows["truncated"][-1])),
+    ]
+    for name, told, actual in pairs:
+        if told != actual and not np.isnan(actual):
+            yield Contradiction(
+                f"{EPISODE_TOPIC} tells {name} of {told}, its records {actual}", f"episode {number}"
+            )
+
+
+def _check_return(episode: Episode) -> Iterator[Contradiction]:
+    total = add_up(episode.rewards)
+    if total != episode.total_reward and not np.isnan(total):
+        yield Contradiction(
+            f"{EPISODE_TOPIC} tells a return of {episode.total_reward}, its rewards give {total}",
+            f"episode {episode.index}",
+        )
+
+
+def _is_image(found: NDArray[Any], leaf: Leaf) -> bool:
+    height, width = leaf.shape[:2]
+    encoding = (leaf.encoding or "").encode()
+    expected = (height, width, encoding, leaf.size // height)
+    heads = zip(_IMAGE_FIELDS, expected, strict=False)
+    return found["data"].shape[1:] == (leaf.size,) and all(
+        (found[name] == value).all() for name, value in heads
+    )

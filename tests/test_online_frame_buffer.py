@@ -1,0 +1,127 @@
+"""The buffer that stores frames once, against SB3's own that store them twice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+
+from mcaprl.online.frame_buffer import FrameReplayBuffer
+
+PICTURE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
+DICT = spaces.Dict({"picture": PICTURE, "vector": spaces.Box(-1, 1, (3,))})
+ACTIONS = spaces.Discrete(4)
+
+
+def drawn(space: spaces.Space[Any], envs: int, random: np.random.Generator) -> Any:
+    """An observation of each environment."""
+    if isinstance(space, spaces.Dict):
+        return {key: drawn(part, envs, random) for key, part in space.items()}
+    values = random.integers(0, 256, (envs, *(space.shape or ())))
+    return values.astype(space.dtype)
+
+
+def feed(buffers: list[Any], space: spaces.Space[Any], steps: int, envs: int, seed: int) -> None:
+    """The same steps, some of which end episodes, for all buffers."""
+    random = np.random.default_rng(seed)
+    observation = drawn(space, envs, random)
+    for _ in range(steps):
+        following = drawn(space, envs, random)
+        done = random.random(envs) < 0.2
+        cut = done & (random.random(envs) < 0.5)
+        infos = [{"TimeLimit.truncated": bool(flag)} for flag in cut]
+        action, reward = random.integers(4, size=envs), random.normal(size=envs)
+        for buffer in buffers:
+            buffer.add(observation, following, action, reward, done, infos)
+        observation = _started(following, drawn(space, envs, random), done)
+
+
+def _started(following: Any, fresh: Any, done: Any) -> Any:
+    """What comes next: the first observation of a new episode where one ended."""
+    if isinstance(following, dict):
+        return {key: _started(part, fresh[key], done) for key, part in following.items()}
+    return np.where(done.reshape(-1, *[1] * (following.ndim - 1)), fresh, following)
+
+
+def samples(buffer: Any, seed: int, batch_size: int = 200) -> list[Any]:
+    np.random.seed(seed)  # noqa: NPY002
+    batch = buffer.sample(batch_size)._asdict()
+    flat: list[Any] = []
+    for value in batch.values():
+        flat += [value[key] for key in sorted(value)] if isinstance(value, dict) else [value]
+    return flat
+
+
+def check_same(ours: Any, theirs: Any) -> None:
+    for mine, other in zip(samples(ours, 5), samples(theirs, 5), strict=True):
+        if other is None:
+            assert mine is None
+        else:
+            np.testing.assert_allclose(mine.numpy(), other.numpy(), rtol=1e-5, atol=1e-6)
+
+
+@given(steps=st.integers(1, 60), envs=st.integers(1, 3), seed=st.integers(0, 99))
+def test_samples_are_those_of_sb3s_buffer(steps: int, envs: int, seed: int) -> None:
+    ours = FrameReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
+    theirs = ReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
+    feed([ours, theirs], PICTURE, steps, envs, seed)
+    check_same(ours, theirs)
+
+
+@given(
+    steps=st.integers(1, 60),
+    envs=st.integers(1, 3),
+    n_steps=st.integers(2, 5),
+    seed=st.integers(0, 99),
+)
+def test_n_step_samples_are_those_of_sb3s_buffer(
+    steps: int, envs: int, n_steps: int, seed: int
+) -> None:
+    extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
+    ours = FrameReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs, **extra)
+    theirs = NStepReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs, **extra)
+    feed([ours, theirs], PICTURE, steps, envs, seed)
+    check_same(ours, theirs)
+
+
+@given(steps=st.integers(1, 60), seed=st.integers(0, 99))
+def test_dict_samples_are_those_of_sb3s_buffer(steps: int, seed: int) -> None:
+    ours = FrameReplayBuffer(40, DICT, ACTIONS, "cpu", 2)
+    theirs = DictReplayBuffer(40, DICT, ACTIONS, "cpu", 2)
+    feed([ours, theirs], DICT, steps, 2, seed)
+    check_same(ours, theirs)
+
+
+@pytest.mark.parametrize("space", [PICTURE, DICT], ids=["picture", "dict"])
+@pytest.mark.parametrize("steps", [7, 50])
+def test_what_is_kept_can_be_restored(space: spaces.Space[Any], steps: int) -> None:
+    first = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=3, gamma=0.9)
+    feed([first], space, steps, 2, 1)
+    second = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=3, gamma=0.9)
+    second.pos, second.full = first.pos, first.full
+    second.restore({name: column.copy() for name, column in first.columns().items()})
+    check_same(second, first)
+    feed([first, second], space, 30, 2, 2)
+    check_same(second, first)
+
+
+def test_a_frame_is_stored_once() -> None:
+    ours = FrameReplayBuffer(1_000, PICTURE, ACTIONS, "cpu", 1)
+    theirs = ReplayBuffer(1_000, PICTURE, ACTIONS, "cpu", 1)
+    feed([ours, theirs], PICTURE, 300, 1, 0)
+    kept = sum(part.nbytes for part in (*ours.frames.values(), *ours.finals.values()))
+    twice = theirs.observations.nbytes + theirs.next_observations.nbytes
+    assert kept < 0.6 * twice
+
+
+def test_half_a_million_depth_images_fit_in_four_gigabytes() -> None:
+    space = spaces.Box(0, 255, (1, 84, 84), np.uint8)
+    buffer = FrameReplayBuffer(500_000, space, ACTIONS, "cpu", 8)
+    arrays = [*buffer.columns().values(), *buffer.frames.values(), buffer.rewards, buffer.dones]
+    assert buffer.buffer_size * buffer.n_envs == 500_000
+    assert sum(array.nbytes for array in arrays) < 4e9
