@@ -71,7 +71,8 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    "name", ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/replay.md", "docs/sims.md"]
+    "name",
+    ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/replay.md", "docs/sims.md"],
 )
 def test_links_and_files_exist(name: str) -> None:
     page = ROOT / name
