@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,11 @@ from rosbags.highlevel import AnyReader
 
 import mcaprl
 from mcaprl.recorder.log_writer import EpisodeSummary
+from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.schema import stored_dtype
+from mcaprl.recorder.seen import moments_of_episode
 from mcaprl.recorder.spaces import observation_leaves
+from mcaprl.sims import make_sim
 from tests.conftest import need
 from tests.recordings import MIXED_SPACE, leaves_of, record
 
@@ -129,6 +133,38 @@ def test_every_value_is_ours(log: Path, read: Callable[[Path], Messages]) -> Non
         assert (np.diff(times[topic]) > 0).all(), f"log_time of {topic} does not rise"
         if topic != "/rl/episode":
             assert times[topic] == times["/rl/step"]
+
+
+@pytest.fixture(scope="module")
+def scene_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the lane sim with its scene."""
+    path = tmp_path_factory.mktemp("foreign") / "lane.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path)) as env:
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(1)
+    return path
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_markers_and_frames_pass_through(scene_log: Path, read: Callable[[Path], Messages]) -> None:
+    found = read(scene_log)
+    (episode,) = mcaprl.open(scene_log).episodes
+    moments = list(moments_of_episode(McapReader(scene_log), episode))
+    assert [time for time, _ in found["/scene"]] == episode.log_time_ns.tolist()
+    for topic, parts in (("/scene", "moving"), ("/scene/static", "static")):
+        for (_, array), moment in zip(found[topic], moments, strict=False):
+            shapes = {shape.name: shape for shape in getattr(moment, parts)}
+            markers = {_field(m, "ns"): m for m in _field(array, "markers") if _field(m, "ns")}
+            assert markers.keys() == shapes.keys()
+            for name, marker in markers.items():
+                points = [[_field(p, axis) for axis in "xyz"] for p in _field(marker, "points")]
+                assert points == shapes[name].points.tolist(), name
+                assert _field(_field(marker, "header"), "frame_id") == shapes[name].frame
+    for (_, tree), moment in zip(found["/tf"], moments, strict=True):
+        (transform,) = _field(tree, "transforms")
+        translation = _field(_field(transform, "transform"), "translation")
+        assert tuple(_field(translation, axis) for axis in "xyz") == moment.frames[0].position
 
 
 def test_streaming_gives_all_topics(log: Path) -> None:
