@@ -220,8 +220,9 @@ def test_commands(
     plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for algo in ("cql", "bc"):
-        train = ["train-offline", str(plain), "--algo", algo, "--updates", "3", "--batch-size", "4"]
+    near = ["--gamma", "0.5", "--target-interval", "1"]
+    for algo, settings in (("cql", near), ("bc", [])):
+        train = ["train-offline", str(plain), "--algo", algo, "--updates", "3", *settings]
         assert run([*train, "--out", algo]) == 0
     both = [
         "annotate",
