@@ -69,7 +69,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove]' --group dev
 	@touch $@
 
 # The libraries that we are measured against.
