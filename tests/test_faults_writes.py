@@ -84,13 +84,13 @@ def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
 
 
 def assert_all_there(path: Path, finished: int) -> None:
-    """All finished episodes come back."""
+    """All finished episodes come back, and one more if the write that failed had its chunk."""
     out = path.with_name("out.mcap")
-    if finished == 0:
-        with pytest.raises(LogError):
-            recover_log(path, out, overwrite=True)
+    try:
+        recover_log(path, out, overwrite=True)
+    except LogError:
+        assert finished == 0
         return
-    recover_log(path, out, overwrite=True)
     assert check_log(out) == []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -150,7 +150,7 @@ def test_vector_recording_on_a_full_disk(log_path: Path) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if env.episodes:
-                assert len(mcaprl.open(log_path).episodes) == env.episodes
+                assert len(mcaprl.open(log_path).episodes) >= env.episodes
 
 
 def test_file_may_not_grow(log_path: Path) -> None:
