@@ -69,7 +69,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,fast]' --group dev
 	@touch $@
 
 # The libraries that we are measured against.
@@ -78,7 +78,7 @@ $(BENCH)/.ready: $(SETTINGS)
 	$(PYTHON) -m venv $(BENCH)
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt \
-	  -e '.[sims,offline]' --group bench
+	  -e '.[sims,offline,fast]' --group bench
 	@touch $@
 
 # d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins.

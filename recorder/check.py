@@ -10,7 +10,6 @@ Each chunk is decompressed once, and looked at as a whole: a check takes as long
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,8 +17,9 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunk_check import Contradiction, check_chunk, check_statistics, place
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES
+from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, Scratch
 from mcaprl.recorder.episode_check import EpisodeCheck
 from mcaprl.recorder.mcap_reader import McapReader
 
@@ -72,10 +72,10 @@ def check_log(path: str | Path) -> list[Problem]:
 def _check_contents(reader: McapReader, *, whole: bool) -> list[Contradiction]:
     """Chunk by chunk: what stands in each, and what the log says with all of them."""
     found: list[Contradiction] = []
-    log = EpisodeCheck(reader) if whole else None
+    log, scratch = EpisodeCheck(reader) if whole else None, Scratch()
     for chunk in reader.chunks:
         try:
-            records = reader.chunk_records(chunk)
+            records = reader.chunk_records(chunk, scratch)
             found += check_chunk(reader, chunk, records)
         except CorruptLogError as error:
             found.append(Contradiction(_without_path(error, reader.path), place(reader, chunk)))
@@ -117,7 +117,7 @@ def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> lis
     ):
         return [Contradiction("the data section's end is damaged", f"byte {offset}")]
     (crc,) = struct.unpack("<I", content)
-    if crc and zlib.crc32(reader.view[:offset]) != crc:
+    if crc and crc32(reader.view[:offset]) != crc:
         where = f"bytes 0 to {offset}"
         return [Contradiction("the data section does not match its CRC", where)]
     return []
@@ -125,7 +125,7 @@ def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> lis
 
 def _is_intact(content: memoryview) -> bool:
     (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
-    return not crc or zlib.crc32(content[:-4]) == crc
+    return not crc or crc32(content[:-4]) == crc
 
 
 def _recover(path: Path) -> str:

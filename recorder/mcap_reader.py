@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 import mmap
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +24,11 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import (
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    Scratch,
     chunk_header,
     chunk_records,
     message_index,
@@ -158,27 +159,33 @@ class McapReader:
             )
         return spans
 
-    def records_of(self, span: Span) -> memoryview:
-        """The bytes that the offsets of a span's index point into.
+    def records_of(self, span: Span, scratch: Scratch | None = None) -> memoryview:
+        """The bytes that the offsets of a span's index point into; see `chunk_records`.
 
         Raises:
             CorruptLogError: the chunk is damaged.
         """
-        return self.view if span.chunk is None else self.chunk_records(span.chunk)
+        return self.view if span.chunk is None else self.chunk_records(span.chunk, scratch)
 
-    def chunk_records(self, chunk: ChunkIndex) -> memoryview:
+    def chunk_records(self, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
         """The records of a chunk, decompressed and checked against their CRC.
+
+        Args:
+            chunk: one of `chunks`.
+            scratch: where they may be decompressed to; then they are there until it is used again.
 
         Raises:
             CorruptLogError: the chunk is damaged.
         """
         start = chunk.chunk_start_offset
         last, records = self._last_chunk
-        if last != start:
-            try:
-                records = chunk_records(self.view, start)
-            except CorruptLogError as error:
-                raise CorruptLogError(f"{self.path}: {error}") from error
+        if last == start:
+            return records
+        try:
+            records = chunk_records(self.view, start, scratch)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
+        if scratch is None:
             self._last_chunk = start, records
         return records
 
@@ -224,7 +231,7 @@ class McapReader:
                 attachment = self._parse(opcode, content, offset)
                 if attachment.name == name:
                     (crc,) = struct.unpack("<I", content[-4:])
-                    if crc and zlib.crc32(content[:-4]) != crc:
+                    if crc and crc32(content[:-4]) != crc:
                         raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
                     found = bytes(attachment.data)
             if opcode == Opcode.DATA_END:
@@ -274,7 +281,7 @@ class McapReader:
         if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
             raise CorruptLogError(f"{self.path}: the footer points outside the file")
         covered = self.view[footer.summary_start : start + _FOOTER_BYTES - 4]
-        if footer.summary_crc and zlib.crc32(covered) != footer.summary_crc:
+        if footer.summary_crc and crc32(covered) != footer.summary_crc:
             raise CorruptLogError(f"{self.path}: the summary does not match its CRC")
         return footer
 
@@ -338,7 +345,7 @@ class McapReader:
         for offset, opcode, content in records_of(self.view, self.data_end):
             if opcode == Opcode.DATA_END:
                 (crc,) = struct.unpack_from("<I", content)
-                if crc and zlib.crc32(self.view[:offset]) != crc:
+                if crc and crc32(self.view[:offset]) != crc:
                     raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
             break
 

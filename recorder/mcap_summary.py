@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -22,6 +21,8 @@ from mcap.records import (
     SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
+
+from mcaprl.recorder.checksum import crc32
 
 
 @dataclass
@@ -88,7 +89,7 @@ class Summary:
         summary = builder.end()
         Footer(start, offsets_start, 0).write(builder)
         footer = builder.end()
-        crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
+        crc = crc32(footer[:-4], crc32(summary))
         return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
 
     def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:

@@ -8,7 +8,6 @@ stand outside the chunks, before what needs them, so that a cut file is still re
 from __future__ import annotations
 
 import contextlib
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, ChunkHeader, compressor
 from mcaprl.recorder.log_file import create, release, reopen
 from mcaprl.recorder.mcap_append import Standing, what_is_written
@@ -265,7 +265,7 @@ class McapWriter:
             start_time=start_time,
             end_time=end_time,
             uncompressed_bytes=len(records),
-            crc=zlib.crc32(records),
+            crc=crc32(records),
             compression=name,
             data=slice(0, len(data)),
         )
@@ -319,7 +319,7 @@ class McapWriter:
                     while rest:
                         rest = rest[self._file.write(rest) :]
                 for part in parts:
-                    self._crc = zlib.crc32(part, self._crc)
+                    self._crc = crc32(part, self._crc)
                 self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up()

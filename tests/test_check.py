@@ -15,7 +15,7 @@ from gymnasium import spaces
 from mcap.records import ChunkIndex
 
 from mcaprl.recorder.check import check_log
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER
+from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, Scratch
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import contents_of
 from mcaprl.recorder.mcap_summary import Summary
@@ -198,9 +198,9 @@ def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) ->
     read: list[int] = []
     once = McapReader.chunk_records
 
-    def count(reader: McapReader, chunk: ChunkIndex) -> memoryview:
+    def count(reader: McapReader, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
         read.append(chunk.chunk_start_offset)
-        return once(reader, chunk)
+        return once(reader, chunk, scratch)
 
     monkeypatch.setattr(McapReader, "chunk_records", count)
     assert check_log(good) == []
