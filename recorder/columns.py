@@ -210,7 +210,7 @@ class Part:
         for entry, row in zip(index, rows.tolist(), strict=True):
             for name, value in self._values(records, entry, columns).items():
                 self._check_shape(name, value, columns[name], entry)
-                # Out of its array, if it is one of no dimension: a column of objects would keep that.
+                # A text out of its array: a column of objects would keep that.
                 columns[name][row] = value[()]
 
     def _put_by_length(
