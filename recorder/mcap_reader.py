@@ -10,8 +10,6 @@ summary, because its writer was killed or is still at work, is scanned from the 
 
 from __future__ import annotations
 
-import io
-import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,12 +37,14 @@ from mcaprl.recorder.mcap_records import (
     ChunkContents,
     LooseMessages,
     contents_of,
+    map_file,
     parse_record,
     records_of,
 )
 
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.STATISTICS)
+_STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,9 @@ class McapReader:
         """Read what the summary does not tell of: everything, if there is none."""
         start, known, self.chunks = len(MCAP0_MAGIC), self.chunks, []
         for chunk in known:
-            self._read_records(start, chunk.chunk_start_offset)
+            # Mostly they stand one behind the other.
+            if start != chunk.chunk_start_offset:
+                self._read_records(start, chunk.chunk_start_offset)
             self.chunks.append(chunk)
             start = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         self._read_records(start, None)
@@ -317,7 +319,7 @@ class McapReader:
                 self._loose.add(offset, content)
             elif opcode == Opcode.DATA_END:
                 return
-            elif opcode in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
+            elif opcode in _STANDING and not self._is_told(opcode, content):
                 self._keep(self._parse(opcode, content, offset))
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
@@ -361,6 +363,13 @@ class McapReader:
         channel = self.channels.get(channel_id)
         return channel is not None and channel.schema_id in self.schemas
 
+    def _is_told(self, opcode: int, content: memoryview) -> bool:
+        """Whether the summary has this schema or channel; both records begin with an id."""
+        number = int.from_bytes(content[:2], "little")
+        return (opcode == Opcode.SCHEMA and number in self.schemas) or (
+            opcode == Opcode.CHANNEL and number in self.channels
+        )
+
     def _keep(self, record: McapRecord) -> None:
         """Note a record. What the summary says comes first: it has a CRC of its own."""
         match record:
@@ -380,19 +389,3 @@ class McapReader:
             return parse_record(opcode, content)
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
-
-
-def map_file(path: Path) -> memoryview:
-    """The bytes of a file, mapped into memory.
-
-    Raises:
-        NotMcapError: it is empty.
-        LogError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            if not file.seek(0, io.SEEK_END):
-                raise NotMcapError(f"{path} is no MCAP file: it is empty")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror}") from error

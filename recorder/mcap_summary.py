@@ -23,6 +23,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.mcap_records import chunk_index_record
 
 
 @dataclass
@@ -75,7 +76,11 @@ class Summary:
         for opcode, records in self._groups():
             group_start = builder.count
             for record in records:
-                record.write(builder)
+                # A log of short episodes has very many of these.
+                if isinstance(record, ChunkIndex):
+                    builder.write(chunk_index_record(record))
+                else:
+                    record.write(builder)
             if builder.count > group_start:
                 length = builder.count - group_start
                 groups.append(
