@@ -28,7 +28,10 @@ test: $(VENV)/.dev tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 faults: $(VENV)/.dev
-	MCAPRL_FAULTS=large OMP_NUM_THREADS=1 $(BIN)/pytest -q -s tests/test_faults_*.py
+	rm -f $(VENV)/fault-figures
+	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
+	  $(BIN)/pytest -q -s tests/test_faults_*.py
+	$(BIN)/python -m tests.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz_reader $(VENV)/fuzz \
