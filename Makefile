@@ -28,7 +28,10 @@ test: $(VENV)/.dev tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 faults: $(VENV)/.dev
-	MCAPRL_FAULTS=large OMP_NUM_THREADS=1 $(BIN)/pytest -q -s tests/test_faults_*.py
+	rm -f $(VENV)/fault-figures
+	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
+	  $(BIN)/pytest -q -s tests/test_faults_*.py
+	$(BIN)/python -m tests.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz_reader $(VENV)/fuzz \
@@ -69,7 +72,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,fast]' --group dev
 	@touch $@
 
 # The libraries that we are measured against.
@@ -78,7 +81,7 @@ $(BENCH)/.ready: $(SETTINGS)
 	$(PYTHON) -m venv $(BENCH)
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(BENCH)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt \
-	  -e '.[sims,offline]' --group bench
+	  -e '.[sims,offline,fast]' --group bench
 	@touch $@
 
 # d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins.

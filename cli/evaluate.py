@@ -45,6 +45,11 @@ RESULT_NAME = "evaluation.json"
     type=click.IntRange(1),
     help="With --data: gradient steps of the model.  [default: 10000]",
 )
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    help="With --data: that read chunks at a time. [default: 1]",
+)
 @click.option("--behavior", metavar="DATA", help="Compare with the returns in these logs.")
 @click.option("--record", "record_path", type=click.Path(path_type=Path), help="Log the episodes.")
 @click.option("--report", type=click.Path(path_type=Path), help="Folder for a page and more.")
@@ -66,7 +71,7 @@ def evaluate(
     """
     if (sim is None) == (data is None):
         raise UsageError("evaluate needs --sim SIM or --data DATA, one of the two")
-    of_data = {name: others.pop(name) for name in ("gamma", "epsilon", "updates")}
+    of_data = {name: others.pop(name) for name in ("gamma", "epsilon", "updates", "threads")}
     _refuse_unused(of_data if data is None else others, "data" if data is None else "sim")
     if data is not None:
         given = {name: value for name, value in of_data.items() if value is not None}

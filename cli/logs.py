@@ -84,7 +84,14 @@ def info(
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
-def check(files: tuple[str, ...], as_json: bool) -> int:
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="That decompress chunks at a time.",
+)
+def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
     """Read every byte of FILE... and tell what is wrong. Exits with 1 if anything is."""
     paths, problems = [], []
     for name in files:
@@ -97,7 +104,7 @@ def check(files: tuple[str, ...], as_json: bool) -> int:
                 click.echo(f"mcaprl: {error}", err=True)
             continue
         paths += found
-        problems += [problem for path in found for problem in check_log(path)]
+        problems += [problem for path in found for problem in check_log(path, threads=threads)]
     if as_json:
         print_json({"ok": not problems, "problems": [asdict(problem) for problem in problems]})
     else:

@@ -29,6 +29,7 @@ def evaluate_from_log(
     epsilon: float = 0.0,
     updates: int = 10_000,
     seed: int,
+    threads: int = 1,
 ) -> dict[str, Any]:
     """Ask every estimator about every policy.
 
@@ -39,6 +40,7 @@ def evaluate_from_log(
         epsilon: probability with which the policies are to act at random.
         updates: of the model behind FQE, DR and WDR.
         seed: of the model and the resampling.
+        threads: that read the logs.
 
     Returns:
         What `--json` prints.
@@ -47,7 +49,7 @@ def evaluate_from_log(
     from mcaprl.offline.off_policy import OffPolicyEvaluator, inverse_probability
     from mcaprl.offline.ranking import ranking
 
-    dataset = open_logs(data)
+    dataset = open_logs(data, threads=threads)
     policies = _policies(names, dataset)
     config = replace(FQEConfig(), gamma=gamma, updates=updates)
     evaluator = OffPolicyEvaluator(dataset, config, seed)

@@ -41,7 +41,7 @@ class _TrainCommand(click.Command):
     default=1,
     show_default=True,
     type=click.IntRange(1),
-    help="Of torch; more than one pays only with big batches on an idle machine.",
+    help="Of torch, and to read with; more than one pays with big batches on an idle machine.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Learn from logs that are still being written, too.")
@@ -87,7 +87,7 @@ def train_offline(
     check_settings(algo, defaults, given)
     config = type(defaults)(**given)
     growing = GrowingLogs(data) if follow else None
-    dataset, weights = (growing.dataset, None) if growing else open_weighted(data)
+    dataset, weights = (growing.dataset, None) if growing else open_weighted(data, threads=threads)
     click.echo(
         f"{algo} learns from {len(dataset.episodes)} episodes, {len(dataset)} transitions,"
         f" mean return {dataset.statistics.mean_return:.2f}"

@@ -13,10 +13,11 @@ from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.reader import find_logs, open_logs
 
 
-def open_weighted(data: Sequence[str]) -> tuple[Dataset, NDArray[np.float64]]:
+def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
     """Read logs, each a file, folder or glob, with `:WEIGHT` behind it or without.
 
     A transition of weight 2 is drawn twice as often as one of weight 1, which is the default.
+    `threads` read chunks at a time.
 
     Returns:
         All logs as one dataset, and the weight of each of its episodes.
@@ -35,7 +36,7 @@ def open_weighted(data: Sequence[str]) -> tuple[Dataset, NDArray[np.float64]]:
                     f"{path} is meant twice, with weights {weights[path.resolve()]:g} and"
                     f" {weight:g}: name it once"
                 )
-    parts = [open_logs(path) for path in weights]
+    parts = [open_logs(path, threads=threads) for path in weights]
     pairs = zip(parts, weights.values(), strict=True)
     each = [np.full(len(part.episodes), weight) for part, weight in pairs]
     return Dataset.concatenate(parts), np.concatenate(each)

@@ -10,16 +10,22 @@ Each chunk is decompressed once, and looked at as a whole: a check takes as long
 from __future__ import annotations
 
 import struct
-import zlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunk_check import Contradiction, check_chunk, check_statistics, place
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES
+from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, Scratch
 from mcaprl.recorder.episode_check import EpisodeCheck
 from mcaprl.recorder.mcap_reader import McapReader
 
@@ -45,11 +51,12 @@ class Problem:
         return f"{self.file}: {self.what} ({self.where}); {self.next}"
 
 
-def check_log(path: str | Path) -> list[Problem]:
+def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
     """Check one log: structure, CRCs, indexes against contents, episodes, metadata.
 
     Args:
         path: of the file.
+        threads: that decompress chunks at a time.
 
     Returns:
         What is wrong with it, in the order of the file; empty if nothing is.
@@ -63,19 +70,19 @@ def check_log(path: str | Path) -> list[Problem]:
         return [Problem(str(path), _without_path(error, path), "opening the file", what_next)]
     found = [*_check_file(reader)]
     try:
-        found += _check_contents(reader, whole=not found)
+        found += _check_contents(reader, whole=not found, threads=threads)
     except (LogError, SpaceError) as error:
         found.append(Contradiction(_without_path(error, path), "/rl/step"))
     return [Problem(str(path), told.what, told.where, _recover(path)) for told in found]
 
 
-def _check_contents(reader: McapReader, *, whole: bool) -> list[Contradiction]:
+def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Contradiction]:
     """Chunk by chunk: what stands in each, and what the log says with all of them."""
     found: list[Contradiction] = []
     log = EpisodeCheck(reader) if whole else None
-    for chunk in reader.chunks:
+    for chunk, read in _decompressed(reader, threads):
         try:
-            records = reader.chunk_records(chunk)
+            records = read()
             found += check_chunk(reader, chunk, records)
         except CorruptLogError as error:
             found.append(Contradiction(_without_path(error, reader.path), place(reader, chunk)))
@@ -85,6 +92,27 @@ def _check_contents(reader: McapReader, *, whole: bool) -> list[Contradiction]:
     if log is not None and not found:
         found += [*check_statistics(reader), *log.finish()]
     return found
+
+
+def _decompressed(
+    reader: McapReader, threads: int
+) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
+    """Yield each chunk with what gives its records, which are there until the next one's are."""
+    if threads == 1:
+        scratch = Scratch()
+        for chunk in reader.chunks:
+            yield chunk, partial(reader.chunk_records, chunk, scratch)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        chunks, ahead = iter(reader.chunks), deque[tuple[ChunkIndex, Future[memoryview]]]()
+        # One for each thread, and one at hand: memory does not grow with the file.
+        while True:
+            for chunk in islice(chunks, threads + 1 - len(ahead)):
+                ahead.append((chunk, pool.submit(reader.chunk_records, chunk, Scratch())))
+            if not ahead:
+                return
+            chunk, future = ahead.popleft()
+            yield chunk, future.result
 
 
 def _check_file(reader: McapReader) -> list[Contradiction]:
@@ -117,7 +145,7 @@ def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> lis
     ):
         return [Contradiction("the data section's end is damaged", f"byte {offset}")]
     (crc,) = struct.unpack("<I", content)
-    if crc and zlib.crc32(reader.view[:offset]) != crc:
+    if crc and crc32(reader.view[:offset]) != crc:
         where = f"bytes 0 to {offset}"
         return [Contradiction("the data section does not match its CRC", where)]
     return []
@@ -125,7 +153,7 @@ def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> lis
 
 def _is_intact(content: memoryview) -> bool:
     (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
-    return not crc or zlib.crc32(content[:-4]) == crc
+    return not crc or crc32(content[:-4]) == crc
 
 
 def _recover(path: Path) -> str:

@@ -6,21 +6,27 @@ them; the rest are decoded one by one. Which way a message went cannot be seen i
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.records import Channel
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.cdr import Layout, MessageType, message_type
-from mcaprl.recorder.chunks import MESSAGE_HEADER, RECORD_HEADER_BYTES, gather, record_dtype
+from mcaprl.recorder.chunks import (
+    MESSAGE_HEADER,
+    Scratch,
+    are_messages,
+    gather,
+    record_dtype,
+)
+from mcaprl.recorder.joined import Chosen, Rows, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader, Span
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
@@ -30,7 +36,6 @@ _LAST_NS = np.iinfo(np.int64).max
 Columns = dict[str, NDArray[Any]]
 """Arrays of one length, by field name; texts are arrays of `str` objects."""
 LOG_TIME = "log_time"
-Rows = slice | NDArray[np.int64]
 
 
 class Topic:
@@ -121,21 +126,33 @@ class Topic:
             CorruptLogError: a chunk is damaged, or a message does not fit its type.
             LogError: a field has not the same shape in all messages.
         """
-        order = np.arange(len(self)) if order is None else order
-        parts = list(self._chosen(order))
+        parts = list(self._all() if order is None else self._chosen(order))
         if not parts:
             return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
-        columns = parts[0].part.empty_columns(wanted, len(order))
-        times = np.empty(len(order), np.int64)
+        columns = parts[0].part.empty_columns(wanted, len(self) if order is None else len(order))
+        local = threading.local()
 
-        def fill(chosen: _Chosen) -> None:
-            times[chosen.rows] = chosen.index["log_time"]
-            chosen.part.fill(columns, chosen.index, chosen.rows)
+        def fill(together: list[Chosen]) -> None:
+            if not hasattr(local, "scratch"):
+                local.scratch = Scratch()
+            scratch, part = local.scratch, together[0].part
+            joint = join(self._reader, together, scratch) if len(together) > 1 else None
+            if joint is not None:
+                records, index, rows = joint
+                part.fill(columns, records, index, rows)
+                return
+            for one in together:
+                records = self._reader.records_of(one.part.span, scratch)
+                one.part.fill(columns, records, one.index, one.rows)
 
-        _for_each(fill, parts, threads)
-        return {LOG_TIME: times, **columns}
+        _for_each(fill, list(neighbors(parts)), threads)
+        return {LOG_TIME: self.times if order is None else _times_of(parts, len(order)), **columns}
 
-    def _chosen(self, order: NDArray[np.int64]) -> Iterator[_Chosen]:
+    def _all(self) -> Iterator[Chosen]:
+        for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
+            yield Chosen(part, part.span.index, slice(stop - count, stop))
+
+    def _chosen(self, order: NDArray[np.int64]) -> Iterator[Chosen]:
         """The parts with messages that are wanted, and where those go."""
         is_rising = len(order) < 2 or bool((order[1:] > order[:-1]).all())
         by_place = None if is_rising else np.argsort(order, kind="stable")
@@ -147,16 +164,7 @@ class Topic:
             index = part.span.index
             if high - low < len(index):
                 index = index[places[low:high] - (stop - len(index))]
-            yield _Chosen(part, index, slice(low, high) if by_place is None else by_place[low:high])
-
-
-@dataclass(frozen=True)
-class _Chosen:
-    """Messages of a part, and their rows in the columns."""
-
-    part: Part
-    index: NDArray[Any]
-    rows: Rows
+            yield Chosen(part, index, slice(low, high) if by_place is None else by_place[low:high])
 
 
 class Part:
@@ -192,9 +200,8 @@ class Part:
             name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
         }
 
-    def fill(self, columns: Columns, index: NDArray[Any], rows: Rows) -> None:
-        """Put the messages of an index into rows of the columns."""
-        records = self._reader.records_of(self.span)
+    def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
+        """Put copies of the messages that an index points at into rows of the columns."""
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -203,7 +210,8 @@ class Part:
         for entry, row in zip(index, rows.tolist(), strict=True):
             for name, value in self._values(records, entry, columns).items():
                 self._check_shape(name, value, columns[name], entry)
-                columns[name][row] = value
+                # A text out of its array: a column of objects would keep that.
+                columns[name][row] = value[()]
 
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
@@ -229,7 +237,10 @@ class Part:
         if any(found[name].shape[1:] != column.shape[1:] for name, column in columns.items()):
             return False
         for name, column in columns.items():
-            column[rows] = self._texts(found[name]) if column.dtype.kind == "O" else found[name]
+            if column.dtype.kind == "O":
+                column[rows] = self._texts(found[name])
+            else:
+                _put(column, rows, found[name])
         return True
 
     def alike(
@@ -243,17 +254,16 @@ class Part:
         self, records: memoryview, index: NDArray[Any], layout: Layout
     ) -> NDArray[Any] | None:
         dtype = record_dtype(layout.dtype)
-        if int(index["offset"].max()) > len(records) - dtype.itemsize:
+        try:
+            rows = gather(records, index, dtype)
+        except CorruptLogError:
+            # The last ones may be shorter than this form.
             return None
-        rows = gather(records, index, dtype)
-        heads_fit = (
-            (rows["opcode"] == Opcode.MESSAGE).all()
-            and (rows["length"] == dtype.itemsize - RECORD_HEADER_BYTES).all()
-            and (rows["channel_id"] == self.channel.id).all()
-            and (rows["log_time"] == index["log_time"]).all()
+        are_told = are_messages(rows, self.channel.id) and bool(
+            (rows["log_time"] == index["log_time"]).all()
         )
         payloads: NDArray[Any] = rows["payload"]
-        return payloads if heads_fit and layout.fits(payloads) else None
+        return payloads if are_told and layout.fits(payloads) else None
 
     def _message(self, records: memoryview, entry: Any) -> bytes:
         return self._reader.message(
@@ -274,6 +284,9 @@ class Part:
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
+            # Often all are the same.
+            if (values == values[0]).all():
+                return [bytes(values[0]).decode()] * len(values)
             return [text.decode() for text in values.tolist()]
         except UnicodeDecodeError as error:
             raise CorruptLogError(
@@ -290,6 +303,21 @@ class Part:
             )
 
 
+def _times_of(parts: list[Chosen], count: int) -> NDArray[np.int64]:
+    times = np.empty(count, np.int64)
+    for chosen in parts:
+        times[chosen.rows] = chosen.index["log_time"]
+    return times
+
+
+def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
+    """Set rows of a column. Vectors are moved as a whole, not number by number."""
+    if values.ndim == 2 and values.size and values.dtype == column.dtype:
+        row = np.dtype((np.void, values.shape[1] * values.itemsize))
+        column, values = column.view(row)[:, 0], values.view(row)[:, 0]
+    column[rows] = values
+
+
 def _type_of(reader: McapReader, channel: Channel) -> MessageType:
     if channel.message_encoding != "cdr":
         raise LogError(
@@ -303,7 +331,7 @@ def _type_of(reader: McapReader, channel: Channel) -> MessageType:
         raise LogError(f"{reader.path}: {channel.topic}: {error}") from error
 
 
-def _for_each(do: Callable[[_Chosen], None], parts: list[_Chosen], threads: int) -> None:
+def _for_each(do: Callable[[list[Chosen]], None], parts: list[list[Chosen]], threads: int) -> None:
     """Call for each part, `threads` at a time; the first error ends it."""
     if threads <= 1 or len(parts) == 1:
         for part in parts:

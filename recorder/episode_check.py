@@ -182,6 +182,8 @@ def _check_return(episode: Episode) -> Iterator[Contradiction]:
 
 
 def _is_image(found: NDArray[Any], leaf: Leaf) -> bool:
+    if not set(_IMAGE_FIELDS) <= set(found.dtype.names or ()):
+        return False
     height, width = leaf.shape[:2]
     encoding = (leaf.encoding or "").encode()
     expected = (height, width, encoding, leaf.size // height)

@@ -100,8 +100,11 @@ def told_episodes(topic: Topic, ends: NDArray[np.int64]) -> list[EpisodeSummary]
     columns = topic.read(names, rows)
     columns["terminated"] = columns["terminated"].astype(bool)
     columns["truncated"] = columns["truncated"].astype(bool)
-    values = zip(*(columns[name].tolist() for name in names), strict=True)
-    return [EpisodeSummary.from_fields(dict(zip(names, row, strict=True))) for row in values]
+    values = {name: columns[name].tolist() for name in names}
+    if "seed" in values:
+        values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
+    rows_ = zip(*values.values(), strict=True)
+    return [EpisodeSummary(**dict(zip(names, row, strict=True))) for row in rows_]
 
 
 def summaries(
@@ -116,8 +119,9 @@ def summaries(
     by_end = {summary.end_time_ns: summary for summary in told}
     found = []
     finals = np.cumsum(lengths + 1) - 1
-    for final, length in zip(finals.tolist(), lengths.tolist(), strict=True):
-        summary = by_end.get(int(columns["log_time"][final]))
+    ends = columns["log_time"][finals].tolist()
+    for end, final, length in zip(ends, finals.tolist(), lengths.tolist(), strict=True):
+        summary = by_end.get(end)
         if summary is None:
             summary = _summary_of_records(columns, final, length)
         elif summary.length != length:

@@ -40,7 +40,6 @@ whole episodes, and episodes and times go on from one to the next.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,12 +113,6 @@ class EpisodeSummary:
         """As `mcaprl_msgs/msg/Episode`."""
         fields = {**vars(self), "seed": -1 if self.seed is None else self.seed}
         return messages.new(messages.EPISODE_TYPE, **fields)
-
-    @classmethod
-    def from_fields(cls, fields: Mapping[str, Any]) -> EpisodeSummary:
-        """From the fields of a `mcaprl_msgs/msg/Episode`."""
-        seed = fields.get("seed", -1)
-        return cls(**{**fields, "seed": None if seed < 0 else seed})
 
 
 class LogWriter:

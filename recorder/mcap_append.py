@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import RECORD_HEADER_BYTES
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import parse_record
@@ -51,9 +51,7 @@ def what_is_written(path: Path) -> Written:
         if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
             raise CorruptLogError("its writer did not finish it")
         (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
-        written = Written(
-            Summary(chunks=list(reader.chunks)), end, crc or zlib.crc32(reader.view[:end])
-        )
+        written = Written(Summary(chunks=list(reader.chunks)), end, crc or crc32(reader.view[:end]))
         _take_topics(reader, written)
         _take_other_records(reader, written)
     except CorruptLogError as error:

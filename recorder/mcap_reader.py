@@ -10,10 +10,7 @@ summary, because its writer was killed or is still at work, is scanned from the 
 
 from __future__ import annotations
 
-import io
-import mmap
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +22,11 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import (
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    Scratch,
     chunk_header,
     chunk_records,
     message_index,
@@ -38,12 +37,14 @@ from mcaprl.recorder.mcap_records import (
     ChunkContents,
     LooseMessages,
     contents_of,
+    map_file,
     parse_record,
     records_of,
 )
 
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.STATISTICS)
+_STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
 @dataclass(frozen=True)
@@ -158,27 +159,33 @@ class McapReader:
             )
         return spans
 
-    def records_of(self, span: Span) -> memoryview:
-        """The bytes that the offsets of a span's index point into.
+    def records_of(self, span: Span, scratch: Scratch | None = None) -> memoryview:
+        """The bytes that the offsets of a span's index point into; see `chunk_records`.
 
         Raises:
             CorruptLogError: the chunk is damaged.
         """
-        return self.view if span.chunk is None else self.chunk_records(span.chunk)
+        return self.view if span.chunk is None else self.chunk_records(span.chunk, scratch)
 
-    def chunk_records(self, chunk: ChunkIndex) -> memoryview:
+    def chunk_records(self, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
         """The records of a chunk, decompressed and checked against their CRC.
+
+        Args:
+            chunk: one of `chunks`.
+            scratch: where they may be decompressed to; then they are there until it is used again.
 
         Raises:
             CorruptLogError: the chunk is damaged.
         """
         start = chunk.chunk_start_offset
         last, records = self._last_chunk
-        if last != start:
-            try:
-                records = chunk_records(self.view, start)
-            except CorruptLogError as error:
-                raise CorruptLogError(f"{self.path}: {error}") from error
+        if last == start:
+            return records
+        try:
+            records = chunk_records(self.view, start, scratch)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
+        if scratch is None:
             self._last_chunk = start, records
         return records
 
@@ -224,7 +231,7 @@ class McapReader:
                 attachment = self._parse(opcode, content, offset)
                 if attachment.name == name:
                     (crc,) = struct.unpack("<I", content[-4:])
-                    if crc and zlib.crc32(content[:-4]) != crc:
+                    if crc and crc32(content[:-4]) != crc:
                         raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
                     found = bytes(attachment.data)
             if opcode == Opcode.DATA_END:
@@ -274,7 +281,7 @@ class McapReader:
         if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
             raise CorruptLogError(f"{self.path}: the footer points outside the file")
         covered = self.view[footer.summary_start : start + _FOOTER_BYTES - 4]
-        if footer.summary_crc and zlib.crc32(covered) != footer.summary_crc:
+        if footer.summary_crc and crc32(covered) != footer.summary_crc:
             raise CorruptLogError(f"{self.path}: the summary does not match its CRC")
         return footer
 
@@ -288,7 +295,9 @@ class McapReader:
         """Read what the summary does not tell of: everything, if there is none."""
         start, known, self.chunks = len(MCAP0_MAGIC), self.chunks, []
         for chunk in known:
-            self._read_records(start, chunk.chunk_start_offset)
+            # Mostly they stand one behind the other.
+            if start != chunk.chunk_start_offset:
+                self._read_records(start, chunk.chunk_start_offset)
             self.chunks.append(chunk)
             start = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         self._read_records(start, None)
@@ -310,7 +319,7 @@ class McapReader:
                 self._loose.add(offset, content)
             elif opcode == Opcode.DATA_END:
                 return
-            elif opcode in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
+            elif opcode in _STANDING and not self._is_told(opcode, content):
                 self._keep(self._parse(opcode, content, offset))
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
@@ -338,7 +347,7 @@ class McapReader:
         for offset, opcode, content in records_of(self.view, self.data_end):
             if opcode == Opcode.DATA_END:
                 (crc,) = struct.unpack_from("<I", content)
-                if crc and zlib.crc32(self.view[:offset]) != crc:
+                if crc and crc32(self.view[:offset]) != crc:
                     raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
             break
 
@@ -353,6 +362,13 @@ class McapReader:
     def _is_known(self, channel_id: int) -> bool:
         channel = self.channels.get(channel_id)
         return channel is not None and channel.schema_id in self.schemas
+
+    def _is_told(self, opcode: int, content: memoryview) -> bool:
+        """Whether the summary has this schema or channel; both records begin with an id."""
+        number = int.from_bytes(content[:2], "little")
+        return (opcode == Opcode.SCHEMA and number in self.schemas) or (
+            opcode == Opcode.CHANNEL and number in self.channels
+        )
 
     def _keep(self, record: McapRecord) -> None:
         """Note a record. What the summary says comes first: it has a CRC of its own."""
@@ -373,19 +389,3 @@ class McapReader:
             return parse_record(opcode, content)
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
-
-
-def map_file(path: Path) -> memoryview:
-    """The bytes of a file, mapped into memory.
-
-    Raises:
-        NotMcapError: it is empty.
-        LogError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            if not file.seek(0, io.SEEK_END):
-                raise NotMcapError(f"{path} is no MCAP file: it is empty")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -22,6 +21,9 @@ from mcap.records import (
     SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
+
+from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.mcap_records import chunk_index_record
 
 
 @dataclass
@@ -74,7 +76,11 @@ class Summary:
         for opcode, records in self._groups():
             group_start = builder.count
             for record in records:
-                record.write(builder)
+                # A log of short episodes has very many of these.
+                if isinstance(record, ChunkIndex):
+                    builder.write(chunk_index_record(record))
+                else:
+                    record.write(builder)
             if builder.count > group_start:
                 length = builder.count - group_start
                 groups.append(
@@ -88,7 +94,7 @@ class Summary:
         summary = builder.end()
         Footer(start, offsets_start, 0).write(builder)
         footer = builder.end()
-        crc = zlib.crc32(footer[:-4], zlib.crc32(summary))
+        crc = crc32(footer[:-4], crc32(summary))
         return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
 
     def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:

@@ -8,14 +8,12 @@ stand outside the chunks, before what needs them, so that a cut file is still re
 from __future__ import annotations
 
 import contextlib
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Channel,
@@ -23,7 +21,6 @@ from mcap.records import (
     DataEnd,
     Header,
     McapRecord,
-    Message,
     Metadata,
     Schema,
 )
@@ -32,7 +29,15 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MAX_CHUNK_BYTES, ChunkHeader, compressor
+from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.chunks import (
+    INDEX_ENTRY,
+    MAX_CHUNK_BYTES,
+    ChunkHeader,
+    compressor,
+    message_index_head,
+    message_record,
+)
 from mcaprl.recorder.log_file import create, release, reopen
 from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
@@ -192,14 +197,13 @@ class McapWriter:
         """
         if not messages:
             return
-        builder = RecordBuilder()
+        records = bytearray()
         entries: dict[int, list[tuple[int, int]]] = {}
         for channel_id, time_ns, data in messages:
-            entries.setdefault(channel_id, []).append((time_ns, builder.count))
-            sequence = int(self._next_sequences(channel_id, 1)[0])
-            Message(channel_id, time_ns, data, time_ns, sequence).write(builder)
+            entries.setdefault(channel_id, []).append((time_ns, len(records)))
+            records += message_record(channel_id, self._next_sequence(channel_id), time_ns, data)
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
-        self._write_chunk(memoryview(builder.end()), indexes, self._compress_messages)
+        self._write_chunk(memoryview(records), indexes, self._compress_messages)
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
         """Write a chunk's records as they are.
@@ -265,20 +269,21 @@ class McapWriter:
             start_time=start_time,
             end_time=end_time,
             uncompressed_bytes=len(records),
-            crc=zlib.crc32(records),
+            crc=crc32(records),
             compression=name,
             data=slice(0, len(data)),
         )
         # The records go to the file as they are: a copy of them would cost as much as the rest.
         head = header.to_record()
         offset, chunk_bytes = self.position, len(head) + len(data)
-        index_offsets, builder = {}, RecordBuilder()
+        index_offsets, index_bytes = {}, 0
+        index_parts: list[bytes | memoryview] = []
         for channel_id, index in indexes.items():
-            index_offsets[channel_id] = offset + chunk_bytes + builder.count
-            _write_message_index(builder, channel_id, index)
-        index_bytes = builder.count
+            index_offsets[channel_id] = offset + chunk_bytes + index_bytes
+            index_parts += [message_index_head(channel_id, index), index.view(np.uint8).data]
+            index_bytes += len(index_parts[-2]) + len(index_parts[-1])
         with HoldSignals():
-            self._write(head, data, builder.end())
+            self._write(head, data, *index_parts)
             self._summary.chunks.append(
                 ChunkIndex(
                     chunk_start_offset=offset,
@@ -292,6 +297,11 @@ class McapWriter:
                     message_index_length=index_bytes,
                 )
             )
+
+    def _next_sequence(self, channel_id: int) -> int:
+        number = self._summary.counts[channel_id]
+        self._summary.counts[channel_id] += 1
+        return number % 2**32
 
     def _next_sequences(self, channel_id: int, count: int) -> NDArray[np.uint32]:
         first = self._summary.counts[channel_id]
@@ -308,7 +318,7 @@ class McapWriter:
         record.write(builder)
         self._write(builder.end())
 
-    def _write(self, *parts: bytes) -> None:
+    def _write(self, *parts: bytes | memoryview) -> None:
         """Write all of it or none: what stands in the file stays a whole number of records."""
         try:
             with HoldSignals():
@@ -319,7 +329,7 @@ class McapWriter:
                     while rest:
                         rest = rest[self._file.write(rest) :]
                 for part in parts:
-                    self._crc = zlib.crc32(part, self._crc)
+                    self._crc = crc32(part, self._crc)
                 self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up()
@@ -333,12 +343,3 @@ class McapWriter:
         with contextlib.suppress(OSError):
             self._file.truncate(self.position)
         self.abandon()
-
-
-def _write_message_index(builder: RecordBuilder, channel_id: int, index: NDArray[Any]) -> None:
-    """A MessageIndex record from an array; the library's own takes a list of tuples."""
-    builder.start_record(Opcode.MESSAGE_INDEX)
-    builder.write2(channel_id)
-    builder.write4(index.nbytes)
-    builder.write(index.tobytes())
-    builder.finish_record()

@@ -21,8 +21,8 @@ from mcaprl.errors import LogError, NoEpisodesError, OutputExistsError, UsageErr
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.chunks import chunk_header
 from mcaprl.recorder.log_file import refuse_if_taken
-from mcaprl.recorder.mcap_reader import McapReader, map_file
-from mcaprl.recorder.mcap_records import parse_record
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import map_file, parse_record
 from mcaprl.recorder.mcap_writer import McapWriter
 from mcaprl.recorder.salvage import Damage, SoundRecord, sound_records
 from mcaprl.recorder.sound_copy import copy_records

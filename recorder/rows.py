@@ -13,6 +13,7 @@ import math
 import warnings
 from array import array
 from collections.abc import Callable, Mapping
+from io import BytesIO
 from typing import Any
 
 import numpy as np
@@ -36,32 +37,44 @@ Converter = Callable[[Any], NDArray[Any]]
 class Arrays:
     """Arrays of one dtype and size that wait, as bytes."""
 
-    def __init__(self, dtype: np.dtype[Any]) -> None:
-        """Begin with none."""
-        self._dtype = dtype
-        self._waiting: list[bytes] = []
-        self.append = self._waiting.append
+    def __init__(self, dtype: np.dtype[Any], size: int) -> None:
+        """Begin with none; `size` is the numbers in each."""
+        self._dtype, self._bytes_each = dtype, dtype.itemsize * size
+        self._waiting = BytesIO()
+
+    def append(self, value: NDArray[Any]) -> None:
+        """Keep a copy of an array of so many bytes."""
+        self._waiting.write(value.tobytes())
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps values of a leaf."""
         append, shape, dtype = self.append, leaf.shape, leaf.dtype
+        take: Callable[[Any], object] = self._waiting.write
 
         def keep(value: Any) -> None:
             if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
-                append(value.tobytes())
+                try:
+                    take(value)
+                except ValueError:
+                    # It does not lie in memory as C has it.
+                    append(value)
             else:
-                append(as_declared(value, leaf).tobytes())
+                append(as_declared(value, leaf))
 
         return keep
 
     def put(self, column: NDArray[Any]) -> None:
         """Put the first values into a column; they stay."""
-        joined = b"".join(self._waiting[: len(column)])
-        column[:] = np.frombuffer(joined, self._dtype).reshape(column.shape)
+        if len(column):
+            waiting = np.frombuffer(self._waiting.getbuffer(), self._dtype, column.size)
+            column[:] = waiting.reshape(column.shape)
 
     def forget(self, count: int | None = None) -> None:
         """Drop the first values, or all."""
-        del self._waiting[:count]
+        rest = b"" if count is None else self._waiting.getvalue()[count * self._bytes_each :]
+        self._waiting.seek(0)
+        self._waiting.truncate()
+        self._waiting.write(rest)
 
 
 class Integers:
@@ -98,7 +111,7 @@ class StepColumns:
     Attributes:
         keep_action: keeps an action.
         keep_behavior_prob: keeps its probability.
-        keep_reward: keeps what it brought.
+        keep_reward: keeps what it brought, a number of any type.
     """
 
     def __init__(self, log: LogWriter) -> None:
@@ -110,12 +123,14 @@ class StepColumns:
         self._rewards, self._probs = array("d"), array("d")
         self._waiting: dict[str, Arrays | Integers] = {}
         self.keep_action = self.keeper(log.action)
-        self.keep_behavior_prob, self.keep_reward = self._probs.append, self._rewards.append
+        self.keep_behavior_prob: Keeper = self._probs.append
+        self.keep_reward: Keeper = self._rewards.append
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps values of a leaf."""
         is_integer = leaf.shape == () and leaf.dtype == np.int64
-        waiting = self._waiting[leaf.name] = Integers() if is_integer else Arrays(leaf.dtype)
+        waiting = Integers() if is_integer else Arrays(leaf.dtype, leaf.size)
+        self._waiting[leaf.name] = waiting
         return waiting.keeper(leaf)
 
     def begin(self, episode: int, start_ns: int, step_ns: int) -> None:
@@ -196,7 +211,7 @@ class ImageColumn:
         assert encoding is not None, f"{topic} has no images"
         self._log = log
         self._rows = log.add_image_topic(topic, shape, encoding)
-        self._pictures = Arrays(np.dtype(np.uint8))
+        self._pictures = Arrays(np.dtype(np.uint8), self._rows.dtype["payload"]["data"].itemsize)
         self._first_step = 0
 
     def keeper(self, leaf: Leaf) -> Keeper:
@@ -215,7 +230,7 @@ class ImageColumn:
 
     def keep(self, picture: NDArray[Any]) -> None:
         """Keep the next step's picture, of any dtype with as many bytes."""
-        self._pictures.append(picture.tobytes())
+        self._pictures.append(picture)
 
     def flush(self, stop: int) -> None:
         """Write all pictures before step `stop`."""

@@ -9,7 +9,6 @@ would have written it; whether a chunk's contents are whole, its CRC tells whoev
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +20,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.mcap_records import RECORD_HEADER, parse_record, records_of
 
@@ -94,7 +94,7 @@ def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
     """
     (crc,) = struct.unpack("<I", content)
     if crc:
-        return bool(zlib.crc32(view[:offset]) == crc)
+        return bool(crc32(view[:offset]) == crc)
     return _next_chunk(view, offset) == len(view)
 
 
@@ -198,7 +198,7 @@ def intact_summary(view: memoryview) -> list[Any]:
     summary_start, _, crc = struct.unpack_from("<QQI", view, start + RECORD_HEADER_BYTES)
     if not len(MCAP0_MAGIC) <= summary_start <= start:
         return []
-    if not crc or zlib.crc32(view[summary_start : end - 4]) != crc:
+    if not crc or crc32(view[summary_start : end - 4]) != crc:
         return []
     return [
         parse_record(opcode, content)

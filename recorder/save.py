@@ -52,7 +52,10 @@ def save_log(
     try:
         _write_images(log, columns)
         log.write_episodes(
-            [dataclasses.replace(episode, episode=k) for k, episode in enumerate(columns.episodes)]
+            [
+                episode if episode.episode == k else dataclasses.replace(episode, episode=k)
+                for k, episode in enumerate(columns.episodes)
+            ]
         )
         _write_steps(log, columns)
         log.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +10,8 @@ from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, chunk_records
+from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, Scratch, chunk_records
 from mcaprl.recorder.log_writer import STEP_TOPIC
 from mcaprl.recorder.mcap_records import contents_of, parse_record
 from mcaprl.recorder.mcap_writer import McapWriter
@@ -113,7 +113,7 @@ class _Copy:
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
         self._seen: set[tuple[int, int]] = set()
-        self._loose = bytearray()
+        self._loose, self._scratch = bytearray(), Scratch()
 
     def take(self, offset: int, opcode: int, content: memoryview) -> None:
         """Write what a record carries."""
@@ -135,11 +135,11 @@ class _Copy:
 
     def _take_chunk(self, offset: int, size: int) -> None:
         try:
-            records = chunk_records(self._view, offset)
+            records = chunk_records(self._view, offset, self._scratch)
         except CorruptLogError as error:
             self._damages.append(Damage(offset, size, str(error)))
             return
-        key = (zlib.crc32(records), len(records))
+        key = (crc32(records), len(records))
         if key in self._seen:
             self._damages.append(Damage(offset, size, "a chunk for the second time"))
             return

@@ -118,7 +118,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     """
     steps = Topic(reader, STEP_TOPIC)
     if not len(steps):
-        return EpisodePlan() if METADATA_NAME in reader.metadata else None
+        return EpisodePlan() if _is_log(reader) else None
     missing = [name for name in _FIELDS if name not in steps.fields]
     if missing and METADATA_NAME in reader.metadata:
         raise CorruptLogError(f"{STEP_TOPIC} has no field {', '.join(missing)}")
@@ -232,6 +232,12 @@ def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> It
         begins, last = bool(steps[start] == 0), start + length - 1
         is_whole = begins and stop - start == length > 1 and bool(columns["final"][last])
         yield _Run(start, last, stop - start, begins, is_whole)
+
+
+def _is_log(reader: McapReader) -> bool:
+    """Whether a file is, or was, a log: its metadata may be lost, and what tells of steps, too."""
+    topics = {channel.topic for channel in reader.channels.values()}
+    return METADATA_NAME in reader.metadata or not topics.isdisjoint((STEP_TOPIC, EPISODE_TOPIC))
 
 
 def _schemas(reader: McapReader) -> list[Schema]:

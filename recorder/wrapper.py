@@ -22,6 +22,8 @@ from mcaprl.recorder.recording import OpenEpisode, Recording, reason_of
 from mcaprl.recorder.rows import ImageColumn, StepColumns, observation_keeper
 from mcaprl.recorder.signals import HoldSignals
 
+_UNKNOWN = math.nan
+
 
 class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     """Records every transition of an environment to an MCAP file.
@@ -105,7 +107,11 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         )
         log = self._recording.log
         self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
-        self._columns = StepColumns(log)
+        self._columns = columns = StepColumns(log)
+        # Looked up at each step.
+        self._shows_steps = self._display.shows_steps
+        self._keep_action, self._keep_reward = columns.keep_action, columns.keep_reward
+        self._keep_behavior_prob = columns.keep_behavior_prob
         images = {
             leaf: ImageColumn(log, leaf.topic, leaf.shape, leaf.encoding)
             for leaf in log.image_leaves
@@ -148,12 +154,12 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
-        columns, step = self._columns, episode.steps + 1
+        step = episode.steps + 1
         try:
             # Before the environment can change it.
-            columns.keep_action(action)
-            columns.keep_behavior_prob(self.behavior_prob)
-            self.behavior_prob = math.nan
+            self._keep_action(action)
+            self._keep_behavior_prob(self.behavior_prob)
+            self.behavior_prob = _UNKNOWN
         except SpaceError:
             raise
         except BaseException:
@@ -162,7 +168,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._keep_observation(observation)
-            columns.keep_reward(float(reward))
+            self._keep_reward(reward)
             if terminated or truncated or step >= self._full_at:
                 # Nothing may come between the writes, nor between them and what counts the steps.
                 with HoldSignals():
@@ -171,7 +177,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
                     if terminated or truncated:
                         reason = reason_of(info.get("reason"), bool(terminated))
                         self._end(bool(terminated), bool(truncated), reason)
-            elif self._display.shows_steps:
+            elif self._shows_steps:
                 self._count(episode, step, float(reward))
             else:
                 episode.steps = step
@@ -216,7 +222,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
     def _count(self, episode: OpenEpisode, step: int, reward: float) -> None:
-        if self._display.shows_steps:
+        if self._shows_steps:
             self._display.observe(step, reward)
         # From here on the step counts.
         episode.steps = step

@@ -14,6 +14,8 @@ import mcaprl
 from mcaprl.recorder.episode import Episode
 
 LARGE = os.environ.get("MCAPRL_FAULTS") == "large"
+# Where to write what was seen; see `fault_table`.
+FIGURES = os.environ.get("MCAPRL_FAULT_FIGURES")
 
 
 def count(small: int, large: int) -> int:
@@ -21,9 +23,13 @@ def count(small: int, large: int) -> int:
     return large if LARGE else small
 
 
-def tell(**figures: Any) -> None:
-    """Print what was seen, one line; `make faults` shows it."""
-    print("\n" + ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in figures.items()))
+def tell(fault: str, **figures: Any) -> None:
+    """Print what was seen of a fault, one line; `make faults` puts it into the docs."""
+    line = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in figures.items())
+    print(f"\n{fault}: {line}")
+    if FIGURES is not None:
+        with Path(FIGURES).open("a") as file:
+            file.write(f"{fault}: {line}\n")
 
 
 class Told(gym.Env[Any, Any]):

@@ -14,15 +14,18 @@ import pytest
 from gymnasium import spaces
 from mcap.records import ChunkIndex
 
+from mcaprl.errors import LogError
 from mcaprl.recorder.check import check_log
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER
+from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, Scratch
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import contents_of
 from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.mcap_writer import McapWriter
 from mcaprl.recorder.metadata import LogMetadata
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.schema import message_dtype
 from tests.faults import write_log
+from tests.fuzz_target import without_crcs
 from tests.recordings import record
 
 SPACE = spaces.Dict(
@@ -186,6 +189,32 @@ def test_pictures_that_are_missing(good: Path) -> None:
     assert problem.what == "pictures on /rl/observation/eye are not as the metadata's space says"
 
 
+def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) -> None:
+    """Where no CRC covers the schema: it is told of, and nothing is recovered from it."""
+    write_log(log_path, 2)
+    data = without_crcs(log_path.read_bytes())
+    assert data.count(b"string encoding") >= 2
+    log_path.write_bytes(data.replace(b"string encoding", b"string encodinx"))
+    (problem,) = check_log(log_path)
+    assert (
+        "pictures on /rl/observation/picture are not as the metadata's space says" in problem.what
+    )
+    with pytest.raises(LogError, match="cannot be made whole"):
+        recover_log(log_path, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_threads_find_the_same(good: Path, threads: int) -> None:
+    assert check_log(good, threads=threads) == []
+    spoilt = bytearray(good.read_bytes())
+    for chunk in McapReader(good).chunks[1:3]:
+        spoilt[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
+    good.write_bytes(spoilt)
+    problems = check_log(good)
+    assert len(problems) >= 3
+    assert check_log(good, threads=threads) == problems
+
+
 def test_attachment_that_is_damaged(good: Path) -> None:
     data = bytearray(good.read_bytes())
     data[data.index(b"foxglove-layout.json") + 60] ^= 1
@@ -198,9 +227,9 @@ def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) ->
     read: list[int] = []
     once = McapReader.chunk_records
 
-    def count(reader: McapReader, chunk: ChunkIndex) -> memoryview:
+    def count(reader: McapReader, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
         read.append(chunk.chunk_start_offset)
-        return once(reader, chunk)
+        return once(reader, chunk, scratch)
 
     monkeypatch.setattr(McapReader, "chunk_records", count)
     assert check_log(good) == []

@@ -83,7 +83,13 @@ def test_killed_recorders_lose_only_the_open_episode(tmp_path: Path) -> None:
         exact += not recovery.has_losses
         path.unlink()
         out.unlink()
-    tell(recorders_killed=trials, episodes_kept=kept, finished_episodes_lost=0, nothing_cut=exact)
+    tell(
+        "recorders killed with SIGKILL",
+        killed=trials,
+        episodes_kept=kept,
+        finished_episodes_lost=0,
+        nothing_to_cut_off=exact,
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -98,7 +104,7 @@ def test_stopped_recorders_leave_whole_files(tmp_path: Path, number: signal.Sign
         for episode in whole:
             assert_is_told(episode)
         assert last.reason in ("terminated", "interrupted")
-    tell(**{f"recorders_stopped_by_{number.name}": trials})
+    tell(f"recorders stopped with {number.name}", stopped=trials, files_not_whole=0)
 
 
 def test_killed_before_its_first_episode(tmp_path: Path) -> None:

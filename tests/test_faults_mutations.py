@@ -44,7 +44,7 @@ def test_mutated_files(tmp_path: Path, mutation: Mutation) -> None:
         process.join()
     assert "failed" not in figures, figures["failed"]
     assert figures["tried"] == trials
-    tell(mutation=mutation.__name__, **figures)
+    tell(f"files {mutation.__name__.replace('_', ' ')}", **figures)
 
 
 def _try_all(folder: Path, mutation: Mutation, trials: int, telling: Any) -> None:

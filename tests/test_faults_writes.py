@@ -111,7 +111,7 @@ def test_every_write_fails_once(log_path: Path) -> None:
                 break
             tried += 1
             assert_all_there(log_path, finished)
-    tell(writes_that_failed=tried, finished_episodes_lost=0)
+    tell("writes that fail", failed=tried, finished_episodes_lost=0)
     assert tried > 20
 
 

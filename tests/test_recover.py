@@ -328,3 +328,16 @@ def test_command_tells_and_exits(
     log_path.write_bytes(b"nonsense")
     assert run(["recover", str(log_path), str(out), "--overwrite"]) == 1
     assert "cannot be recovered" in capsys.readouterr().err
+
+
+def test_a_log_whose_steps_have_lost_their_name(log_path: Path, tmp_path: Path) -> None:
+    """What else is in it is no log: nothing is kept of a log without an episode."""
+    record(log_path, SPACE, spaces.Discrete(2), [4, 5])
+    data = log_path.read_bytes()
+    for name in (b"mcaprl.dataset", b"/rl/step"):
+        assert data.count(name) >= 2
+        data = data.replace(name, name[:-1] + b"x")
+    log_path.write_bytes(data)
+    with pytest.raises(NoEpisodesError, match="no whole episode"):
+        recover_log(log_path, tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()

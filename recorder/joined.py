@@ -1,0 +1,106 @@
+"""Small chunks side by side: visited as if they were one.
+
+A visit to a chunk costs as much as some hundred messages in it. Recorders end a chunk with each
+episode, so a log of short ones has many: those that follow each other are decompressed into one
+piece of memory, and their messages are taken from there at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.chunks import (
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+    Scratch,
+    gather,
+    joined_records,
+)
+from mcaprl.recorder.mcap_reader import McapReader
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.columns import Part
+
+# So large a piece stays in a processor's cache from one pass over it to the next.
+_MOST_BYTES = 2**20
+
+Rows = slice | NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Messages of a part, and their rows in the columns."""
+
+    part: Part
+    index: NDArray[Any]
+    rows: Rows
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Length of the chunk's records; more than can be joined if there is no such chunk."""
+        chunk = self.part.span.chunk
+        is_alone = chunk is None or not isinstance(self.rows, slice)
+        return _MOST_BYTES if is_alone or chunk is None else chunk.uncompressed_size
+
+
+def neighbors(chosen: Iterable[Chosen]) -> Iterator[list[Chosen]]:
+    """Bring together what is of one channel, follows each other, and is small."""
+    together: list[Chosen] = []
+    size = 0
+    for one in chosen:
+        more = one.chunk_bytes
+        is_other = bool(together) and one.part.channel is not together[0].part.channel
+        if together and (is_other or size + more > _MOST_BYTES):
+            yield together
+            together, size = [], 0
+        together.append(one)
+        size += more
+    if together:
+        yield together
+
+
+def join(
+    reader: McapReader, together: list[Chosen], scratch: Scratch
+) -> tuple[memoryview, NDArray[Any], slice] | None:
+    """Records of several chunks, with an index into all of them, and the rows that it fills.
+
+    Returns:
+        None if a message does not lie wholly in its own chunk; who reads them one by one sees why.
+
+    Raises:
+        CorruptLogError: a chunk is damaged.
+    """
+    spans = [one.part.span.chunk for one in together]
+    chunks = [chunk for chunk in spans if chunk is not None]
+    offsets = [chunk.chunk_start_offset for chunk in chunks]
+    size = sum(chunk.uncompressed_size for chunk in chunks)
+    try:
+        records, stops = joined_records(reader.view, offsets, size, scratch)
+    except CorruptLogError as error:
+        raise CorruptLogError(f"{reader.path}: {error}") from error
+    counts = [len(one.index) for one in together]
+    index = np.concatenate([one.index for one in together])
+    starts = np.repeat(np.array([0, *stops[:-1]], np.uint64), counts)
+    room = np.repeat(np.array(stops, np.uint64), counts) - starts
+    if (room < MESSAGE_HEADER.itemsize).any() or (
+        index["offset"] > room - np.uint64(MESSAGE_HEADER.itemsize)
+    ).any():
+        return None
+    room -= index["offset"] + np.uint64(RECORD_HEADER_BYTES)
+    index["offset"] += starts
+    try:
+        lengths = gather(records, index, MESSAGE_HEADER)["length"]
+    except CorruptLogError:
+        return None
+    if (lengths > room).any():
+        return None
+    first, last = together[0].rows, together[-1].rows
+    assert isinstance(first, slice)
+    assert isinstance(last, slice)
+    return records, index, slice(first.start, last.stop)
