@@ -131,20 +131,6 @@ def test_on_policy_they_agree_with_the_logged_returns() -> None:
         assert low - (high - low) < value < high + (high - low)
 
 
-@pytest.mark.parametrize("estimator", ["PDIS", "WPDIS", "DR"])
-def test_intervals_cover_the_true_value_as_often_as_they_say(estimator: str) -> None:
-    """95 % within two points, and what chance makes of 500 logs of 300 episodes."""
-    covered = 0
-    for seed in range(500):
-        table = task.play(None, episodes=300, seed=seed)
-        random = np.random.default_rng(seed)
-        counts = random.multinomial(300, [1 / 300] * 300, 400).astype(np.float64)
-        values = ESTIMATORS[estimator](table, counts)
-        low, high = OffPolicyEvaluator._interval(values)
-        covered += low <= task.true_value() <= high
-    assert 0.92 <= covered / 500 <= 0.97
-
-
 def test_a_log_of_other_actions_gives_no_verdict() -> None:
     always_one = np.array([[0.001, 0.999], [0.001, 0.999]])
     evaluator = OffPolicyEvaluator(log(40, acting=always_one), NO_MODEL)
