@@ -7,8 +7,8 @@ Double DQN learns online and records what it does; its checkpoints are kept. The
 is asked about twice: the sim runs its greedy policy through fresh episodes, which gives its true
 value, and each estimator guesses that value from the log that the run itself recorded. The orders
 are compared by Spearman's correlation and by regret@1, of each training seed; a table has their
-mean and range over seeds. Two simple rules stand beside the estimators: the last checkpoint is best, and
-the checkpoint that thinks most of itself is (its own mean Q of the first states).
+mean and range over seeds. Two simple rules stand beside the estimators: the last checkpoint is the
+best one, and the checkpoint that thinks most of itself is (its own mean Q of the first states).
 
 What is found goes to FOLDER/SIM/ranking.json; what is there already is not done again.
 """

@@ -7,7 +7,6 @@ WDR), and not by those that only weigh what was logged.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -283,26 +282,6 @@ class OffPolicyEvaluator:
     def _discounts(self) -> Floats:
         discounts: Floats = self.gamma ** np.arange(int(self._lengths.max()) + 1, dtype=np.float64)
         return discounts
-
-
-def inverse_probability(behavior_probs: NDArray[np.floating], actions: int) -> tuple[float, float]:
-    """How well logged probabilities are calibrated: the mean of 1 / (p A), at most 1.
-
-    Over actions drawn with probabilities p, the mean of 1 / p is the number of actions that can be
-    drawn. So 1 says that every one of A actions can come, less that some never do, and clearly more
-    than 1 that the probabilities are too small to be true.
-
-    Args:
-        behavior_probs: (N,) of the actions taken.
-        actions: A.
-
-    Returns:
-        The mean, and its standard error; NaN if probabilities are unknown or 0.
-    """
-    if len(behavior_probs) < 2 or not (behavior_probs > 0).all():
-        return math.nan, math.nan
-    inverse = 1 / (behavior_probs.astype(np.float64) * actions)
-    return float(inverse.mean()), float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
 
 
 def _verdict(size: float) -> str:

@@ -19,7 +19,6 @@ from mcaprl.offline.off_policy import (
     Estimate,
     OffPolicyEvaluator,
     PolicyEstimates,
-    inverse_probability,
 )
 from mcaprl.recorder.dataset import Dataset
 from tests import two_state_task as task
@@ -179,15 +178,3 @@ def test_the_same_seed_gives_the_same_estimates() -> None:
         OffPolicyEvaluator(log(50), NO_MODEL, seed=3).evaluate(None, "random") for _ in range(2)
     )
     assert first == second
-
-
-def test_inverse_probabilities_by_hand() -> None:
-    # Six actions, uniform: 1 / p is 6 at each step.
-    assert inverse_probability(np.full(10, 1 / 6), 6) == pytest.approx((1.0, 0.0))
-    # One action for certain: of two actions one never comes.
-    assert inverse_probability(np.ones(10), 2) == pytest.approx((0.5, 0.0))
-    # Probabilities of which none can be true: half of what they are.
-    assert inverse_probability(np.full(10, 1 / 12), 6) == pytest.approx((2.0, 0.0))
-    # 1 / (2 p) is 1 and 2: mean 1.5, standard deviation sqrt(.5), over sqrt(2) steps.
-    assert inverse_probability(np.array([0.5, 0.25]), 2) == pytest.approx((1.5, 0.5))
-    assert math.isnan(inverse_probability(np.array([0.5, math.nan]), 2)[0])
