@@ -16,7 +16,7 @@ help:
 	@echo "make fuzz    search for bytes that the reader cannot bear, for ten minutes"
 	@echo "make check   format, lint, types, and the direction of imports"
 	@echo "make bench   measure speed against other libraries, as ratios"
-	@echo "make bench-learning   the same of learning, and the CartPole grid, beside d3rlpy and SB3"
+	@echo "make bench-learning   the same of learning and off-policy estimates, beside d3rlpy, SB3, SCOPE-RL"
 	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
 	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
 	@echo "make clean   remove what these made"
@@ -48,6 +48,7 @@ bench: $(BENCH)/.ready
 
 bench-learning: $(VENV)/.rivals
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.learning
+	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.off_policy
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.cartpole_grid $(VENV)/cartpole
 
 docs: $(VENV)/.dev
@@ -84,13 +85,14 @@ $(BENCH)/.ready: $(SETTINGS)
 	  -e '.[sims,offline,fast]' --group bench
 	@touch $@
 
-# d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins.
+# d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins, and
+# so does SCOPE-RL.
 $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	@echo "installing into $(VENV)/rivals"
 	$(BIN)/python -m venv $(VENV)/rivals
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
-	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1
+	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1 scope-rl==0.2.1
 	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev

@@ -55,8 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: without the program's name; default: the process's own.
     """
-    # A terminated recording closes its file on the way out, as an interrupted one does.
+    # A terminated recording closes its file on the way out, as an interrupted one does; so does
+    # one whose terminal is closed, unless nohup asked for the contrary.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
     warnings.showwarning = _print_warning
     sys.exit(run(arguments))
 

@@ -12,6 +12,7 @@ from typing import Any
 import click
 import gymnasium as gym
 
+from mcaprl.cli.curves import learning_curves
 from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
@@ -130,7 +131,7 @@ def _evaluate_in_sim(
         _print_improvements(compared)
     if report is not None:
         recorded = None if record_path is None else (record_path, len(set(policies)))
-        _write_report(report, result, scores, compared, world, recorded)
+        _write_report(report, result, scores, compared, world, recorded, policies)
 
 
 def _score_all(
@@ -226,13 +227,15 @@ def _write_report(
     compared: list[Improvement],
     world: list[Any],
     recorded: tuple[Path, int] | None,
+    names: Sequence[str],
 ) -> None:
     from mcaprl.sims.report import evaluation_page
 
     write_json(folder / RESULT_NAME, result)
     logged = result["behavior"]
     band = None if logged is None else (logged["mean_return"], *logged["interval"])
-    evaluation_page(folder, result["sim"], scores, compared, world, band, recorded)
+    curves = learning_curves([name for name in names if name not in SCRIPTED])
+    evaluation_page(folder, result["sim"], scores, compared, world, band, recorded, curves)
 
 
 def _print_scores(

@@ -18,6 +18,7 @@ from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.film import (
     FILM_KINDS,
     check_output,
+    filmed,
     spread,
     write_film,
     write_sheet,
@@ -49,10 +50,10 @@ def make_film(
     episode = dataset.episodes[number]
     if video is not None:
         step_ns = float(np.median(np.diff(episode.log_time_ns)))
-        every = range(episode.length + 1)
-        with progress(f"drawing {video}", len(every)) as advance:
-            pictures = _ticking(_pictures(path, dataset, episode, every, sim), advance)
-            count = write_film(video, pictures, speed * 1e9 / step_ns)
+        shown, pictures_per_s = filmed(episode.length, speed * 1e9 / step_ns)
+        with progress(f"drawing {video}", len(shown)) as advance:
+            pictures = _ticking(_pictures(path, dataset, episode, shown, sim), advance)
+            count = write_film(video, pictures, pictures_per_s)
         click.echo(f"{video}: {count} pictures of episode {number}")
     if sheet is not None:
         steps = spread(episode.length, STILLS)

@@ -13,6 +13,7 @@ import click
 
 from mcaprl.cli.show import print_facts, print_json, size, write_json
 from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
+from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.check import Problem, check_log
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.lint import Finding, lint
@@ -163,6 +164,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 def describe_dataset(dataset: Dataset) -> dict[str, Any]:
     """The facts that `info --json` gives, but for the files' size."""
     statistics = dataset.statistics
+    calibrated = calibration(dataset.behavior_probs, dataset.action_space)
     return {
         "env_id": dataset.env_id,
         "episodes": statistics.episodes,
@@ -177,6 +179,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
             dataset.action_names.get(action, str(action)): count
             for action, count in statistics.action_counts.items()
         },
+        "behavior_prob": calibrated and {**calibrated.to_json(), "text": str(calibrated)},
         "policies": sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         "ends": dict(statistics.ends),
     }
@@ -205,6 +208,7 @@ def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
         ("kept in", facts["storage"]),
         ("actions", _short(facts["actions"])),
         ("taken", _counts(facts["action_counts"]) or "-"),
+        ("behavior_prob", _calibration(facts["behavior_prob"])),
         ("policies", ", ".join(facts["policies"]) or "unknown"),
         ("ends", _counts(facts["ends"])),
     ]
@@ -213,6 +217,10 @@ def _fact_rows(facts: dict[str, Any], files: int) -> list[tuple[str, str]]:
 def _title(sources: Sequence[Path]) -> str:
     more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
     return f"{sources[0]}{more}"
+
+
+def _calibration(found: dict[str, Any] | None) -> str:
+    return "unknown" if found is None else f"speaks of {found['text']}"
 
 
 def _counts(counts: dict[str, int]) -> str:

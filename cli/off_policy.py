@@ -10,15 +10,12 @@ import click
 
 from mcaprl.cli.policies import policy_names, trained_policies
 from mcaprl.cli.show import print_table, progress
+from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.reader import open_logs
 
 if TYPE_CHECKING:
     from mcaprl.offline.off_policy import PolicyEstimates, StochasticPolicy
     from mcaprl.recorder.dataset import Dataset
-
-
-_STANDARD_ERRORS = 4.0
-"""So far from 1, chance no longer explains it."""
 
 
 def evaluate_from_log(
@@ -46,7 +43,7 @@ def evaluate_from_log(
         What `--json` prints.
     """
     from mcaprl.offline.fqe import FQEConfig
-    from mcaprl.offline.off_policy import OffPolicyEvaluator, inverse_probability
+    from mcaprl.offline.off_policy import OffPolicyEvaluator
     from mcaprl.offline.ranking import ranking
 
     dataset = open_logs(data, threads=threads)
@@ -58,7 +55,7 @@ def evaluate_from_log(
         for name, policy in policies.items():
             found.append(evaluator.evaluate(policy, name, epsilon=epsilon, on_update=advance))
     estimates = [estimate for one in found for estimate in one.estimates]
-    actions = int(getattr(dataset.action_space, "n", 0))
+    calibrated = calibration(dataset.behavior_probs, dataset.action_space)
     return {
         "data": data,
         "episodes": len(dataset.episodes),
@@ -66,7 +63,7 @@ def evaluate_from_log(
         "epsilon": epsilon,
         "behavior_return": evaluator.behavior_return,
         "behavior_interval": list(evaluator.behavior_interval),
-        "behavior_calibration": inverse_probability(dataset.behavior_probs, actions),
+        "behavior_calibration": calibrated and {**calibrated.to_json(), "text": str(calibrated)},
         "coverage": {one.policy: one.coverage for one in found},
         "estimates": [estimate.to_json() for estimate in estimates],
         "ranking": ranking(estimates) if len(policies) > 1 else None,
@@ -95,12 +92,8 @@ def print_estimates(result: dict[str, Any]) -> None:
     )
     coverage = ", ".join(f"{share:.0%} by {name}" for name, share in result["coverage"].items())
     click.echo(f"logged actions that the policies would take: {coverage}")
-    calibration, error = result["behavior_calibration"]
-    if calibration > 1 + _STANDARD_ERRORS * error:
-        click.echo(
-            f"the log's behavior_prob cannot be right: 1 / behavior_prob is {calibration:.2f} times"
-            " the number of actions in the mean, and 1 at most if it is"
-        )
+    if result["behavior_calibration"] is not None:
+        click.echo(f"the log's behavior_prob speaks of {result['behavior_calibration']['text']}")
     if result["ranking"] is not None:
         order = result["ranking"]
         click.echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ from mcaprl.figures import COLORS, new_figure, save_png
 from mcaprl.offline.metrics import METRICS_NAME
 
 CURVES_NAME = "curves.png"
+Curve = dict[str, NDArray[np.float64]]
+
 _COLUMNS = 3
 _LEARNED, _HELD_OUT = COLORS[:2]
 
@@ -26,27 +29,59 @@ def draw_curves(folder: Path) -> Path:
         MissingExtraError: matplotlib is not installed.
         ReportError: it cannot be written.
     """
-    curves = [read_curve(path) for path in sorted(folder.glob(f"seed-*/{METRICS_NAME}"))]
-    names = [name for name in curves[0] if name not in ("update", "learning_rate")]
+    curves = read_curves(folder)
+    names = _shown(curves)
     rows = -(-len(names) // _COLUMNS)
     figure, panels = new_figure((4 * _COLUMNS, 2.4 * rows), rows, _COLUMNS, grid=True)
     for panel in panels.flat[len(names) :]:
         panel.set_axis_off()
     for panel, name in zip(panels.flat, names, strict=False):
-        color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
-        for curve in curves:
-            panel.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5)
-        shortest = min((curve["update"] for curve in curves), key=len)
-        mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
-        panel.plot(shortest, mean, color=color, lw=1.8)
+        _draw(panel, curves, name)
         panel.set_title(name.replace("_", " "))
-    seeds = "one seed" if len(curves) == 1 else f"thick: mean of {len(curves)} seeds"
-    figure.supxlabel(f"updates; {seeds}")
+    figure.supxlabel(_legend(curves))
     save_png(figure, folder / CURVES_NAME)
     return folder / CURVES_NAME
 
 
-def read_curve(path: Path) -> dict[str, NDArray[np.float64]]:
+def curve_figures(folder: Path) -> list[tuple[str, Any]]:
+    """The same as a small figure for each term, by its name; for pages.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    curves = read_curves(folder)
+    found = []
+    for name in _shown(curves):
+        figure, axes = new_figure((4.4, 2.6))
+        _draw(axes, curves, name)
+        axes.set_xlabel(_legend(curves))
+        found.append((name.replace("_", " "), figure))
+    return found
+
+
+def read_curves(folder: Path) -> list[Curve]:
+    """Those of all seeds of a run; none if there are no metrics."""
+    return [read_curve(path) for path in sorted(folder.glob(f"seed-*/{METRICS_NAME}"))]
+
+
+def _shown(curves: list[Curve]) -> list[str]:
+    return [name for name in curves[0] if name not in ("update", "learning_rate")] if curves else []
+
+
+def _legend(curves: list[Curve]) -> str:
+    return "updates" + ("" if len(curves) == 1 else f"; thick: mean of {len(curves)} seeds")
+
+
+def _draw(axes: Any, curves: list[Curve], name: str) -> None:
+    color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
+    for curve in curves:
+        axes.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5)
+    shortest = min((curve["update"] for curve in curves), key=len)
+    mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
+    axes.plot(shortest, mean, color=color, lw=1.8)
+
+
+def read_curve(path: Path) -> Curve:
     """The columns of a `metrics.csv`, by name."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))

@@ -1,6 +1,7 @@
 """Estimates of a policy's value from another's log, by importance sampling: pure functions.
 
-Each takes episodes side by side and gives one value for each resampling of them:
+Each takes episodes side by side and gives quotients of means over them, and so a value for every
+resampling, and an interval:
 
     TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
     WIS     weighted                               the same, over the sum of all rho
@@ -25,9 +26,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mcaprl.offline.quotients import Floats, Quotients, quotient
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,61 +71,49 @@ class EpisodeTable:
         return np.hstack([np.ones((len(self.ratios), 1)), self.rho[:, :-1]])
 
 
-def trajectory(episodes: EpisodeTable, counts: Floats) -> Floats:
-    """TIS: the mean of rho_T sum_t gamma^t r_t.
-
-    Args:
-        episodes: E of them.
-        counts: (B, E) how often each episode stands in each of B resamplings.
-
-    Returns:
-        (B,) values.
-    """
-    returns = (episodes.discounts * episodes.rewards).sum(1)
-    return _mean(episodes.rho[:, -1] * returns, counts)
+def trajectory(episodes: EpisodeTable) -> Quotients:
+    """TIS: the mean of rho_T sum_t gamma^t r_t."""
+    return Quotients.mean(episodes.rho[:, -1] * _returns(episodes))
 
 
-def weighted_trajectory(episodes: EpisodeTable, counts: Floats) -> Floats:
-    """WIS: the mean of the returns, weighted by rho_T. Arguments as of `trajectory`."""
-    returns = (episodes.discounts * episodes.rewards).sum(1)
-    rho = episodes.rho[:, -1]
-    return _quotient(counts @ (rho * returns), counts @ rho)
+def weighted_trajectory(episodes: EpisodeTable) -> Quotients:
+    """WIS: the mean of the returns, weighted by rho_T."""
+    rho = episodes.rho[:, -1:]
+    return Quotients(np.ones(1), ((rho * _returns(episodes)[:, None], rho),))
 
 
-def per_decision(episodes: EpisodeTable, counts: Floats) -> Floats:
-    """PDIS: the mean of sum_t gamma^t rho_t r_t. Arguments as of `trajectory`."""
-    return _mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1), counts)
+def per_decision(episodes: EpisodeTable) -> Quotients:
+    """PDIS: the mean of sum_t gamma^t rho_t r_t."""
+    return Quotients.mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1))
 
 
-def weighted_per_decision(episodes: EpisodeTable, counts: Floats) -> Floats:
-    """WPDIS: sum_t gamma^t of the mean reward at t, weighted by rho_t. As `trajectory`."""
-    paid = _quotient(counts @ (episodes.rho * episodes.rewards), counts @ episodes.rho)
-    return paid @ episodes.discounts
+def weighted_per_decision(episodes: EpisodeTable) -> Quotients:
+    """WPDIS: sum_t gamma^t of the mean reward at t, weighted by rho_t."""
+    rho = episodes.rho
+    return Quotients(episodes.discounts, ((rho * episodes.rewards, rho),))
 
 
-def doubly_robust(episodes: EpisodeTable, counts: Floats) -> Floats:
+def doubly_robust(episodes: EpisodeTable) -> Quotients:
     """DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
 
-    Jiang and Li, equation 10, written out. With a model of zeros it is PDIS. As `trajectory`.
+    Jiang and Li, equation 10, written out. With a model of zeros it is PDIS.
     """
     unexplained = episodes.rho * (episodes.rewards - episodes.q)
     per_step = unexplained + episodes.rho_before * episodes.v
-    return _mean((episodes.discounts * per_step).sum(1), counts)
+    return Quotients.mean((episodes.discounts * per_step).sum(1))
 
 
-def weighted_doubly_robust(episodes: EpisodeTable, counts: Floats) -> Floats:
-    """WDR: DR with rho_t over its sum at that step. As `trajectory`.
+def weighted_doubly_robust(episodes: EpisodeTable) -> Quotients:
+    """WDR: DR with rho_t over its sum at that step.
 
     Thomas and Brunskill, equation 10.
     """
-    unexplained = counts @ (episodes.rho * (episodes.rewards - episodes.q))
-    valued = counts @ (episodes.rho_before * episodes.v)
-    per_step = _quotient(unexplained, counts @ episodes.rho)
-    per_step = per_step + _quotient(valued, counts @ episodes.rho_before)
-    return per_step @ episodes.discounts
+    rho, before = episodes.rho, episodes.rho_before
+    unexplained = rho * (episodes.rewards - episodes.q)
+    return Quotients(episodes.discounts, ((unexplained, rho), (before * episodes.v, before)))
 
 
-ESTIMATORS: Final[dict[str, Callable[[EpisodeTable, Floats], Floats]]] = {
+ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], Quotients]]] = {
     "TIS": trajectory,
     "WIS": weighted_trajectory,
     "PDIS": per_decision,
@@ -146,7 +134,7 @@ def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
     episode has all the weight, 0 if none has any.
     """
     rho = episodes.rho
-    return _quotient(rho.sum(0) ** 2, (rho**2).sum(0))
+    return quotient(rho.sum(0) ** 2, (rho**2).sum(0))
 
 
 def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
@@ -163,13 +151,7 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
         return float(discounts.sum() / (discounts @ (1 / sizes)))
 
 
-def _mean(values: Floats, counts: Floats) -> Floats:
-    means: Floats = counts @ values / counts.sum(1)
-    return means
-
-
-def _quotient(numerators: Floats, denominators: Floats) -> Floats:
-    """The quotient, and 0 where nothing has any weight."""
-    return np.divide(
-        numerators, denominators, out=np.zeros_like(numerators), where=denominators > 0
-    )
+def _returns(episodes: EpisodeTable) -> Floats:
+    """(E,) discounted."""
+    returns: Floats = (episodes.discounts * episodes.rewards).sum(1)
+    return returns

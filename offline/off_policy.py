@@ -7,7 +7,6 @@ WDR), and not by those that only weigh what was logged.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -22,9 +21,9 @@ from mcaprl.offline.fqe import FQE, FQEConfig
 from mcaprl.offline.importance import (
     ESTIMATORS,
     EpisodeTable,
-    Floats,
     effective_sample_size,
 )
+from mcaprl.offline.quotients import Floats, Quotients
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 LEAST_SAMPLE_SIZE: Final = 10.0
 """Below this effective number of episodes there is an estimate, but no verdict."""
 RESAMPLES: Final = 1000
-CONFIDENCE: Final = 0.95
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
 _ROWS_AT_ONCE = 4096
@@ -53,7 +51,7 @@ class Estimate:
         policy: its name.
         estimator: `FQE` or one of `importance.ESTIMATORS`.
         value: the discounted return; None where nothing can be computed.
-        interval: 95 % bootstrap interval over episodes.
+        interval: 95 % bootstrap-t interval over episodes.
         effective_sample_size: how many episodes of the policy itself the log is worth.
         verdict: `ok`, or `refused: ` and why.
     """
@@ -105,7 +103,7 @@ class OffPolicyEvaluator:
     Attributes:
         gamma: the discount.
         behavior_return: mean discounted return of the logged episodes.
-        behavior_interval: its 95 % bootstrap interval.
+        behavior_interval: its 95 % bootstrap-t interval.
     """
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
@@ -137,7 +135,7 @@ class OffPolicyEvaluator:
         self._fold = random.permutation(len(self._lengths)) % FOLDS
         returns = self._padded(dataset.rewards, 0.0) @ self._discounts()
         self.behavior_return = float(returns.mean())
-        self.behavior_interval = self._interval(self._counts @ returns / shape[1])
+        self.behavior_interval = Quotients.mean(returns).interval(self._counts)
 
     def evaluate(
         self,
@@ -245,14 +243,14 @@ class OffPolicyEvaluator:
         )
 
     def _estimate(self, name: str, estimator: str, table: EpisodeTable) -> Estimate:
-        estimate = ESTIMATORS[estimator]
-        value = estimate(table, np.ones((1, len(self._lengths))))[0]
+        estimate = ESTIMATORS[estimator](table)
+        value = estimate.values(np.ones((1, len(self._lengths))))[0]
         size = effective_sample_size(estimator, table)
         return Estimate(
             name,
             estimator,
             float(value),
-            self._interval(estimate(table, self._counts)),
+            estimate.interval(self._counts),
             size,
             _verdict(size),
         )
@@ -271,7 +269,7 @@ class OffPolicyEvaluator:
                 f"refused: {self._config.updates // self._config.target_interval} target copies"
                 f" are too few for gamma {self.gamma}: more updates"
             )
-        interval = self._interval(self._counts @ first / len(first))
+        interval = Quotients.mean(first).interval(self._counts)
         return Estimate(name, "FQE", float(first.mean()), interval, size, verdict)
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:
@@ -284,32 +282,6 @@ class OffPolicyEvaluator:
     def _discounts(self) -> Floats:
         discounts: Floats = self.gamma ** np.arange(int(self._lengths.max()) + 1, dtype=np.float64)
         return discounts
-
-    @staticmethod
-    def _interval(values: Floats) -> tuple[float, float]:
-        tail = 50 * (1 - CONFIDENCE)
-        low, high = np.percentile(values, [tail, 100 - tail])
-        return float(low), float(high)
-
-
-def inverse_probability(behavior_probs: NDArray[np.floating], actions: int) -> tuple[float, float]:
-    """How well logged probabilities are calibrated: the mean of 1 / (p A), at most 1.
-
-    Over actions drawn with probabilities p, the mean of 1 / p is the number of actions that can be
-    drawn. So 1 says that every one of A actions can come, less that some never do, and clearly more
-    than 1 that the probabilities are too small to be true.
-
-    Args:
-        behavior_probs: (N,) of the actions taken.
-        actions: A.
-
-    Returns:
-        The mean, and its standard error; NaN if probabilities are unknown or 0.
-    """
-    if len(behavior_probs) < 2 or not (behavior_probs > 0).all():
-        return math.nan, math.nan
-    inverse = 1 / (behavior_probs.astype(np.float64) * actions)
-    return float(inverse.mean()), float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
 
 
 def _verdict(size: float) -> str:

@@ -71,6 +71,11 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
         MissingExtraError: matplotlib is not installed.
         ReportError: it cannot be written.
     """
+    save_png(curve_figure(runs, title), path)
+
+
+def curve_figure(runs: Sequence[RunCurve], title: str) -> Any:
+    """The same as a figure."""
     figure, axes = new_figure((7.2, 4.0))
     scored = all(np.isfinite(p.score) for run in runs for seed in run.seeds for p in seed)
     for run, color in zip(runs, COLORS, strict=False):
@@ -83,7 +88,7 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
     axes.set_xlabel(f"environment steps{dots}")
     axes.set_title(title)
     axes.legend(loc="lower right")
-    save_png(figure, path)
+    return figure
 
 
 def _draw_run(axes: Any, run: RunCurve, color: str, scored: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, Usag
 Picture = NDArray[np.uint8]
 
 FILM_KINDS = (".mp4", ".gif")
+MOST_PICTURES_PER_S: Final = 50.0
+"""What viewers of GIFs can show; screens hardly show more."""
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -108,6 +110,20 @@ def contact_sheet(pictures: Sequence[Picture]) -> Picture:
         top, left = (number // columns) * (height + _GAP_PX), (number % columns) * (width + _GAP_PX)
         sheet[top : top + height, left : left + width] = half
     return sheet
+
+
+def filmed(length: int, steps_per_s: float) -> tuple[range, float]:
+    """Which steps of an episode a film shows, and how many pictures a second.
+
+    All of them as long as that can be watched; else every second one, every third one, ... so that
+    the last is among them.
+
+    Args:
+        length: steps of the episode.
+        steps_per_s: at the film's speed.
+    """
+    stride = max(1, math.ceil(steps_per_s / MOST_PICTURES_PER_S - 1e-9))
+    return range(length % stride, length + 1, stride), steps_per_s / stride
 
 
 def spread(length: int, count: int) -> list[int]:

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.spaces import Leaf, observation_leaves
@@ -208,6 +209,17 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Finding]:
         )
 
 
+def _wrong_probabilities(dataset: Dataset) -> Iterator[Finding]:
+    found = calibration(dataset.behavior_probs, dataset.action_space)
+    if found is not None and not found.possible:
+        yield Finding(
+            "problem",
+            f"behavior_prob cannot be right: it speaks of {found}",
+            "over all steps",
+            "off-policy evaluation weighs steps by it, and its estimates are off",
+        )
+
+
 _LOOKS: Final[tuple[Callable[[Dataset], Iterator[Finding]], ...]] = (
     _not_finite,
     _out_of_range,
@@ -218,6 +230,7 @@ _LOOKS: Final[tuple[Callable[[Dataset], Iterator[Finding]], ...]] = (
     _actions_never_taken,
     _mixed_policies,
     _unknown_probabilities,
+    _wrong_probabilities,
 )
 
 

@@ -105,14 +105,15 @@ class LiveServer:
             due += self._player.advance(elapsed_s)
             time_ns, stopped = self._player.time_ns, was_playing and not self._player.playing
             state = self._state(did_seek=restarts)
-        if restarts:
-            # Viewers without a seek bar throw away what they have drawn, and begin anew.
-            self._server.clear_session()
-        for message in due:
-            self._send(message)
-        self._server.broadcast_time(time_ns)
-        if restarts or stopped:
-            self._server.broadcast_playback_state(state)
+            # Nobody seeks until all is sent, or messages of the old place would follow the answer.
+            if restarts:
+                # Viewers without a seek bar throw away what they have drawn, and begin anew.
+                self._server.clear_session()
+            for message in due:
+                self._send(message)
+            self._server.broadcast_time(time_ns)
+            if restarts or stopped:
+                self._server.broadcast_playback_state(state)
 
     def close(self) -> None:
         """Say goodbye to all viewers."""

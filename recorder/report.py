@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.lint import Finding
@@ -76,6 +77,7 @@ def dataset_page(
         Section("What it is", table=Table(("", ""), facts)),
         _findings_section(findings),
         Section("What happened", figures=_figures(dataset, tracks)),
+        *_calibration_section(dataset),
         Section("Best and worst episodes", cards=_cards(dataset, tracks)),
         Section("Observations", table=_columns(dataset)),
     ]
@@ -87,6 +89,20 @@ def _findings_section(findings: Sequence[Finding]) -> Section:
         return Section("Findings", text="Nothing was found that would spoil learning.")
     rows = [(one.severity, one.what, one.where, one.effect) for one in findings]
     return Section("Findings", table=Table(("", "what", "where", "what it does"), rows))
+
+
+def _calibration_section(dataset: Dataset) -> list[Section]:
+    """Nothing where probabilities are unknown."""
+    found = calibration(dataset.behavior_probs, dataset.action_space)
+    if found is None:
+        return []
+    rows = [
+        (f"{one.probability:.3f}", f"{one.steps / len(dataset):.1%}", f"{one.actions:.2f}")
+        for one in found.ranges
+    ]
+    table = Table(("behavior_prob", "of the steps", "actions a state has of it"), rows)
+    text = f"The actions taken, each counted 1 / behavior_prob, speak of {found}."
+    return [Section("How likely the actions were", text, table=table)]
 
 
 def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:

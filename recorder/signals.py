@@ -1,4 +1,4 @@
-"""Keeps Ctrl-C and SIGTERM from falling between two writes that belong together."""
+"""Keeps Ctrl-C, SIGTERM and a closed terminal from falling between two writes that belong together."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
-_HELD = (signal.SIGINT, signal.SIGTERM)
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+# Windows has no SIGHUP.
+_HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 
 
 class HoldSignals:

@@ -113,6 +113,7 @@ def evaluation_page(
     world: Sequence[Shape],
     behavior: tuple[float, float, float] | None,
     recorded: tuple[Path, int] | None,
+    curves: Sequence[Figure] = (),
 ) -> None:
     """Write FOLDER/index.html, comparison.png and trajectories.png.
 
@@ -124,6 +125,7 @@ def evaluation_page(
         world: what stands still.
         behavior: mean, low and high of the logged episodes' returns, if there are such.
         recorded: the log with the episodes, and of how many of the first `scores` it has them.
+        curves: how the policies were learnt.
 
     Raises:
         MissingExtraError: matplotlib or jinja2 is not installed.
@@ -143,6 +145,8 @@ def evaluation_page(
         sections.append(Section("Where they went", figures=[Figure.of("", ways)]))
     cards = _cards(scores, world, recorded)
     sections.append(Section("Best and worst episodes", cards=cards))
+    if curves:
+        sections.append(Section("How they were learnt", figures=curves))
     episodes = sum(score.returns.size for score in scores)
     write_page(folder / "index.html", title, f"{episodes} episodes, greedy actions", sections)
 

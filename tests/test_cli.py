@@ -105,7 +105,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
         assert estimate["verdict"].startswith("refused: ")
     random = {e["estimator"]: e for e in result["estimates"] if e["policy"] == "random"}
     assert random["PDIS"]["value"] == pytest.approx(result["behavior_return"]), "random acted"
-    assert result["behavior_calibration"] == pytest.approx([1.0, 0.0])
+    assert result["behavior_calibration"]["text"] == "2.00 +- 0.00 of 2 actions"
     assert result["coverage"]["random"] == pytest.approx(0.5)
     assert result["ranking"]["trusted"] is False
     assert run(ask) == 0

@@ -13,7 +13,7 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.recorder.film import contact_sheet, spread
+from mcaprl.recorder.film import contact_sheet, filmed, spread
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.seen import moments_of_episode
 from mcaprl.sims import make_sim
@@ -131,6 +131,13 @@ def test_sheet() -> None:
     assert [sheet[0, 0, 0], sheet[0, 36, 0], sheet[0, 72, 0], sheet[26, 0, 0]] == [10, 20, 30, 40]
     assert sheet[26, 36, 0] == 255
     assert spread(2, 12) == [0, 1, 2]
+
+
+def test_a_fast_film_leaves_steps_out() -> None:
+    assert filmed(3, 50.0) == (range(4), 50.0)
+    steps, pictures_per_s = filmed(7, 120.0)
+    assert list(steps) == [1, 4, 7], "the end is shown"
+    assert pictures_per_s == 40.0
 
 
 def test_films_of_a_scene_and_of_a_sim(

@@ -185,8 +185,16 @@ def viewer_is_there() -> None:
     need(importlib.util.find_spec("foxglove") is not None, "foxglove-sdk is not installed")
 
 
-def look(arguments: list[str], plan: list[list[Any]]) -> tuple[Any, list[str]]:
-    """Run the server and a viewer that follows a plan; what it saw, and what was printed."""
+def look(
+    arguments: list[str], plan: list[list[Any]], how: signal.Signals = signal.SIGINT
+) -> tuple[Any, list[str]]:
+    """Run the server and a viewer that follows a plan; what it saw, and what was printed.
+
+    Args:
+        arguments: of `replay`.
+        plan: what the viewer does.
+        how: the server is ended.
+    """
     command = [sys.executable, "-m", "mcaprl.cli", "replay", *arguments, "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
@@ -200,8 +208,11 @@ def look(arguments: list[str], plan: list[list[Any]]) -> tuple[Any, list[str]]:
             viewer = ["node", str(NODE / "viewer.mjs"), address[0], json.dumps(plan)]
             seen = subprocess.run(viewer, capture_output=True, text=True, timeout=60, check=True)
         finally:
-            server.send_signal(signal.SIGINT)
-            rest, _ = server.communicate(timeout=30)
+            server.send_signal(how)
+            try:
+                rest, _ = server.communicate(timeout=30)
+            finally:
+                server.kill()
     assert server.returncode == 0
     assert rest == "ended\n"
     assert not Path(layout[0]).exists()
@@ -250,7 +261,8 @@ def test_two_policies_side_by_side(log: Path, tmp_path: Path) -> None:
     viewer_is_there()
     other = record(tmp_path / "pilot.mcap", (5,), 4)
     arguments = [str(log), str(other), "--episode", "0", "--speed", "2"]
-    seen, _ = look(arguments, [["seek", str(START_NS + STEP_NS)]])
+    # With the terminal, too, it ends as with Ctrl-C.
+    seen, _ = look(arguments, [["seek", str(START_NS + STEP_NS)]], signal.SIGHUP)
     assert {"/lane/rl/step", "/pilot/rl/step", "/pilot/scene"} <= seen["topics"].keys()
     times = {message["topic"]: message["time"] for message in seen["steps"][0]["messages"]}
     assert times["/lane/tf"] == times["/pilot/tf"] == str(START_NS + STEP_NS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import subprocess
@@ -12,13 +13,18 @@ import numpy as np
 import pytest
 
 import mcaprl
+from mcaprl.cli.curves import learning_curves
 from mcaprl.figures import new_figure, to_svg
+from mcaprl.online.curve import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.recorder.lint import lint
 from mcaprl.recorder.report import dataset_page
 from mcaprl.recorder.tracks import tracks_of
 from mcaprl.recorder.wrapper import RecordMcap
 from mcaprl.sims import make_sim
+from mcaprl.sims.evaluate import PolicyScore
+from mcaprl.sims.report import evaluation_page
+from mcaprl.sims.rollout import EpisodeResult
 from tests.conftest import need
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -103,6 +109,37 @@ def test_it_fits_a_phone_and_the_reader_s_colors(lane_page: Path, width: int, da
     brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
     assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
     assert svg_ink == ink, "what is drawn has the color of what is written"
+
+
+def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> None:
+    for seed in range(2):
+        (tmp_path / f"online/seed-{seed}").mkdir(parents=True)
+        points = [
+            CurvePoint(step, 2.0 * step + seed, math.nan, 0.0, 9.0, 5.0, best=True)
+            for step in (10, 20, 30)
+        ]
+        write_curve(tmp_path / f"online/seed-{seed}/curve.csv", points)
+        (tmp_path / f"offline/seed-{seed}").mkdir(parents=True)
+        rows = "update,learning_rate,loss,held_out_loss\n1,.1,3,4\n2,.1,2,3\n"
+        (tmp_path / f"offline/seed-{seed}/metrics.csv").write_text(rows)
+    curves = learning_curves(
+        [str(tmp_path / name) for name in ("online", "online/seed-0", "offline", "nowhere.zip")]
+    )
+    assert [figure.caption for figure in curves] == [
+        "Evaluations while learning",
+        "offline: loss",
+        "offline: held out loss",
+    ]
+    assert "online: median and range of 2 seeds" in curves[0].svg
+    assert "mean of 2 seeds" in curves[1].svg
+    places = np.array([(0.0, 0.0), (3.0, 1.0)])
+    episode = EpisodeResult(7, 3.5, 1, "success", places)
+    score = PolicyScore("cql", ((episode,), (episode,)), 3.5, (3.5, 3.5), successes=("success",))
+    evaluation_page(tmp_path / "page", "lane", [score], [], [], None, None, curves)
+    document, console = browse(tmp_path / "page" / "index.html")
+    assert console == ""
+    assert document.index("Best and worst") < document.index("How they were learnt")
+    assert document.count("<svg") == 1 + 1 + 2 + 3, "comparison, ways, thumbnails, curves"
 
 
 def test_text_is_text_and_no_markup(tmp_path: Path) -> None:

@@ -64,17 +64,25 @@ async function until(condition) {
   while (!condition()) await new Promise((resolve) => setTimeout(resolve, 10));
 }
 
+// Until nothing has come for a while: a busy machine takes its time.
+async function quiet() {
+  for (let count = -1; count !== now.messages.length + now.states.length; ) {
+    count = now.messages.length + now.states.length;
+    await new Promise((resolve) => setTimeout(resolve, 400));
+  }
+}
+
 await until(() => seen.server !== undefined && byId.size > 0 && now.messages.length > 0);
 for (const [kind, value, count] of JSON.parse(plan)) {
   control(false, 1);
   await until(() => now.states.length > 0);
-  await new Promise((resolve) => setTimeout(resolve, 200));
+  await quiet();
   now = { messages: [], states: [] };
   if (kind === "seek") control(false, 1, value);
   if (kind === "play") control(true, value);
   if (kind === "episode") client.setParameters([{ name: "episode", value }], "p");
   await until(() => now.states.length > 0 && now.messages.length >= (count ?? 1));
-  await new Promise((resolve) => setTimeout(resolve, 200));
+  if (kind !== "play") await quiet();
   seen.steps.push({ kind, value, ...now });
 }
 client.close();

@@ -1,0 +1,235 @@
+"""Off-policy estimates beside others' code, and how often their intervals are right.
+
+    python -m benchmarks.off_policy
+
+Importance sampling: the six estimators on the same logs as SCOPE-RL's, to the last digits. Fitted Q
+evaluation: beside d3rlpy's DiscreteFQE on the same log, policy and settings, and beside the returns
+that the policy really has in the sim. Coverage: how many of `--logs` logs' 95 % intervals hold the
+true value, on a task whose value follows from linear equations (tests/two_state_task.py).
+
+Needs d3rlpy and SCOPE-RL for the first two (`make bench-learning` installs them); what is not
+installed is left out, and said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import warnings
+from contextlib import closing
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import mcaprl
+from mcaprl.offline.fqe import FQEConfig
+from mcaprl.offline.importance import ESTIMATORS, EpisodeTable
+from mcaprl.offline.off_policy import OffPolicyEvaluator
+from tests import two_state_task as task
+
+SCOPE_RL_NAMES: Final = {
+    "TIS": "TrajectoryWiseImportanceSampling",
+    "WIS": "SelfNormalizedTIS",
+    "PDIS": "PerDecisionImportanceSampling",
+    "WPDIS": "SelfNormalizedPDIS",
+    "DR": "DoublyRobust",
+}
+"""Its self-normalised DR leaves the weights of V as they are and is not our WDR."""
+
+
+def beside_scope_rl(logs: int) -> dict[str, float]:
+    """The largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
+    from scope_rl.ope.discrete import basic_estimators
+
+    worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
+    for seed in range(logs):
+        table = task.play(None, episodes=300, seed=seed)
+        # Two actions with pi and mu that have the table's ratios, and Q that has its Q and V.
+        given = _as_scope_rl(table)
+        for name, theirs in SCOPE_RL_NAMES.items():
+            estimator = getattr(basic_estimators, theirs)()
+            wanted = {k: v for k, v in given.items() if name == "DR" or "value" not in k}
+            other = estimator.estimate_policy_value(**wanted)
+            mine = float(ESTIMATORS[name](table).values(np.ones((1, 300)))[0])
+            worst[name] = max(worst[name], abs(mine - other) / abs(other))
+    return worst
+
+
+def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
+    """An episode table in SCOPE-RL's terms; the action that was taken is always its action 0."""
+    pi = np.minimum(0.5, table.ratios / 4).ravel()
+    # Action 1 has what is left of the probability, and the Q that makes V what it is.
+    other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
+    return {
+        "step_per_trajectory": table.rewards.shape[1],
+        "action": np.zeros(table.rewards.size, dtype=np.int64),
+        "reward": table.rewards.ravel(),
+        "pscore": pi / table.ratios.ravel(),
+        "evaluation_policy_action_dist": np.stack([pi, 1 - pi], axis=1),
+        "state_action_value_prediction": np.stack([table.q.ravel(), other], axis=1),
+        "gamma": table.gamma,
+    }
+
+
+class Balance:
+    """A CartPole policy that needs no training: push to the side that the pole falls to."""
+
+    def __init__(self, look_ahead_s: float) -> None:
+        """Look so far ahead; what looks back falls soon."""
+        self._look_ahead_s = look_ahead_s
+
+    def act(self, observations: NDArray[np.floating]) -> NDArray[np.int64]:
+        """(B,) 1 is to the right."""
+        angle, speed = observations[:, 2], observations[:, 3]
+        return (angle + self._look_ahead_s * speed > 0).astype(np.int64)
+
+    def action_probabilities(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(B, 2), all on one."""
+        return np.eye(2)[self.act(observations)]
+
+
+FQE: Final = FQEConfig(
+    updates=6_000,
+    batch_size=128,
+    hidden=(64, 64),
+    learning_rate=1e-3,
+    final_learning_rate_fraction=1.0,
+    gamma=0.97,
+    target_interval=30,
+)
+POLICIES: Final = {"looks ahead": Balance(0.3), "looks at the angle": Balance(0.0)}
+EPSILON: Final = 0.5
+
+
+def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[str, Any]:
+    """Columns of episodes of a policy that errs, as `Dataset.from_arrays` takes them."""
+    random = np.random.default_rng(seed)
+    rows = []
+    with closing(gym.make("CartPole-v1")) as env:
+        for episode in range(episodes):
+            observation, _ = env.reset(seed=seed * 100_000 + episode)
+            ended = False
+            while not ended:
+                best = int(policy.act(observation[None])[0])
+                action = int(random.integers(2)) if random.random() < epsilon else best
+                prob = epsilon / 2 + (1 - epsilon) * (action == best)
+                after, reward, terminated, truncated, _ = env.step(action)
+                rows.append((observation, action, reward, terminated, truncated, after, prob))
+                observation, ended = after, terminated or truncated
+    names = ("observations", "actions", "rewards", "terminated", "truncated")
+    names += ("next_observations", "behavior_probs")
+    return {name: np.array([row[k] for row in rows]) for k, name in enumerate(names)}
+
+
+def true_value(policy: Balance, episodes: int = 200) -> float:
+    """Its discounted return over fresh episodes."""
+    played = cartpole(policy, 0.0, episodes, seed=9)
+    ends = np.flatnonzero(played["terminated"] | played["truncated"])
+    lengths = np.diff(ends, prepend=-1)
+    # Each step pays 1.
+    return float(((1 - FQE.gamma**lengths) / (1 - FQE.gamma)).mean())
+
+
+def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
+    """FQE as `evaluate --data` has it."""
+    data = mcaprl.Dataset.from_arrays(**columns, env_id="CartPole-v1")
+    return OffPolicyEvaluator(data, FQE, seed).evaluate(policy, "").estimates[0].value or 0.0
+
+
+def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
+    """d3rlpy's FQE with the same settings: the mean value of the first states."""
+    import d3rlpy
+    from d3rlpy.ope.fqe import DiscreteFQE
+    from d3rlpy.ope.fqe import FQEConfig as TheirConfig
+
+    class Acting:
+        """What DiscreteFQE asks of the algorithm that it evaluates."""
+
+        @property
+        def impl(self) -> Acting:
+            return self
+
+        def predict_best_action(self, observations: torch.Tensor) -> torch.Tensor:
+            return torch.from_numpy(policy.act(observations.numpy()))
+
+    d3rlpy.seed(seed)
+    log = d3rlpy.dataset.MDPDataset(
+        columns["observations"],
+        columns["actions"],
+        columns["rewards"].astype(np.float32),
+        columns["terminated"].astype(np.float32),
+        columns["truncated"].astype(np.float32),
+        action_space=d3rlpy.ActionSpace.DISCRETE,
+        action_size=2,
+    )
+    config = TheirConfig(
+        learning_rate=FQE.learning_rate,
+        encoder_factory=d3rlpy.models.VectorEncoderFactory(list(FQE.hidden)),
+        batch_size=FQE.batch_size,
+        gamma=FQE.gamma,
+        target_update_interval=FQE.target_interval,
+    )
+    learner = DiscreteFQE(Acting(), config)
+    learner.build_with_dataset(log)
+    for _ in range(FQE.updates):
+        learner.update(log.sample_transition_batch(FQE.batch_size))
+    firsts = np.array([episode.observations[0] for episode in log.episodes])
+    return float(learner.predict_value(firsts, policy.act(firsts)).mean())
+
+
+def beside_d3rlpy(seeds: int) -> None:
+    """Print both FQEs, on logs and networks of their own for each seed, and the truth."""
+    print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
+    for name, policy in POLICIES.items():
+        found = []
+        for seed in range(seeds):
+            columns = cartpole(POLICIES["looks ahead"], EPSILON, 100, seed)
+            found.append([ours(columns, policy, seed), d3rlpys(columns, policy, seed)])
+        values, true = np.array(found), true_value(policy)
+        cells = [f"{one.mean():.2f} +- {one.std(ddof=1):.2f}" for one in values.T]
+        errors = [f"{error:.2f}" for error in np.abs(values - true).mean(0)]
+        print("|", " | ".join([name, f"{true:.2f}", *cells, *errors]), "|", flush=True)
+
+
+def coverage(logs: int, episodes: int) -> dict[str, float]:
+    """The share of logs whose interval holds the true value, for each estimator."""
+    held = dict.fromkeys(ESTIMATORS, 0)
+    for seed in range(logs):
+        table = task.play(None, episodes=episodes, seed=seed)
+        random = np.random.default_rng(seed)
+        counts = random.multinomial(episodes, [1 / episodes] * episodes, 1000).astype(np.float64)
+        for name, estimator in ESTIMATORS.items():
+            low, high = estimator(table).interval(counts)
+            held[name] += low <= task.true_value() <= high
+    return {name: times / logs for name, times in held.items()}
+
+
+def main() -> None:
+    """Compare and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--logs", type=int, default=2_000, help="of the coverage")
+    parser.add_argument("--seeds", type=int, default=4, help="of both FQEs")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")
+    if importlib.util.find_spec("scope_rl"):
+        worst = beside_scope_rl(20)
+        print("largest relative difference to SCOPE-RL:")
+        print("  " + ", ".join(f"{name} {difference:.1e}" for name, difference in worst.items()))
+    else:
+        print("SCOPE-RL is not installed: not compared")
+    if importlib.util.find_spec("d3rlpy"):
+        beside_d3rlpy(arguments.seeds)
+    else:
+        print("d3rlpy is not installed: not compared")
+    for episodes in (50, 300):
+        shares = coverage(arguments.logs, episodes)
+        print(f"{arguments.logs} logs of {episodes} episodes; 95 % intervals that hold the truth:")
+        print("  " + ", ".join(f"{name} {share:.1%}" for name, share in shares.items()), flush=True)
+
+
+if __name__ == "__main__":
+    main()

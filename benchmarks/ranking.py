@@ -1,0 +1,178 @@
+"""How well a log alone tells the checkpoints of a training run apart.
+
+    python -m benchmarks.ranking FOLDER --sim lane
+    python -m benchmarks.ranking FOLDER --sim racer
+
+Double DQN learns online and records what it does; its checkpoints are kept. Then every checkpoint
+is asked about twice: the sim runs its greedy policy through fresh episodes, which gives its true
+value, and each estimator guesses that value from the log that the run itself recorded. The orders
+are compared by Spearman's correlation and by regret@1, of each training seed; a table has their
+mean and range over seeds. Two simple rules stand beside the estimators: the last checkpoint is the
+best one, and the checkpoint that thinks most of itself is (its own mean Q of the first states).
+
+What is found goes to FOLDER/SIM/ranking.json; what is there already is not done again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+import mcaprl
+from mcaprl.offline.fqe import FQEConfig
+from mcaprl.offline.off_policy import OffPolicyEvaluator
+from mcaprl.offline.ranking import rank_correlation, regret_at_1
+from mcaprl.online.agent import Agent
+from mcaprl.online.evaluation import Scale
+from mcaprl.online.policy import OnlinePolicy, describe_run, load_policy, save_policy
+from mcaprl.online.task import Task
+from mcaprl.progress import TrainingProgress
+from mcaprl.sims import make_sims
+from mcaprl.sims.rollout import episode_seed
+
+SEEDS: Final = 4
+CHECKPOINTS: Final = 10
+EPISODES: Final = 100
+FIRST_SEED: Final = 5_000_000
+GAMMA: Final = 0.97
+RULES: Final = ("the later the better", "own mean Q")
+
+
+def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Path]]:
+    """The log of a training, and its checkpoints."""
+    log = folder / "training.mcap"
+    every = steps // CHECKPOINTS
+    kept = [folder / f"step-{every * (k + 1)}.zip" for k in range(CHECKPOINTS)]
+    if kept[-1].exists():
+        return log, kept
+    folder.mkdir(parents=True)
+    task = Task.for_sim(
+        sim, steps=steps, eval_interval=steps, eval_episodes=1, checkpoint_interval=2 * steps
+    )
+    batch = task.batch(1)
+    description = describe_run(
+        task.algo,
+        task.config.hidden,
+        batch.single_observation_space,
+        batch.single_action_space,
+        batch.spec.id if batch.spec else sim,
+        task.sim_options,
+    )
+    agent = Agent(task, description["env_id"], folder, seed, Scale(0.0, 1.0), record=log)
+
+    def keep(progress: TrainingProgress) -> None:
+        if progress.done % every == 0:
+            save_policy(folder / f"step-{progress.done}.zip", agent.model, description)
+
+    with closing(agent):
+        agent.learn(keep)
+    return log, kept
+
+
+def true_values(sim: str, policy: OnlinePolicy) -> tuple[float, float]:
+    """Mean return of the greedy policy over fresh episodes: discounted, and as it is."""
+    with closing(make_sims(sim, EPISODES)) as envs:
+        each: Any = [episode_seed(FIRST_SEED, k) for k in range(EPISODES)]
+        observations, _ = envs.reset(seed=each)
+        running, discount = np.ones(EPISODES, dtype=np.bool_), 1.0
+        discounted, plain = np.zeros(EPISODES), np.zeros(EPISODES)
+        while running.any():
+            observations, rewards, terminated, truncated, _ = envs.step(policy.act(observations))
+            discounted[running] += discount * rewards[running]
+            plain[running] += rewards[running]
+            running &= ~(terminated | truncated)
+            discount *= GAMMA
+    return float(discounted.mean()), float(plain.mean())
+
+
+def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[str, Any]]:
+    """True and estimated values of each checkpoint."""
+    dataset = mcaprl.open(log)
+    firsts = np.array([episode.observations[0] for episode in dataset.episodes])
+    evaluator = OffPolicyEvaluator(dataset, config)
+    found = []
+    for number, path in enumerate(kept):
+        policy = load_policy(path)
+        discounted, plain = true_values(sim, policy)
+        estimates = evaluator.evaluate(policy, path.stem).estimates
+        values = {estimate.estimator: estimate.value for estimate in estimates}
+        values |= dict(
+            zip(RULES, (number, float(policy.q_values(firsts).max(1).mean())), strict=True)
+        )
+        trusted = [estimate.estimator for estimate in estimates if estimate.trusted]
+        row = {"discounted": discounted, "return": plain, "estimates": values, "trusted": trusted}
+        print(path, json.dumps(row), flush=True)
+        found.append(row)
+    return found
+
+
+def judged(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
+    """Rank correlation with discounted and plain returns, regret@1 and the share of verdicts."""
+    estimated, discounted, plain = (
+        np.array([row["estimates"][estimator] if own is None else row[own] for row in rows])
+        for own in (None, "discounted", "return")
+    )
+    return (
+        rank_correlation(estimated, discounted),
+        rank_correlation(estimated, plain),
+        regret_at_1(estimated, discounted),
+        float(np.mean([estimator in row["trusted"] for row in rows])),
+    )
+
+
+def show(sim: str, by_seed: list[list[dict[str, Any]]]) -> None:
+    """Print one row for each estimator: means over training seeds, and the range."""
+    print(f"\n{sim}: {len(by_seed)} training seeds, {len(by_seed[0])} checkpoints each")
+    for name in by_seed[0][0]["estimates"]:
+        figures = np.array([judged(rows, name) for rows in by_seed])
+        cells = [_mean_and_range(column) for column in figures.T[:3]]
+        print(f"| {name} | {' | '.join(cells)} | {figures[:, 3].mean():.0%} |")
+    errors = [row["estimates"]["FQE"] - row["discounted"] for rows in by_seed for row in rows]
+    spread = [row["discounted"] for rows in by_seed for row in rows]
+    print(f"true discounted values {min(spread):.2f} to {max(spread):.2f};", end=" ")
+    print(f"FQE errs by {np.mean(np.abs(errors)):.2f} in the mean, bias {np.mean(errors):.2f}")
+
+
+def _mean_and_range(column: NDArray[np.float64]) -> str:
+    known = column[~np.isnan(column)]
+    if not len(known):
+        return "none"
+    return f"{known.mean():.2f} ({known.min():.2f} to {known.max():.2f})"
+
+
+def main() -> None:
+    """Train, ask, compare."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--sim", default="lane")
+    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--updates", type=int, default=5_000)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    config = FQEConfig(
+        updates=arguments.updates,
+        gamma=GAMMA,
+        batch_size=128,
+        hidden=(64, 64),
+        target_interval=max(1, math.floor(arguments.updates * (1 - GAMMA) / 6)),
+    )
+    folder = arguments.folder / arguments.sim
+    result = folder / "ranking.json"
+    by_seed = json.loads(result.read_text()) if result.exists() else []
+    for seed in range(len(by_seed), SEEDS):
+        log, kept = train(arguments.sim, folder / f"seed-{seed}", seed, arguments.steps)
+        by_seed.append(ask(arguments.sim, log, kept, config))
+        result.write_text(json.dumps(by_seed, indent=1) + "\n")
+    show(arguments.sim, by_seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""How the policies on a command line were learnt: the curves of their runs, for pages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mcaprl.page import Figure
+
+
+def learning_curves(names: Sequence[str]) -> list[Figure]:
+    """Figures for those POLICYs that are the folder of a run, or of one of its seeds.
+
+    Runs that learned online are compared in one figure; one that learned offline has one for each
+    term of its loss.
+    """
+    folders = dict.fromkeys(
+        found for name in names if (found := _run_folder(Path(name))) is not None
+    )
+    online = [folder for folder in folders if any(folder.glob("seed-*/curve.csv"))]
+    figures = []
+    if online:
+        from mcaprl.online.curve_picture import curve_figure, read_run
+
+        runs = [read_run(folder) for folder in online]
+        figures.append(Figure.of("Evaluations while learning", curve_figure(runs, "")))
+    for folder in folders:
+        if folder in online:
+            continue
+        from mcaprl.offline.curves import curve_figures
+
+        figures += [
+            Figure.of(f"{folder.name}: {term}", drawn) for term, drawn in curve_figures(folder)
+        ]
+    return figures
+
+
+def _run_folder(path: Path) -> Path | None:
+    """The run that a path is, or whose seed it is or lies in."""
+    of_seed = [seed.parent for seed in (path, path.parent) if seed.name.startswith("seed-")]
+    for folder in (path, *of_seed):
+        if any(any(folder.glob(f"seed-*/{name}")) for name in ("curve.csv", "metrics.csv")):
+            return folder
+    return None
