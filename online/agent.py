@@ -14,6 +14,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.utils import ConstantSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.online.algorithms import make_model
 from mcaprl.online.callbacks import BetweenRollouts, CopyTargetByEpisodes, EveryInterval
@@ -22,11 +23,12 @@ from mcaprl.online.config import DQNConfig
 from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, Scale
 from mcaprl.online.first_episodes import FirstEpisodes
+from mcaprl.online.frames import StackedVecEnv
 from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
-from mcaprl.online.warm_start import fill_buffer, sample_observations, take_weights
+from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims.rollout import episode_seed
@@ -83,8 +85,10 @@ class Agent:
                 recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
             env = stack.enter_context(closing(BatchedVecEnv(recorder or batch)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
-            self._eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
-            self.model: BaseAlgorithm = make_model(task.algo, task.config, env, seed)
+            eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
+            self._eval_env = _stacked(eval_env, task.config.frame_stack)
+            seen = _stacked(env, task.config.frame_stack)
+            self.model: BaseAlgorithm = make_model(task.algo, task.config, seen, seed)
             self._describer = None
             if recorder is not None:
                 self._describer = env.before_step = ActionDescriber(recorder, self.model)
@@ -96,6 +100,7 @@ class Agent:
             batch.single_action_space,
             env_id,
             task.sim_options,
+            task.config.frame_stack,
         )
 
     def start_from(self, data: Dataset | None, policy: Any) -> None:
@@ -118,8 +123,7 @@ class Agent:
             fill_buffer(model, data)
             model.learning_starts = 0
         if policy is not None:
-            space = self._eval_env.observation_space
-            take_weights(model, policy, sample_observations(space))
+            take_weights(model, policy, self._evaluated.single_observation_space)
             model.learning_starts = 0
             model.exploration_rate = model.exploration_final_eps
             self._explore_as_at_the_end()
@@ -216,6 +220,10 @@ class Agent:
         score = self.points[-1].score if self.points else math.nan
         steps = self._task.config.steps
         report(TrainingProgress(self._seed, model.num_timesteps, steps, {"score": score}))
+
+
+def _stacked(env: VecEnv, count: int) -> VecEnv:
+    return env if count == 1 else StackedVecEnv(env, count)
 
 
 def _logger(folder: Path, done: int) -> Logger:
