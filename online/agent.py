@@ -24,6 +24,7 @@ from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, Scale
 from mcaprl.online.first_episodes import FirstEpisodes
 from mcaprl.online.frames import StackedVecEnv
+from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
@@ -57,6 +58,7 @@ class Agent:
         *,
         record: Path | None = None,
         resume: bool = False,
+        live: LiveTraining | None = None,
     ) -> None:
         """Make an agent with fresh weights, its environments, and its log.
 
@@ -69,6 +71,7 @@ class Agent:
             record: log to write; None records nothing, neither training nor evaluations.
             resume: go on from the folder's checkpoint and behind the log's last episode, where
                 there are such.
+            live: shows what happens, to whoever connects.
 
         Raises:
             SpaceError, OutputExistsError, LogError: the log cannot be written.
@@ -83,7 +86,9 @@ class Agent:
             recorder = None
             if record is not None:
                 recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
-            env = stack.enter_context(closing(BatchedVecEnv(recorder or batch)))
+            self._watched = live.watch(recorder or batch) if live is not None else None
+            acted_in = self._watched or recorder or batch
+            env = stack.enter_context(closing(BatchedVecEnv(acted_in)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
             self._eval_env = _stacked(eval_env, task.config.frame_stack)
@@ -92,6 +97,10 @@ class Agent:
             self._describer = None
             if recorder is not None:
                 self._describer = env.before_step = ActionDescriber(recorder, self.model)
+            if self._watched is not None:
+                self._watched.model = self.model
+                if self._describer is not None:
+                    self._watched.after_asking = self._describer.forget
             self._envs = stack.pop_all()
         self._description = describe_run(
             task.algo,
@@ -204,6 +213,8 @@ class Agent:
 
     def _add_point(self, point: CurvePoint) -> None:
         self.points.append(point)
+        if self._watched is not None:
+            self._watched.score = point.score
         write_curve(self._folder / CURVE_NAME, self.points)
         self.model.logger.record("eval/score", point.score)
         self.model.logger.dump(point.step)

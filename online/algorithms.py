@@ -95,7 +95,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     )
     if _has_images(env.observation_space):
         # A quarter less work for the same convolutions; files and results are the same.
-        model.policy.to(memory_format=torch.channels_last)
+        cast(Any, model.policy).to(memory_format=torch.channels_last)
     if isinstance(config, DQNConfig) and config.exploration_decay:
         cast(DQN, model).exploration_schedule = ExponentialSchedule(
             config.exploration_initial_eps,

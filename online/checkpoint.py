@@ -100,11 +100,12 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for key, value in tensors.items():
         index, name = key.split(".")
         moments.setdefault(int(index), {})[name] = value
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
-    for index, parts in moments.items():
-        # In memory they must lie as the weights do (convolutions: channels last).
-        same = {k: v for k, v in parts.items() if v.shape == parameters[index].shape}
-        parts.update({k: torch.empty_like(parameters[index]).copy_(v) for k, v in same.items()})
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    for number, parts in moments.items():
+        for name, part in parts.items():
+            if part.shape == weights[number].shape:
+                # In memory they must lie as the weights do (convolutions: channels last).
+                parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
 

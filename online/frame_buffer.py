@@ -125,10 +125,7 @@ class FrameReplayBuffer(BaseBuffer):
     def columns(self) -> dict[str, NDArray[Any]]:
         """All that is stored, to be kept and given to `restore`."""
         rows = self.size()
-        columns = {
-            name: getattr(self, name)[:rows]
-            for name in _COLUMNS
-        }
+        columns = {name: getattr(self, name)[:rows] for name in _COLUMNS}
         columns |= {f"frames.{key}": part[:rows] for key, part in self.frames.items()}
         for name in ("newest", "finals"):
             columns |= {f"{name}.{key}": part for key, part in getattr(self, name).items()}
@@ -264,4 +261,4 @@ def _frame_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
         return spaces.Dict({key: _frame_space(part, count) for key, part in space.items()})
     assert isinstance(space, spaces.Box)
     low, high = (np.split(end, count, stack_axis(space))[-1] for end in (space.low, space.high))
-    return spaces.Box(low, high, dtype=space.dtype)  # type: ignore[arg-type]
+    return spaces.Box(low, high, dtype=space.dtype)

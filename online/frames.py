@@ -31,7 +31,7 @@ def parts_of(observations: Any) -> dict[str, NDArray[Any]]:
 
 def whole_of(parts: dict[str, Any]) -> Any:
     """Undo `parts_of`."""
-    return parts[WHOLE] if WHOLE in parts else parts
+    return parts.get(WHOLE, parts)
 
 
 def stack_axis(space: spaces.Space[Any]) -> int:

@@ -118,7 +118,9 @@ class OnlinePolicy:
         """The best actions, after what is remembered."""
         memory = self._memory
         if memory is not None:
-            seen, now = (next(iter(p.values()), ()) for p in (memory.frames, parts_of(observations)))
+            seen, now = (
+                next(iter(p.values()), ()) for p in (memory.frames, parts_of(observations))
+            )
             goes_on = len(seen) == len(now)
             observations = memory.see(observations) if goes_on else memory.begin(observations)
         return self.network.predict(observations, deterministic=deterministic)

@@ -106,7 +106,9 @@ class Stacking:
         self.buffer, self.memory = buffer, FrameMemory(space, count)
         self.ended: Any = None
 
-    def add(self, obs: Any, following: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
+    def add(
+        self, obs: Any, following: Any, action: Any, reward: Any, done: Any, infos: Any
+    ) -> None:
         if self.ended is None:
             self.memory.begin(obs)
         else:
@@ -128,9 +130,7 @@ def test_stacks_are_those_that_sb3s_buffer_would_hold(
 ) -> None:
     shown = stacked_space(PICTURE, count)
     extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
-    ours = FrameReplayBuffer(
-        20 * envs, shown, ACTIONS, "cpu", envs, **extra, frame_stack=count
-    )
+    ours = FrameReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra, frame_stack=count)
     theirs = NStepReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra)
     assert ours.frames[""].shape[2:] == PICTURE.shape
     feed([Stacking(b, PICTURE, count) for b in (ours, theirs)], PICTURE, steps, envs, seed)
