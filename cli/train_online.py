@@ -68,7 +68,8 @@ class _TrainCommand(click.Command):
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Begin with logs in the replay buffer, or with a policy's weights; may be given twice.",
+    help="Begin with logs in the replay buffer, or with a policy's weights (of a run with several"
+    " seeds, one for each); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show it to Foxglove meanwhile; frames are dropped.")
@@ -157,11 +158,11 @@ def _shown(task: Task, out: Path, port: int) -> Iterator[LiveTraining]:
         yield live
 
 
-def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, Policy | None]:
-    """The logs, and the policy, among what is to be begun with."""
+def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, list[Policy] | None]:
+    """The logs, and the policies of a run's seeds, among what is to be begun with."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"an agent begins with one policy, not with {' and '.join(policies)}")
     logs = [source for source in sources if source not in policies]
     data = open_logs(logs) if logs else None
-    return data, load_trained(Path(policies[0]))[0] if policies else None
+    return data, load_trained(Path(policies[0])) if policies else None

@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -116,7 +116,8 @@ class Agent:
         """Begin with experience: logged transitions in the replay buffer, a policy's weights.
 
         Data make the random steps at the beginning needless. A policy's agent explores as it
-        would at the end of its training.
+        would at the end of its training, and learns once it has acted for as many steps as others
+        act at random.
 
         Args:
             data: None has none.
@@ -133,7 +134,7 @@ class Agent:
             model.learning_starts = 0
         if policy is not None:
             take_weights(model, policy, self._evaluated.single_observation_space)
-            model.learning_starts = 0
+            model.learning_starts = cast(DQNConfig, self._task.config).learning_starts
             model.exploration_rate = model.exploration_final_eps
             self._explore_as_at_the_end()
 
@@ -206,6 +207,7 @@ class Agent:
     def _explore_as_at_the_end(self) -> None:
         self._began_with_policy = True
         model: Any = self.model
+        model.acts_at_once = True
         model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
 
     def _keep_best(self) -> None:

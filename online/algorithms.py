@@ -21,7 +21,7 @@ from mcaprl.online.config import (
     OnlineConfig,
     PPOConfig,
 )
-from mcaprl.online.double_dqn import DoubleDQN
+from mcaprl.online.double_dqn import DoubleDQN, WarmDQN
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.frames import parts_of_space
 
@@ -40,7 +40,7 @@ class Algorithm:
 
 
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "dqn": Algorithm(DQNConfig, DQN),
+    "dqn": Algorithm(DQNConfig, WarmDQN),
     "double-dqn": Algorithm(DoubleDQNConfig, DoubleDQN),
     "ppo": Algorithm(PPOConfig, PPO),
     "a2c": Algorithm(A2CConfig, A2C),

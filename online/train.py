@@ -91,7 +91,8 @@ def train(
         seed: of the first; the others count up from it.
         record: log of every transition, written while it happens; with several seeds a folder.
         data: logged transitions to begin the replay buffer with.
-        policy: a trained one with Q-values, whose weights to begin with.
+        policy: a trained one with Q-values, whose weights to begin with; of several, each seed
+            takes another.
         resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
         live: shows the training to whoever connects; its layout is written into `out`.
         progress: called now and then; None shows a bar where stderr is a terminal.
@@ -113,7 +114,7 @@ def train(
     config = task.config
     with closing(make_sim(task.sim, **task.sim_options)) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(Path(out), task, env, logs, data, policy, live)
+        run = _Run(Path(out), task, env, logs, data, policy, live, seed)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -137,6 +138,7 @@ class _Run:
     data: Dataset | None
     policy: Any
     live: LiveTraining | None
+    first_seed: int
 
     def open(self, resume: bool) -> None:
         """Make the folder, or make sure that it is this run's."""
@@ -178,7 +180,7 @@ class _Run:
             live=self.live,
         )
         with closing(agent):
-            agent.start_from(self.data, self.policy)
+            agent.start_from(self.data, self._policy_of(seed))
             agent.learn(report)
         score = evaluate(
             self.env,
@@ -198,6 +200,11 @@ class _Run:
             score=fresh.score(score.mean_return),
             ends=score.ends,
         )
+
+    def _policy_of(self, seed: int) -> Any:
+        if not isinstance(self.policy, Sequence):
+            return self.policy
+        return self.policy[(seed - self.first_seed) % len(self.policy)]
 
     def conclude(self, summaries: Sequence[RunSummary], fresh: Scale) -> None:
         """Write the scores of all seeds, and their curves as a picture."""

@@ -5,8 +5,8 @@ Viewers find the topics of a log, as `log_writer` and `display` describe them, a
     /rl/training    mcaprl_msgs/msg/Telemetry...    named numbers of the learner: loss, epsilon, ...
 
 Nothing is kept, and nobody is waited for. Times are those of the wall clock: simulated time is no
-use where whole episodes are left out. What does not move is told to each new viewer, and again where
-it changes.
+use where whole episodes are left out. What does not move is told to each new viewer, and again
+where it changes.
 """
 
 from __future__ import annotations
