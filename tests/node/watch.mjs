@@ -12,11 +12,15 @@ client.on("error", (error) => {
   console.error(error);
   process.exit(1);
 });
+let waits = true;
 client.on("advertise", (channels) => {
   for (const { id, topic, schemaName, schema } of channels) {
     seen.topics[topic] = { schemaName, schema };
     byId.set(client.subscribe(id), topic);
   }
+  // What was sent before this is answered is lost; the server answers in order.
+  if (waits) setTimeout(() => console.log("watching"), 300);
+  waits = false;
 });
 client.on("message", ({ subscriptionId, timestamp, data }) => {
   const bytes = Buffer.from(data.buffer, data.byteOffset, data.byteLength).toString("base64");
