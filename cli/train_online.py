@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,6 +18,10 @@ from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.reader import open_logs
 from mcaprl.sims.rollout import Policy
+
+if TYPE_CHECKING:
+    from mcaprl.online.live import LiveTraining
+    from mcaprl.online.task import Task
 
 
 class _TrainCommand(click.Command):
@@ -62,9 +68,18 @@ class _TrainCommand(click.Command):
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Begin with logs in the replay buffer, or with a policy's weights; may be given twice.",
+    help="Begin with logs in the replay buffer, or with a policy's weights (of a run with several"
+    " seeds, one for each); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
+@click.option("--live", is_flag=True, help="Show it to Foxglove meanwhile; frames are dropped.")
+@click.option(
+    "--port",
+    default=8765,
+    show_default=True,
+    type=click.IntRange(0, 65535),
+    help="With --live: of 127.0.0.1, to listen on; 0 takes any that is free.",
+)
 @sim_options
 def train_online(
     sim: str | None,
@@ -77,6 +92,8 @@ def train_online(
     record: Path | None,
     sources: tuple[str, ...],
     resume: bool,
+    live: bool,
+    port: int,
     sim_arguments: dict[str, Any],
     **settings: Any,
 ) -> None:
@@ -97,16 +114,18 @@ def train_online(
         sim, algo, sim_arguments, given, preset=preset, resumed=out if resume else None
     )
     data, policy = _experience(sources)
-    summaries = train(
-        task,
-        out,
-        seeds=seeds,
-        seed=seed,
-        record=record,
-        data=data,
-        policy=policy,
-        resume=resume,
-    )
+    with _shown(task, out, port) if live else nullcontext() as shown:
+        summaries = train(
+            task,
+            out,
+            seeds=seeds,
+            seed=seed,
+            record=record,
+            data=data,
+            policy=policy,
+            resume=resume,
+            live=shown,
+        )
     rows = [
         [
             str(summary.folder),
@@ -126,11 +145,24 @@ def train_online(
     click.echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")
 
 
-def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, Policy | None]:
-    """The logs, and the policy, among what is to be begun with."""
+@contextmanager
+def _shown(task: Task, out: Path, port: int) -> Iterator[LiveTraining]:
+    """Listen for viewers, and tell the user where."""
+    from mcaprl.online.live import LiveTraining
+    from mcaprl.recorder.layout import LAYOUT_NAME
+
+    with closing(LiveTraining(task, port=port)) as live:
+        click.echo(f"open {live.stream.app_url}")
+        click.echo(f"or connect any viewer of the Foxglove protocol to {live.stream.url}")
+        click.echo(f"layout to import: {out / LAYOUT_NAME}")
+        yield live
+
+
+def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, list[Policy] | None]:
+    """The logs, and the policies of a run's seeds, among what is to be begun with."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"an agent begins with one policy, not with {' and '.join(policies)}")
     logs = [source for source in sources if source not in policies]
     data = open_logs(logs) if logs else None
-    return data, load_trained(Path(policies[0]))[0] if policies else None
+    return data, load_trained(Path(policies[0])) if policies else None

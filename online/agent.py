@@ -8,12 +8,13 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.utils import ConstantSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.online.algorithms import make_model
 from mcaprl.online.callbacks import BetweenRollouts, CopyTargetByEpisodes, EveryInterval
@@ -22,11 +23,13 @@ from mcaprl.online.config import DQNConfig
 from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, Scale
 from mcaprl.online.first_episodes import FirstEpisodes
+from mcaprl.online.frames import StackedVecEnv
+from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
-from mcaprl.online.warm_start import fill_buffer, sample_observations, take_weights
+from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.sims.rollout import episode_seed
@@ -55,6 +58,7 @@ class Agent:
         *,
         record: Path | None = None,
         resume: bool = False,
+        live: LiveTraining | None = None,
     ) -> None:
         """Make an agent with fresh weights, its environments, and its log.
 
@@ -67,6 +71,7 @@ class Agent:
             record: log to write; None records nothing, neither training nor evaluations.
             resume: go on from the folder's checkpoint and behind the log's last episode, where
                 there are such.
+            live: shows what happens, to whoever connects.
 
         Raises:
             SpaceError, OutputExistsError, LogError: the log cannot be written.
@@ -81,13 +86,21 @@ class Agent:
             recorder = None
             if record is not None:
                 recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
-            env = stack.enter_context(closing(BatchedVecEnv(recorder or batch)))
+            self._watched = live.watch(recorder or batch) if live is not None else None
+            acted_in = self._watched or recorder or batch
+            env = stack.enter_context(closing(BatchedVecEnv(acted_in)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
-            self._eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
-            self.model: BaseAlgorithm = make_model(task.algo, task.config, env, seed)
+            eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
+            self._eval_env = _stacked(eval_env, task.config.frame_stack)
+            seen = _stacked(env, task.config.frame_stack)
+            self.model: BaseAlgorithm = make_model(task.algo, task.config, seen, seed)
             self._describer = None
             if recorder is not None:
                 self._describer = env.before_step = ActionDescriber(recorder, self.model)
+            if self._watched is not None:
+                self._watched.model = self.model
+                if self._describer is not None:
+                    self._watched.after_asking = self._describer.forget
             self._envs = stack.pop_all()
         self._description = describe_run(
             task.algo,
@@ -96,13 +109,15 @@ class Agent:
             batch.single_action_space,
             env_id,
             task.sim_options,
+            task.config.frame_stack,
         )
 
     def start_from(self, data: Dataset | None, policy: Any) -> None:
         """Begin with experience: logged transitions in the replay buffer, a policy's weights.
 
         Data make the random steps at the beginning needless. A policy's agent explores as it
-        would at the end of its training.
+        would at the end of its training, and learns once it has acted for as many steps as others
+        act at random.
 
         Args:
             data: None has none.
@@ -118,9 +133,8 @@ class Agent:
             fill_buffer(model, data)
             model.learning_starts = 0
         if policy is not None:
-            space = self._eval_env.observation_space
-            take_weights(model, policy, sample_observations(space))
-            model.learning_starts = 0
+            take_weights(model, policy, self._evaluated.single_observation_space)
+            model.learning_starts = cast(DQNConfig, self._task.config).learning_starts
             model.exploration_rate = model.exploration_final_eps
             self._explore_as_at_the_end()
 
@@ -193,6 +207,7 @@ class Agent:
     def _explore_as_at_the_end(self) -> None:
         self._began_with_policy = True
         model: Any = self.model
+        model.acts_at_once = True
         model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
 
     def _keep_best(self) -> None:
@@ -200,6 +215,8 @@ class Agent:
 
     def _add_point(self, point: CurvePoint) -> None:
         self.points.append(point)
+        if self._watched is not None:
+            self._watched.score = point.score
         write_curve(self._folder / CURVE_NAME, self.points)
         self.model.logger.record("eval/score", point.score)
         self.model.logger.dump(point.step)
@@ -216,6 +233,10 @@ class Agent:
         score = self.points[-1].score if self.points else math.nan
         steps = self._task.config.steps
         report(TrainingProgress(self._seed, model.num_timesteps, steps, {"score": score}))
+
+
+def _stacked(env: VecEnv, count: int) -> VecEnv:
+    return env if count == 1 else StackedVecEnv(env, count)
 
 
 def _logger(folder: Path, done: int) -> Logger:

@@ -100,6 +100,12 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for key, value in tensors.items():
         index, name = key.split(".")
         moments.setdefault(int(index), {})[name] = value
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    for number, parts in moments.items():
+        for name, part in parts.items():
+            if part.shape == weights[number].shape:
+                # In memory they must lie as the weights do (convolutions: channels last).
+                parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
 

@@ -29,6 +29,8 @@ class OnlineConfig(Settings):
     """discount of the reward one step later"""
     hidden: tuple[int, ...] = (64, 64)
     """widths of the hidden layers; for images, of those behind the convolutions"""
+    frame_stack: int = 1
+    """how many successive observations the network sees at once"""
     max_grad_norm: float = 10.0
     """longer gradients are scaled down to this length"""
     eval_interval: int = 5_000
@@ -42,7 +44,8 @@ class OnlineConfig(Settings):
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
-        for name in ("steps", "envs", "eval_interval", "eval_episodes", "checkpoint_interval"):
+        counts = ("steps", "envs", "frame_stack", "eval_interval", "eval_episodes")
+        for name in (*counts, "checkpoint_interval"):
             self._require(name, getattr(self, name) >= 1, "at least 1")
         for name in ("learning_rate", "max_grad_norm"):
             self._require(name, getattr(self, name) > 0, "above 0")

@@ -25,6 +25,7 @@ class CurvePoint:
         lowest_return: of an episode.
         highest_return: of an episode.
         mean_length: steps of an episode.
+        mean_progress_m: along the path or line in an episode; NaN where the environment tells none.
         best: whether the mean return was higher than ever.
     """
 
@@ -34,6 +35,7 @@ class CurvePoint:
     lowest_return: float
     highest_return: float
     mean_length: float
+    mean_progress_m: float
     best: bool
 
 

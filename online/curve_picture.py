@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,13 @@ from mcaprl.online.curve import CURVE_NAME, CurvePoint, read_curve
 
 PICTURE_NAME = "curve.png"
 SCORES_NAME = "scores.json"
+VALUES: Final = {
+    "score": "score: random 0, pilot 1",
+    "mean_return": "mean return",
+    "mean_progress_m": "metres along the path in an episode",
+    "mean_length": "steps of an episode",
+}
+"""What of a curve can be drawn, and how the axis is labelled."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +64,18 @@ def _final_scores(path: Path) -> tuple[float, ...]:
         raise TrainingError(f"cannot read the scores in {path}: {error}") from error
 
 
-def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
+def curve_picture(
+    path: Path, runs: Sequence[RunCurve], title: str, value: str | None = None
+) -> None:
     """Draw curves of runs: each seed, the median over them, and their range.
 
-    Dots at the right are the best checkpoints on fresh episodes.
+    Dots at the right of scores are the best checkpoints on fresh episodes.
 
     Args:
         path: of the PNG to write.
         runs: to be compared.
         title: over the picture.
+        value: a key of `VALUES`; None is the score where there is one, else the mean return.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -77,34 +87,40 @@ def curve_picture(path: Path, runs: Sequence[RunCurve], title: str) -> None:
 def curve_figure(runs: Sequence[RunCurve], title: str) -> Any:
     """The same as a figure."""
     figure, axes = new_figure((7.2, 4.0))
-    scored = all(np.isfinite(p.score) for run in runs for seed in run.seeds for p in seed)
+    if value is None:
+        scored = all(np.isfinite(p.score) for run in runs for seed in run.seeds for p in seed)
+        value = "score" if scored else "mean_return"
     for run, color in zip(runs, COLORS, strict=False):
-        _draw_run(axes, run, color, scored)
-    if scored:
+        _draw_run(axes, run, color, value)
+    if value == "score":
         axes.axhline(1, color=INK, lw=1, ls="--", zorder=0)
         axes.axhline(0, color=PALE, lw=1, zorder=0)
-    axes.set_ylabel("score: random 0, pilot 1" if scored else "mean return")
-    dots = "; dots: best checkpoints on fresh episodes" if any(run.finals for run in runs) else ""
+    axes.set_ylabel(VALUES[value])
+    dots = "; dots: best checkpoints on fresh episodes" if _has_finals(runs, value) else ""
     axes.set_xlabel(f"environment steps{dots}")
     axes.set_title(title)
     axes.legend(loc="lower right")
     return figure
 
 
-def _draw_run(axes: Any, run: RunCurve, color: str, scored: bool) -> None:
-    steps, values = _on_common_steps(run, scored)
+def _has_finals(runs: Sequence[RunCurve], value: str) -> bool:
+    return value == "score" and any(run.finals for run in runs)
+
+
+def _draw_run(axes: Any, run: RunCurve, color: str, value: str) -> None:
+    steps, values = _on_common_steps(run, value)
     axes.plot(steps, values.T, color=color, lw=0.6, alpha=0.35)
     axes.fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.15, lw=0)
     label = f"{run.name}: median and range of {len(values)} seeds"
     axes.plot(steps, np.median(values, axis=0), color=color, lw=2, label=label)
-    if scored and run.finals:
+    if _has_finals([run], value):
         beyond = np.full(len(run.finals), steps[-1] * 1.04)
         axes.plot(beyond, run.finals, "o", color=color, mec="white", ms=6, clip_on=False)
 
 
-def _on_common_steps(run: RunCurve, scored: bool) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _on_common_steps(run: RunCurve, value: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """The steps that all seeds have reached, and (seeds, steps) what was measured there."""
     length = min(len(points) for points in run.seeds)
     steps = np.array([point.step for point in run.seeds[0][:length]])
-    values = [[p.score if scored else p.mean_return for p in seed[:length]] for seed in run.seeds]
+    values = [[getattr(point, value) for point in seed[:length]] for seed in run.seeds]
     return steps, np.array(values)

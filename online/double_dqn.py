@@ -8,13 +8,35 @@ replay buffer gives both, fewer steps where the episode ended sooner.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3 import DQN
+from stable_baselines3.common.noise import ActionNoise
 from torch.nn import functional
 
 
-class DoubleDQN(DQN):
+class WarmDQN(DQN):
+    """SB3's DQN, which may begin with weights that are worth acting by.
+
+    Attributes:
+        acts_at_once: whether the steps before learning starts are the policy's own, not random
+            ones. A policy that learns from its first few steps alone forgets what it knew
+            (https://arxiv.org/abs/2412.07762): it is to fill the buffer first.
+    """
+
+    acts_at_once = False
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        starts = 0 if self.acts_at_once else learning_starts
+        return super()._sample_action(starts, action_noise, n_envs)
+
+
+class DoubleDQN(WarmDQN):
     """SB3's DQN in all but the target; its `.zip` files load as `DQN`, too."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:

@@ -94,6 +94,7 @@ class Evaluation(EvalCallback):
         self._on_point = on_point
         self._returns: list[float] = []
         self._lengths: list[int] = []
+        self._progress_m: list[float] = []
 
     def resume(self, calls: int, best_mean_return: float) -> None:
         """Go on as after so many steps of all environments."""
@@ -103,7 +104,7 @@ class Evaluation(EvalCallback):
         if self.n_calls % self.eval_freq:
             return True
         self.eval_env.seed(SELECTION_SEED)
-        self._returns, self._lengths = [], []
+        self._returns, self._lengths, self._progress_m = [], [], []
         best_before = self.best_mean_reward
         going_on = super()._on_step()
         point = CurvePoint(
@@ -113,6 +114,7 @@ class Evaluation(EvalCallback):
             lowest_return=min(self._returns),
             highest_return=max(self._returns),
             mean_length=float(np.mean(self._lengths)),
+            mean_progress_m=float(np.mean(self._progress_m)),
             best=self.best_mean_reward > best_before,
         )
         self._on_point(point)
@@ -125,6 +127,7 @@ class Evaluation(EvalCallback):
             episode = locals_["info"]["episode"]
             self._returns.append(episode["r"])
             self._lengths.append(episode["l"])
+            self._progress_m.append(locals_["info"].get("progress_m", math.nan))
 
 
 class _Call(BaseCallback):

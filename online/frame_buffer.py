@@ -2,7 +2,8 @@
 
 SB3's own keeps every observation twice, as one step's next and the following step's first: 500,000
 depth images of 84x84 then take 7 GB. Here the next observation is the following row's; only those
-that end an episode are kept beside.
+that end an episode are kept beside. Where observations are several frames in a row, each frame is
+stored once all the same.
 """
 
 from __future__ import annotations
@@ -17,21 +18,24 @@ from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-# The one part of observations that are no dict.
-_WHOLE = ""
+from mcaprl.online.frames import WHOLE, joined, parts_of, parts_of_space, stack_axis, whole_of
+
 _FIRST_FINALS = 64
+_COLUMNS = ("final_of", "ages", "actions", "rewards", "dones", "timeouts")
 
 
 class FrameReplayBuffer(BaseBuffer):
     """As SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer`, in half the memory.
 
-    R rows of N environments; a row's step follows the step of the row before.
+    R rows of N environments; a row's step follows the step of the row before. *shape is that of a
+    single frame. If frames before an oldest step are overwritten, its own stands for them.
 
     Attributes:
         frames: by key, (R, N, *shape); observations that are no dict have the key "".
         newest: by key, (N, *shape), what followed the last row.
         finals: by key, (F, *shape), where episodes ended.
         final_of: (R, N), which of `finals` followed; -1 where the episode went on.
+        ages: (R, N), frames of the episode before this one; not counted beyond what is looked at.
         actions: (R, N, 1).
         rewards: (R, N) float32.
         dones: (R, N) float32, 1 where an episode ended, for whatever reason.
@@ -49,6 +53,7 @@ class FrameReplayBuffer(BaseBuffer):
         *,
         n_steps: int = 1,
         gamma: float = 1.0,
+        frame_stack: int = 1,
     ) -> None:
         """Reserve the memory; the system gives it as it is filled.
 
@@ -61,16 +66,19 @@ class FrameReplayBuffer(BaseBuffer):
             optimize_memory_usage: SB3 passes it; it changes nothing.
             n_steps: rewards that are summed up.
             gamma: discount of the reward one step later.
+            frame_stack: k, how many frames in a row an observation is.
         """
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = rows = max(buffer_size // n_envs, 1)
-        self.n_steps, self.gamma = n_steps, gamma
-        parts = _parts_of(observation_space)
+        self.n_steps, self.gamma, self.frame_stack = n_steps, gamma, frame_stack
+        self.frame_space = _frame_space(observation_space, frame_stack)
+        parts = parts_of_space(self.frame_space)
         self.frames = {k: np.zeros((rows, n_envs, *s.shape), s.dtype) for k, s in parts.items()}
         self.newest = {k: np.zeros((n_envs, *s.shape), s.dtype) for k, s in parts.items()}
         self.finals = {k: np.zeros((_FIRST_FINALS, *s.shape), s.dtype) for k, s in parts.items()}
         self.final_of = np.full((rows, n_envs), -1, np.int64)
         self._free = list(range(_FIRST_FINALS))
+        self.ages = np.zeros((rows, n_envs), np.int64)
         self.actions = np.zeros((rows, n_envs, self.action_dim), action_space.dtype)
         self.rewards = np.zeros((rows, n_envs), np.float32)
         self.dones = np.zeros((rows, n_envs), np.float32)
@@ -88,19 +96,21 @@ class FrameReplayBuffer(BaseBuffer):
         """Append a step of each environment.
 
         Args:
-            obs: (N, *shape); where the step before ended no episode, its `next_obs`.
+            obs: (N, *shape); where the step before ended no episode, its `next_obs`. Of stacks only
+                the newest frame is looked at.
             next_obs: (N, *shape), at an episode's end its last observation.
             action: (N,).
             reward: (N,).
             done: (N,).
             infos: whose `TimeLimit.truncated` says that an episode was cut off.
         """
-        row, following = self.pos, _as_parts(next_obs)
-        for key, part in _as_parts(obs).items():
+        row, following = self.pos, self._newest_frames(next_obs)
+        for key, part in self._newest_frames(obs).items():
             self.frames[key][row] = part
             self.newest[key][:] = following[key]
         self._free += [slot for slot in self.final_of[row].tolist() if slot >= 0]
         self.final_of[row] = -1
+        self.ages[row] = self._ages_after(row - 1)
         for env in np.flatnonzero(done).tolist():
             slot = self._free_slot()
             self.final_of[row, env] = slot
@@ -115,10 +125,7 @@ class FrameReplayBuffer(BaseBuffer):
     def columns(self) -> dict[str, NDArray[Any]]:
         """All that is stored, to be kept and given to `restore`."""
         rows = self.size()
-        columns = {
-            name: getattr(self, name)[:rows]
-            for name in ("final_of", "actions", "rewards", "dones", "timeouts")
-        }
+        columns = {name: getattr(self, name)[:rows] for name in _COLUMNS}
         columns |= {f"frames.{key}": part[:rows] for key, part in self.frames.items()}
         for name in ("newest", "finals"):
             columns |= {f"{name}.{key}": part for key, part in getattr(self, name).items()}
@@ -127,7 +134,7 @@ class FrameReplayBuffer(BaseBuffer):
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
         """Go back to what `columns` gave; `pos` and `full` are set already."""
         rows = self.size()
-        for name in ("final_of", "actions", "rewards", "dones", "timeouts"):
+        for name in _COLUMNS:
             getattr(self, name)[:rows] = columns[name]
         for key, part in self.frames.items():
             part[:rows] = columns[f"frames.{key}"]
@@ -154,14 +161,14 @@ class FrameReplayBuffer(BaseBuffer):
         rows, returns, discounts = self._look_ahead(batch_inds, envs)
         terminated = self.dones[rows, envs] * (1 - self.timeouts[rows, envs])
         samples = (
-            self._tensors({key: part[batch_inds, envs] for key, part in self.frames.items()}),
+            self._tensors(self._stacks(batch_inds, envs)),
             self.to_torch(self.actions[batch_inds, envs]),
             self._tensors(self._following(rows, envs)),
             self.to_torch(terminated[:, None]),
             self.to_torch(returns[:, None]),
             self.to_torch(discounts[:, None]) if self.n_steps > 1 else None,
         )
-        if _WHOLE in self.frames:
+        if WHOLE in self.frames:
             return ReplayBufferSamples(*samples)
         return DictReplayBufferSamples(*samples)
 
@@ -183,8 +190,27 @@ class FrameReplayBuffer(BaseBuffer):
         discounts = np.float32(self.gamma) ** (last + 1).astype(np.float32)
         return ahead[np.arange(len(rows)), last], returns, discounts
 
+    def _stacks(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """What was observed before the steps of rows."""
+        if self.frame_stack == 1:
+            return {key: part[rows, envs] for key, part in self.frames.items()}
+        places = self._places(rows, envs, np.arange(self.frame_stack)[::-1])
+        return self._joined({key: part[places, envs[:, None]] for key, part in self.frames.items()})
+
     def _following(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
         """What was observed after the steps of rows."""
+        following = self._frames_after(rows, envs)
+        if self.frame_stack == 1:
+            return following
+        places = self._places(rows, envs, np.arange(self.frame_stack - 1)[::-1])
+        stacks = {
+            key: np.concatenate([part[places, envs[:, None]], following[key][:, None]], axis=1)
+            for key, part in self.frames.items()
+        }
+        return self._joined(stacks)
+
+    def _frames_after(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
+        """The frames that were seen after the steps of rows."""
         slots = self.final_of[rows, envs]
         ended = slots >= 0
         newest = ~ended & (rows == (self.pos - 1) % self.buffer_size)
@@ -196,14 +222,43 @@ class FrameReplayBuffer(BaseBuffer):
             found[key] = part
         return found
 
+    def _places(
+        self, rows: NDArray[Any], envs: NDArray[Any], before: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Which rows have the frames so many steps before those of rows, in the same episode."""
+        oldest = self.pos if self.full else 0
+        kept = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
+        places: NDArray[np.int64] = rows[:, None] - np.minimum(before, kept[:, None])
+        return places % self.buffer_size
+
+    def _ages_after(self, row: int) -> NDArray[np.int64]:
+        """How many frames of the same episode were seen before the one that follows a row."""
+        if not self.size():
+            return np.zeros(self.n_envs, np.int64)
+        ages = np.minimum(self.ages[row] + 1, self.frame_stack)
+        return np.where(self.dones[row] > 0, 0, ages)
+
+    def _newest_frames(self, observations: Any) -> dict[str, NDArray[Any]]:
+        """The newest frame of each stack."""
+        newest = {}
+        for key, space in parts_of_space(self.frame_space).items():
+            part, axis = parts_of(observations)[key], stack_axis(space)
+            count = space.shape[axis]
+            newest[key] = np.take(part, range(-count, 0), axis) if self.frame_stack > 1 else part
+        return newest
+
+    def _joined(self, frames: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        return parts_of(joined(whole_of(frames), self.frame_space))
+
     def _tensors(self, parts: dict[str, NDArray[Any]]) -> Any:
         tensors = {key: self.to_torch(part, copy=False) for key, part in parts.items()}
-        return tensors.get(_WHOLE, tensors)
+        return whole_of(tensors)
 
 
-def _parts_of(space: spaces.Space[Any]) -> dict[str, Any]:
-    return dict(space.items()) if isinstance(space, spaces.Dict) else {_WHOLE: space}
-
-
-def _as_parts(observations: Any) -> dict[str, NDArray[Any]]:
-    return observations if isinstance(observations, dict) else {_WHOLE: observations}
+def _frame_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
+    """The space of a single frame of stacks."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: _frame_space(part, count) for key, part in space.items()})
+    assert isinstance(space, spaces.Box)
+    low, high = (np.split(end, count, stack_axis(space))[-1] for end in (space.low, space.high))
+    return spaces.Box(low, high, dtype=space.dtype)

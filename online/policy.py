@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import VecTransposeImage
 from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
 
 from mcaprl.errors import PolicyError, SpaceError
+from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
 from mcaprl.online.sb3_data import description_of
 from mcaprl.online.zip_file import read_model, write_model
 from mcaprl.recorder.spaces import space_from_json, space_to_json
@@ -54,6 +55,7 @@ class OnlinePolicy:
         action_space: of one action.
         env_id: of the environment it learned in; empty if unknown.
         env_kwargs: arguments to make that environment.
+        frame_stack: how many successive observations it looks at; see `act`.
         network: SB3's policy.
     """
 
@@ -63,18 +65,31 @@ class OnlinePolicy:
     action_space: spaces.Space[Any]
     env_id: str
     env_kwargs: dict[str, Any]
+    frame_stack: int
     network: BasePolicy
+    _memory: FrameMemory | None
+
+    def begin(self) -> None:
+        """Forget what was seen: the next observations are the first of their episodes."""
+        if self._memory is not None:
+            self._memory.frames = {}
 
     def act(self, observations: Any) -> NDArray[np.int64]:
         """The best actions (B,), values of `action_space`.
 
+        A policy with `frame_stack` k > 1 remembers the observations of its last k calls since
+        `begin`.
+
         Raises:
             PolicyError: the observations do not fit the network.
         """
-        return cast(NDArray[np.int64], self._tried(self.network.predict, observations)[0])
+        return cast(NDArray[np.int64], self._tried(self._predicted, observations)[0])
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
         """The values (B, A) of all actions, in the order of the action space.
+
+        Args:
+            observations: (B, *shape), or (B, k, *shape), oldest first, where k frames are stacked.
 
         Raises:
             PolicyError: the policy has none, or the observations do not fit the network.
@@ -86,6 +101,9 @@ class OnlinePolicy:
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
         """The probabilities (B, A) of all actions; those of a Q-network are 0 but for the best.
 
+        Args:
+            observations: as of `q_values`.
+
         Raises:
             PolicyError: the observations do not fit the network.
         """
@@ -96,8 +114,21 @@ class OnlinePolicy:
         probabilities[np.arange(len(outputs)), outputs.argmax(1)] = 1.0
         return probabilities
 
+    def _predicted(self, observations: Any, deterministic: bool) -> Any:
+        """The best actions, after what is remembered."""
+        memory = self._memory
+        if memory is not None:
+            seen, now = (
+                next(iter(p.values()), ()) for p in (memory.frames, parts_of(observations))
+            )
+            goes_on = len(seen) == len(now)
+            observations = memory.see(observations) if goes_on else memory.begin(observations)
+        return self.network.predict(observations, deterministic=deterministic)
+
     def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:
         """Q-values, or probabilities."""
+        if self._memory is not None:
+            observations = joined(observations, self._memory.space)
         tensor = self.network.obs_to_tensor(observations)[0]
         with torch.inference_mode():
             if isinstance(self.network, DQNPolicy):
@@ -140,11 +171,13 @@ def describe_run(
     action_space: spaces.Space[Any],
     env_id: str,
     env_kwargs: dict[str, Any],
+    frame_stack: int = 1,
 ) -> dict[str, Any]:
     """What a run knows of its policies, as plain JSON types."""
     return {
         "algo": algo,
         "net_arch": list(hidden),
+        "frame_stack": frame_stack,
         "observation_space": json.loads(space_to_json(observation_space)),
         "action_space": json.loads(space_to_json(action_space)),
         "env_id": env_id,
@@ -198,7 +231,8 @@ def _build(
 ) -> OnlinePolicy:
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = space_from_json(json.dumps(description["action_space"]))
-    shown = channels_first(observation_space)
+    frames = int(description.get("frame_stack", 1))
+    shown = channels_first(stacked_space(observation_space, frames))
     policy_type: Any = _policy_type(description["network"], shown)
     network = policy_type(
         shown,
@@ -218,7 +252,9 @@ def _build(
         action_space=action_space,
         env_id=description.get("env_id", ""),
         env_kwargs=description.get("env_kwargs", {}),
+        frame_stack=frames,
         network=network,
+        _memory=FrameMemory(observation_space, frames) if frames > 1 else None,
     )
 
 

@@ -18,6 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.online.double_dqn import WarmDQN
 from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.vector_wrapper import RecordVecMcap
 
@@ -111,7 +112,10 @@ def exploration(model: BaseAlgorithm) -> float:
     """The probability of a random action in the next step; NaN where the policy is stochastic."""
     if not isinstance(model, DQN):
         return math.nan
-    return 1.0 if model.num_timesteps < model.learning_starts else model.exploration_rate
+    at_random = model.num_timesteps < model.learning_starts
+    if at_random and not (isinstance(model, WarmDQN) and model.acts_at_once):
+        return 1.0
+    return model.exploration_rate
 
 
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:

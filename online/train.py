@@ -9,6 +9,7 @@ RUN/seed-0/progress.csv                 SB3's own scalars; the same for TensorBo
 RUN/seed-1/...
 RUN/scores.json                         each seed's best checkpoint on fresh episodes
 RUN/curve.png                           the curves of all seeds
+RUN/foxglove-layout.json                for who watches, if it is shown while it trains
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ from mcaprl.online.agent import Agent
 from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curve_picture import PICTURE_NAME, SCORES_NAME, curve_picture, read_run
 from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
+from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import BEST_NAME, load_policy
 from mcaprl.online.recording import log_paths
 from mcaprl.online.task import CONFIG_NAME, Task, read_config
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.layout import LAYOUT_NAME
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluate import evaluate
 
@@ -76,6 +79,7 @@ def train(
     data: Dataset | None = None,
     policy: Any = None,
     resume: bool = False,
+    live: LiveTraining | None = None,
     progress: ProgressCallback | None = None,
 ) -> list[RunSummary]:
     """Train in an environment; the same seed and machine give the same curve.
@@ -87,8 +91,10 @@ def train(
         seed: of the first; the others count up from it.
         record: log of every transition, written while it happens; with several seeds a folder.
         data: logged transitions to begin the replay buffer with.
-        policy: a trained one with Q-values, whose weights to begin with.
+        policy: a trained one with Q-values, whose weights to begin with; of several, each seed
+            takes another.
         resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
+        live: shows the training to whoever connects; its layout is written into `out`.
         progress: called now and then; None shows a bar where stderr is a terminal.
 
     Returns:
@@ -108,7 +114,7 @@ def train(
     config = task.config
     with closing(make_sim(task.sim, **task.sim_options)) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(Path(out), task, env, logs, data, policy)
+        run = _Run(Path(out), task, env, logs, data, policy, live, seed)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -131,9 +137,16 @@ class _Run:
     logs: dict[int, Path]
     data: Dataset | None
     policy: Any
+    live: LiveTraining | None
+    first_seed: int
 
     def open(self, resume: bool) -> None:
         """Make the folder, or make sure that it is this run's."""
+        self._open(resume)
+        if self.live is not None:
+            write_json(self.folder / LAYOUT_NAME, self.live.stream.layout())
+
+    def _open(self, resume: bool) -> None:
         if resume and (self.folder / CONFIG_NAME).exists():
             self.task.check_same(read_config(self.folder), self.folder / CONFIG_NAME)
             return
@@ -164,9 +177,10 @@ class _Run:
             selection,
             record=self.logs.get(seed),
             resume=resume,
+            live=self.live,
         )
         with closing(agent):
-            agent.start_from(self.data, self.policy)
+            agent.start_from(self.data, self._policy_of(seed))
             agent.learn(report)
         score = evaluate(
             self.env,
@@ -186,6 +200,11 @@ class _Run:
             score=fresh.score(score.mean_return),
             ends=score.ends,
         )
+
+    def _policy_of(self, seed: int) -> Any:
+        if not isinstance(self.policy, Sequence):
+            return self.policy
+        return self.policy[(seed - self.first_seed) % len(self.policy)]
 
     def conclude(self, summaries: Sequence[RunSummary], fresh: Scale) -> None:
         """Write the scores of all seeds, and their curves as a picture."""

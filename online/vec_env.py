@@ -24,8 +24,8 @@ class BatchedVecEnv(VecEnv):
     """A `gymnasium.vector.VectorEnv` behind SB3's interface.
 
     At an episode's end `infos[i]` has what SB3 reads there: `terminal_observation`,
-    `TimeLimit.truncated`, and under `episode` what its `Monitor` would say; `reason`, too, where
-    the environment tells one. Between ends the dicts are empty.
+    `TimeLimit.truncated`, and under `episode` what its `Monitor` would say; `reason` and
+    `progress_m`, too, where the environment tells them. Between ends the dicts are empty.
 
     Attributes:
         before_step: called with the actions (N,) before each step.
@@ -93,8 +93,9 @@ class BatchedVecEnv(VecEnv):
             "TimeLimit.truncated": timed_out,
             "episode": monitor,
         }
-        if final_info.get("_reason", np.zeros(self.num_envs, dtype=bool))[i]:
-            info["reason"] = str(final_info["reason"][i])
+        for key, kind in (("reason", str), ("progress_m", float)):
+            if final_info.get(f"_{key}", np.zeros(self.num_envs, dtype=bool))[i]:
+                info[key] = kind(final_info[key][i])
         return info
 
     def close(self) -> None:

@@ -14,6 +14,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from mcaprl.errors import PolicyError, SpaceError, UsageError
+from mcaprl.online.frame_buffer import FrameReplayBuffer
+from mcaprl.online.frames import joined, parts_of, parts_of_space, stacked_space, whole_of
 from mcaprl.online.policy import channels_first
 from mcaprl.recorder.dataset import Dataset
 
@@ -42,7 +44,9 @@ def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
     buffer = model.replay_buffer if isinstance(model, DQN) else None
     if buffer is None:
         raise UsageError(f"{type(model).__name__} learns from no logs: it has no replay buffer")
-    _check_space("observation_space", channels_first(dataset.observation_space), model)
+    count = buffer.frame_stack if isinstance(buffer, FrameReplayBuffer) else 1
+    shown = stacked_space(channels_first(dataset.observation_space), count)
+    _check_space("observation_space", shown, model)
     _check_space("action_space", dataset.action_space, model)
     rows = min(len(dataset) // buffer.n_envs, buffer.buffer_size)
     if rows == 0:
@@ -67,13 +71,13 @@ def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> 
     )
 
 
-def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
+def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) -> None:
     """Give a DQN the weights of a trained Q-network, layer by layer.
 
     Args:
         model: a fresh one.
         policy: with `name`, `q_values`, and its network as an attribute.
-        observations: (B, *shape) on which both must give the same values.
+        space: of a single observation; on some drawn from it both must give the same values.
 
     Raises:
         UsageError: the algorithm has no Q-network.
@@ -81,7 +85,14 @@ def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
     """
     if not isinstance(model, DQN):
         raise UsageError(f"{type(model).__name__} has no Q-values to start from a policy with")
-    expected = policy.q_values(observations)
+    frames = getattr(policy, "frame_stack", 1)
+    if stacked_space(channels_first(space), frames) != model.observation_space:
+        raise PolicyError(
+            f"{policy.name} looks at {frames} observations in a row, the agent at another number:"
+            " pass --frame-stack"
+        )
+    stacks = _drawn(space, frames)
+    expected = policy.q_values(stacks if frames > 1 else _first_frames(stacks))
     given, taken = _layers(_network_of(policy)), _layers(model.q_net)
     shapes = [tuple(layer.weight.shape) for layer in given]
     own = [tuple(layer.weight.shape) for layer in taken]
@@ -93,7 +104,8 @@ def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
         target.load_state_dict(source.state_dict())
     model.q_net_target.load_state_dict(model.q_net.state_dict())
     with torch.inference_mode():
-        values = model.q_net(model.policy.obs_to_tensor(observations)[0]).cpu().numpy()
+        shown = model.policy.obs_to_tensor(joined(stacks, space))[0]
+        values = model.q_net(shown).cpu().numpy()
     if not np.allclose(values, expected, rtol=1e-4, atol=1e-4):
         raise PolicyError(
             f"{policy.name} has a network of another form (normalised inputs, say): its weights"
@@ -101,13 +113,16 @@ def take_weights(model: BaseAlgorithm, policy: Any, observations: Any) -> None:
         )
 
 
-def sample_observations(space: spaces.Space[Any]) -> Any:
-    """Some observations of a space, to compare networks on."""
+def _drawn(space: spaces.Space[Any], count: int) -> Any:
+    """Some stacks of observations of a space, to compare networks on: (B, count, *shape)."""
     space.seed(0)
-    drawn = [space.sample() for _ in range(_CHECKED)]
-    if isinstance(space, spaces.Dict):
-        return {key: np.stack([one[key] for one in drawn]) for key in space}
-    return np.stack(drawn)
+    drawn = [parts_of(space.sample()) for _ in range(_CHECKED * count)]
+    columns = {key: np.stack([one[key] for one in drawn]) for key in parts_of_space(space)}
+    return whole_of({k: v.reshape(_CHECKED, count, *v.shape[1:]) for k, v in columns.items()})
+
+
+def _first_frames(frames: Any) -> Any:
+    return whole_of({key: part[:, 0] for key, part in parts_of(frames).items()})
 
 
 def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> None:

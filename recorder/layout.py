@@ -15,6 +15,7 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
+TRAINING_TOPIC = "/rl/training"
 # Observations of more numbers than this get a series for each of the first ones only.
 MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
@@ -32,6 +33,7 @@ def layout_of(
     topics: Sequence[str],
     telemetry_names: Sequence[str] = (),
     follow_frame: str = "",
+    training_names: Sequence[str] = (),
 ) -> dict[str, Any]:
     """The layout for a log with these topics.
 
@@ -40,10 +42,12 @@ def layout_of(
         topics: that the log has beside `/rl/step` and `/rl/episode`.
         telemetry_names: fields of `/telemetry`.
         follow_frame: the frame that the 3D view moves with; empty to stand still.
+        training_names: fields of `/rl/training`, where a learner is watched.
     """
     panels: dict[str, dict[str, Any]] = {}
     views = _views(metadata, topics, follow_frame, panels)
-    plots = _plots(metadata, topics, telemetry_names, panels)
+    learning = {name: f"{TRAINING_TOPIC}.{name}" for name in training_names}
+    plots = _plots(metadata, topics, telemetry_names, learning, panels)
     panels["StateTransitions!actions"] = _state_transitions(metadata, topics)
     below: list[Node] = ["StateTransitions!actions"]
     if "/rosout" in topics:
@@ -93,6 +97,7 @@ def _plots(
     metadata: LogMetadata,
     topics: Sequence[str],
     telemetry_names: Sequence[str],
+    learning: Mapping[str, str],
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
     """Plots of reward and return, and below them tabs with all other numbers of the log."""
@@ -101,6 +106,7 @@ def _plots(
         returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
     always = {"reward": {"reward": "/rl/step.reward"}, "return": returns}
     tabs = {
+        **{name: {name: path} for name, path in learning.items()},
         **_value_series(metadata, topics),
         **_telemetry_series(telemetry_names),
         "observations": _observation_series(metadata),

@@ -10,12 +10,11 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.playback import Played, Player
 from mcaprl.recorder.prefix import PREFIXED_TYPES, prefixed_message
+from mcaprl.recorder.viewer_server import DEFAULT_PORT, ViewerServer
 
-HOST = "127.0.0.1"
 _PERIOD_S = 1 / 30
 
 
@@ -32,7 +31,7 @@ class LiveServer:
         prefixes: Sequence[str] = ("",),
         episode_starts_ns: Sequence[int] = (),
         name: str = "mcaprl",
-        port: int = 8765,
+        port: int = DEFAULT_PORT,
     ) -> None:
         """Start to listen.
 
@@ -47,45 +46,34 @@ class LiveServer:
             MissingExtraError: foxglove-sdk is not installed.
             UsageError: the port is taken.
         """
-        self._foxglove = import_extra("foxglove", "foxglove")
-        self._ws = import_extra("foxglove.websocket", "foxglove")
+        self._viewers = ViewerServer()
+        self._foxglove, self._ws = self._viewers.foxglove, self._viewers.websocket
         self._player, self._prefixes = player, prefixes
         self._starts_ns = tuple(episode_starts_ns)
         self._lock = threading.Lock()
         self._looked_at = False
         self._newly_subscribed = self._seeked = False
-        self._context = self._foxglove.Context()
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)
         )
-        capabilities = self._ws.Capability
-        try:
-            self._server = self._foxglove.start_server(
-                name=name,
-                host=HOST,
-                port=port,
-                capabilities=[
-                    capabilities.Time,
-                    capabilities.Parameters,
-                    capabilities.PlaybackControl,
-                ],
-                server_listener=self,
-                supported_encodings=["cdr"],
-                context=self._context,
-                playback_time_range=(player.start_ns, player.end_ns),
-            )
-        except (OSError, RuntimeError) as error:
-            raise UsageError(f"cannot listen on {HOST}:{port}: {error}; pass --port") from error
+        can = self._ws.Capability
+        self._server = self._viewers.start(
+            name,
+            port,
+            self,
+            capabilities=[can.Time, can.Parameters, can.PlaybackControl],
+            playback_time_range=(player.start_ns, player.end_ns),
+        )
 
     @property
     def url(self) -> str:
         """Where viewers connect."""
-        return f"ws://{HOST}:{self._server.port}"
+        return self._viewers.url
 
     @property
     def app_url(self) -> str:
         """A link that opens Foxglove with it."""
-        return str(self._server.app_url())
+        return self._viewers.app_url
 
     def run(self, stop: threading.Event) -> None:
         """Play until `stop` is set."""
@@ -117,9 +105,7 @@ class LiveServer:
 
     def close(self) -> None:
         """Say goodbye to all viewers."""
-        self._server.stop()
-        for channel in self._channels.values():
-            channel.close()
+        self._viewers.close()
 
     def on_playback_control_request(self, request: Any) -> Any:
         """Play, pause, change the speed, or seek."""
@@ -200,19 +186,14 @@ class LiveServer:
         found = []
         for channel in reader.channels.values():
             schema = reader.schema_of(channel)
-            found.append(
-                (
-                    (number, channel.id),
-                    self._foxglove.Channel(
-                        f"/{prefix}{channel.topic}" if prefix else channel.topic,
-                        message_encoding=channel.message_encoding,
-                        schema=self._foxglove.Schema(
-                            name=schema.name, encoding=schema.encoding, data=schema.data
-                        ),
-                        context=self._context,
-                    ),
-                )
+            announced = self._viewers.add_channel(
+                f"/{prefix}{channel.topic}" if prefix else channel.topic,
+                schema.name,
+                schema.data,
+                encoding=channel.message_encoding,
+                schema_encoding=schema.encoding,
             )
+            found.append(((number, channel.id), announced))
         return found
 
     def _send(self, message: Played) -> None:

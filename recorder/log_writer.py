@@ -134,20 +134,28 @@ class LogWriter:
             OutputExistsError, LogError: the file cannot be created, or appended to; then it stays
                 as it is.
         """
-        leaves = observation_leaves(metadata.observation_space)
-        self.metadata = metadata
-        self.action = action_leaf(metadata.action_space)
-        self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
-        name, text = step_schema(metadata.observation_space, metadata.action_space)
-        dtype = message_dtype(text)
-        assert dtype is not None, "/rl/step has a fixed length by construction"
-        self._step_dtype = dtype
+        self._prepare(metadata)
         strings = metadata.to_strings()
         self.mcap = McapWriter(path, compression=compression, overwrite=overwrite, append=append)
         if self.mcap.untouched:
             self._check_same(strings)
+        self._announce(strings)
+
+    def _prepare(self, metadata: LogMetadata) -> None:
+        """Find what messages the spaces need."""
+        leaves = observation_leaves(metadata.observation_space)
+        self.metadata = metadata
+        self.action = action_leaf(metadata.action_space)
+        self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
+        self._step_type = step_schema(metadata.observation_space, metadata.action_space)
+        dtype = message_dtype(self._step_type[1])
+        assert dtype is not None, "/rl/step has a fixed length by construction"
+        self._step_dtype = dtype
+
+    def _announce(self, strings: dict[str, str]) -> None:
+        """Tell what the log is of, and the topics that every log has."""
         self.mcap.add_metadata(METADATA_NAME, strings)
-        self._step_channel = self.mcap.add_channel(STEP_TOPIC, name, text, strings)
+        self._step_channel = self.mcap.add_channel(STEP_TOPIC, *self._step_type, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
 
     def _check_same(self, strings: dict[str, str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
 from mcaprl.online.frame_buffer import FrameReplayBuffer
+from mcaprl.online.frames import FrameMemory, stacked_space
 
 PICTURE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
 DICT = spaces.Dict({"picture": PICTURE, "vector": spaces.Box(-1, 1, (3,))})
@@ -97,6 +99,44 @@ def test_dict_samples_are_those_of_sb3s_buffer(steps: int, seed: int) -> None:
     check_same(ours, theirs)
 
 
+class Stacking:
+    """Gives a buffer stacks of what it is fed, as the environments' wrapper does."""
+
+    def __init__(self, buffer: Any, space: spaces.Space[Any], count: int) -> None:
+        self.buffer, self.memory = buffer, FrameMemory(space, count)
+        self.ended: Any = None
+
+    def add(
+        self, obs: Any, following: Any, action: Any, reward: Any, done: Any, infos: Any
+    ) -> None:
+        if self.ended is None:
+            self.memory.begin(obs)
+        else:
+            self.memory.frames[""][self.ended] = obs[self.ended, None]
+        stack = self.memory.stacked()
+        self.buffer.add(stack, self.memory.see(following), action, reward, done, infos)
+        self.ended = done
+
+
+@given(
+    steps=st.integers(1, 19),
+    envs=st.integers(1, 3),
+    n_steps=st.integers(2, 3),
+    count=st.integers(2, 4),
+    seed=st.integers(0, 99),
+)
+def test_stacks_are_those_that_sb3s_buffer_would_hold(
+    steps: int, envs: int, n_steps: int, count: int, seed: int
+) -> None:
+    shown = stacked_space(PICTURE, count)
+    extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
+    ours = FrameReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra, frame_stack=count)
+    theirs = NStepReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra)
+    assert ours.frames[""].shape[2:] == PICTURE.shape
+    feed([Stacking(b, PICTURE, count) for b in (ours, theirs)], PICTURE, steps, envs, seed)
+    check_same(ours, theirs)
+
+
 @pytest.mark.parametrize("space", [PICTURE, DICT], ids=["picture", "dict"])
 @pytest.mark.parametrize("steps", [7, 50])
 def test_what_is_kept_can_be_restored(space: spaces.Space[Any], steps: int) -> None:
@@ -108,6 +148,24 @@ def test_what_is_kept_can_be_restored(space: spaces.Space[Any], steps: int) -> N
     check_same(second, first)
     feed([first, second], space, 30, 2, 2)
     check_same(second, first)
+
+
+def test_frames_that_are_overwritten_are_stood_for_by_the_oldest() -> None:
+    """Four rows; frames count up, and one episode goes on."""
+    shown = stacked_space(PICTURE, 3)
+    buffer = FrameReplayBuffer(4, shown, ACTIONS, "cpu", 1, frame_stack=3)
+    frames = np.arange(7, dtype=np.uint8)[:, None, None, None, None] * np.ones((1, 1, 6, 6))
+    for now, following in itertools.pairwise(frames):
+        buffer.add(now, following, np.zeros(1), np.zeros(1), np.zeros(1), [{}])
+    batch = buffer._get_samples(np.arange(4))
+    # Frames 2 to 5 are in rows 2, 3, 0, 1; 6 is what followed.
+    assert batch.observations[:, :, 0, 0].tolist() == [[2, 3, 4], [3, 4, 5], [2, 2, 2], [2, 2, 3]]
+    assert batch.next_observations[:, :, 0, 0].tolist() == [
+        [3, 4, 5],
+        [4, 5, 6],
+        [2, 2, 3],
+        [2, 3, 4],
+    ]
 
 
 def test_a_frame_is_stored_once() -> None:

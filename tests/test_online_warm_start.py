@@ -177,7 +177,7 @@ def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
     policy = load_offline(tmp_path / "cql")
     observations = mcaprl.open(logs).observations
-    with closing(agent(tmp_path)) as begun:
+    with closing(agent(tmp_path, learning_starts=100)) as begun:
         begun.start_from(None, policy)
         model: Any = begun.model
         with torch.inference_mode():
@@ -187,7 +187,12 @@ def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path
         np.testing.assert_array_equal(values, target)
         begun.learn(silent)
         assert model.exploration_rate == pytest.approx(0.05)
-        assert model._n_updates == 50
+        # 26 steps of four environments come after more than 100, or 25: each is one update.
+        assert model._n_updates == 25
+        acted = model.replay_buffer.actions[:25, :, 0]
+        seen = model.replay_buffer.observations[:25]
+        own = policy.act(seen.reshape(-1, 12)).reshape(acted.shape)
+        assert (acted == own).mean() > 0.9, "the first steps are its own"
 
 
 def test_an_agent_goes_on_from_an_online_policy(tmp_path: Path) -> None:
