@@ -3,16 +3,22 @@
     python -m benchmarks.learning
 
 One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
-time on one thread, the best of ROUNDS turns. Needs d3rlpy and stable-baselines3 beside mcaprl.
-Prints the ratios and writes them to benchmarks/learning.json.
+time on one thread, the best of ROUNDS turns. The last row is the whole way: a log of LOG_ROWS steps
+on disk is read and packed, and CQL makes LOG_UPDATES updates of batch 256; the other way is
+mcap with mcap-ros2-support, and d3rlpy. There a part of the work is done and scaled up: a tenth of
+the log, and as many updates as fit into the turns. Prints the ratios, writes them to
+benchmarks/learning.json, and the table into docs/results.md.
 """
 
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import d3rlpy
@@ -24,14 +30,31 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.logger import configure
 
 import mcaprl
+from benchmarks import rivals
+from benchmarks.page import write_section
+from benchmarks.workloads import EPISODE_STEPS, vectors
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
 
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
 ROUNDS = 7
 TURN_S = 1.0
+LOG_ROWS, LOG_SHARE, LOG_UPDATES = 1_000_000, 0.1, 8_000
 HIDDEN = [256, 256]
 RESULTS = Path(__file__).with_name("learning.json")
+LIBRARIES = ("torch", "d3rlpy", "stable-baselines3", "mcap", "mcap-ros2-support")
+DDQN, CQL, SB3 = "Double DQN / d3rlpy's", "CQL / d3rlpy's", "Double DQN / SB3's DQN"
+SEEDS = "CQL, four seeds at once / one after the other"
+WHOLE = "from a log of a million steps to a CQL policy / mcap-ros2-support and d3rlpy"
+GOALS = {
+    f"{DDQN}, batch 256": 2.5,
+    f"{CQL}, batch 256": 3.3,
+    f"{SB3}, batch 256": 1.25,
+    f"{DDQN}, batch 32": 3.0,
+    f"{CQL}, batch 32": 3.8,
+    f"{SB3}, batch 32": 2.0,
+    WHOLE: 4.0,
+}
 Update = Callable[[], object]
 
 
@@ -57,7 +80,7 @@ def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Up
     return ALGORITHMS[algo](config, buffer, range(seeds)).update
 
 
-def d3rlpys(data: mcaprl.Dataset, config: str, batch_size: int) -> Update:
+def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
     """One update of d3rlpy, its batch drawn from its own buffer."""
     log = d3rlpy.dataset.MDPDataset(
         data.observations,
@@ -107,6 +130,35 @@ def best_rates(sides: dict[str, tuple[Update, int]]) -> dict[str, float]:
     return best
 
 
+def whole_way(folder: Path) -> float:
+    """How many times the CPU time of ours the others need from a log on disk to a policy."""
+    log, part = folder / "log.mcap", folder / "part.mcap"
+    vectors(LOG_ROWS).save(log)
+    rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
+    start = time.process_time()
+    update = ours(mcaprl.open(log), "cql", 256)
+    ours_s = time.process_time() - start
+    start = time.process_time()
+    columns = rivals.read_mcap(part)
+    their_update = d3rlpys(logged(columns), "DiscreteCQLConfig", 256)
+    theirs_s = (time.process_time() - start) / LOG_SHARE
+    rates = best_rates({"ours": (update, 1), "theirs": (their_update, 1)})
+    print(f"reading takes the others {theirs_s / ours_s:.0f} times as long", flush=True)
+    return (theirs_s + LOG_UPDATES / rates["theirs"]) / (ours_s + LOG_UPDATES / rates["ours"])
+
+
+def logged(columns: dict[str, Any]) -> Any:
+    """Columns under the names that a dataset has for them; where episodes end is given away."""
+    rows = len(columns["action"])
+    return SimpleNamespace(
+        observations=columns["observation"],
+        actions=columns["action"],
+        rewards=columns["reward"],
+        terminated=np.zeros(rows, bool),
+        truncated=np.arange(1, rows + 1) % EPISODE_STEPS == 0,
+    )
+
+
 def main() -> None:
     """Measure, print ratios, and write them to learning.json."""
     torch.set_num_threads(1)
@@ -124,15 +176,24 @@ def main() -> None:
             }
         )
         results |= {
-            f"Double DQN / d3rlpy's, batch {size}": rates["ddqn"] / rates["d3rlpy ddqn"],
-            f"CQL / d3rlpy's, batch {size}": rates["cql"] / rates["d3rlpy cql"],
-            f"Double DQN / SB3's DQN, batch {size}": rates["ddqn"] / rates["sb3 dqn"],
-            f"CQL, four seeds at once / one after the other, batch {size}": rates["four seeds"]
-            / rates["cql"],
+            f"{DDQN}, batch {size}": rates["ddqn"] / rates["d3rlpy ddqn"],
+            f"{CQL}, batch {size}": rates["cql"] / rates["d3rlpy cql"],
+            f"{SB3}, batch {size}": rates["ddqn"] / rates["sb3 dqn"],
+            f"{SEEDS}, batch {size}": rates["four seeds"] / rates["cql"],
         }
-    for name, value in results.items():
-        print(f"{value:6.2f}  {name}")
+    with tempfile.TemporaryDirectory() as folder:
+        results[WHOLE] = whole_way(Path(folder))
+    print(table := as_table(results))
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    write_section("learning-speed", table)
+
+
+def as_table(results: dict[str, float]) -> str:
+    """Markdown, with the goals and the versions."""
+    lines = ["| what | times as fast | goal |", "|---|---|---|"]
+    lines += [f"| {name} | {x:.2f} | {GOALS.get(name, '')} |" for name, x in results.items()]
+    versions = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
+    return "\n".join([*lines, "", f"Versions: {versions}."])
 
 
 if __name__ == "__main__":
