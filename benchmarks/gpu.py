@@ -92,6 +92,7 @@ def bare_products(seeds: int, device: torch.device) -> Callable[[], object]:
 
     cuda: Any = torch.cuda
     stream = cuda.Stream()
+    stream.wait_stream(cuda.current_stream())
     with cuda.stream(stream):
         run()
     cuda.current_stream().wait_stream(stream)

@@ -11,6 +11,7 @@ and told when `check` asks.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -69,7 +70,7 @@ class StaticUpdate:
 
     def __call__(self, rows: Tensor, learning_rate: float) -> dict[str, Tensor]:
         """Make one update on the rows (R,) of a batch."""
-        # Without pinned memory the copy has left `rows` when this returns, and waits for nothing.
+        # Without pinned memory, the copy has left `rows` when this returns.
         self._rows.copy_(rows, non_blocking=True)
         self._rate.fill_(learning_rate)
         self._updates.fill_(self._learner.step + 1)
@@ -114,7 +115,9 @@ class StaticUpdate:
         cuda: Any = torch.cuda  # Its streams have no types.
         stream = cuda.Stream()
         stream.wait_stream(cuda.current_stream())
-        with cuda.stream(stream):
+        with cuda.stream(stream), warnings.catch_warnings():
+            # Adam says that it could be captured, and is not.
+            warnings.simplefilter("ignore", UserWarning)
             for _ in range(_WARM_UPS):
                 self._update()
         cuda.current_stream().wait_stream(stream)
