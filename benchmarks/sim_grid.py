@@ -6,7 +6,8 @@ The logs are those of `sim_data`; the settings of each sim are below and the sam
 What counts are the networks after the last update: nothing is chosen by how it does in the sim. A
 score is the mean return over 30 episodes of each seed where random is 0 and the pilot 1, with a
 95 % bootstrap interval over seeds and episodes. Each cell is kept in FOLDER/SIM/scores.json; those
-that are there are not made anew. When all are there the tables go to docs/results.md.
+that are there are not made anew, so a run that was stopped goes on. In the end the tables go to
+docs/results.md, with a dash for each cell that is not there yet.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from mcaprl.sims.pilots import make_pilot
 from mcaprl.sims.rollout import Policy
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
-ALGOS = ("cql", "iql", "bcq", "bc", "double-dqn")
-SHARED: dict[str, Any] = {"updates": 5_000, "batch_size": 128}
+ALGOS = ("cql", "bc", "double-dqn", "bcq", "iql")
+SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
@@ -60,15 +61,11 @@ def main() -> None:
         paths = make_logs(folder, sim)
         wanted = [
             (name, algo)
-            for name in arguments.data.split(",")
             for algo in arguments.algos.split(",")
+            for name in arguments.data.split(",")
         ]
         _fill(folder, sim, paths, wanted)
-    found = {sim: _read(arguments.folder / sim) for sim in SETTINGS}
-    complete = all(
-        algo in found[sim].get(name, {}) for sim in SETTINGS for name in NAMES for algo in ALGOS
-    )
-    if complete:
+        found = {sim: _read(arguments.folder / sim) for sim in SETTINGS}
         write_section("sim-grid", "\n".join(table(sim, found[sim]) for sim in SETTINGS))
 
 
@@ -134,17 +131,22 @@ def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) 
 
 
 def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
-    """Markdown: each cell has the mean score, its interval, and the lowest seed."""
+    """Markdown: each cell has the mean score and its interval."""
     lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
     lines.append("|---|" + "---|" * len(ALGOS))
     for name in NAMES:
-        row = cells[name]
-        texts = []
-        for algo in ALGOS:
-            low, high = row[algo]["interval"]
-            texts.append(f"{row[algo]['score']:.2f} ({low:.2f} to {high:.2f})")
-        lines.append(f"| {name} ({row['behavior']['score']:.2f}) | {' | '.join(texts)} |")
+        row = cells.get(name, {})
+        behavior = f" ({row['behavior']['score']:.2f})" if row else ""
+        texts = [_text(row.get(algo)) for algo in ALGOS]
+        lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
     return "\n".join([*lines, ""])
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return "-"
+    low, high = cell["interval"]
+    return f"{cell['score']:.2f} ({low:.2f} to {high:.2f})"
 
 
 def _read(folder: Path) -> dict[str, dict[str, Cell]]:
