@@ -34,11 +34,15 @@ def draw_curves(folder: Path) -> Path:
         panel.set_axis_off()
     for panel, name in zip(panels.flat, names, strict=False):
         color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
-        for curve in curves:
-            panel.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5)
         shortest = min((curve["update"] for curve in curves), key=len)
+        # A line through one point cannot be seen.
+        marker = "o" if len(shortest) == 1 else None
+        for curve in curves:
+            panel.plot(
+                curve["update"], curve[name], color=color, lw=0.7, alpha=0.5, marker=marker
+            )
         mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
-        panel.plot(shortest, mean, color=color, lw=1.8)
+        panel.plot(shortest, mean, color=color, lw=1.8, marker=marker)
         panel.set_title(name.replace("_", " "))
     seeds = "one seed" if len(curves) == 1 else f"thick: mean of {len(curves)} seeds"
     figure.supxlabel(f"updates; {seeds}")
