@@ -64,8 +64,8 @@ class BCQ(DQN):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of the temporal difference; for the clone its cross entropy."""
-        q_tm1, q_t = self.learn_with_next("q", batch)
-        td_loss = self.td_loss(q_tm1, batch, q_t)
+        q_tm1 = self.learn("q", batch.observations)
+        td_loss = self.td_loss(q_tm1, batch)
         logits_tm1 = self.learn("logits", batch.observations)
         cloning = cross_entropy(logits_tm1, batch.actions)
         penalty = scaled(square_penalty(logits_tm1), self.config.logits_penalty)
@@ -77,12 +77,11 @@ class BCQ(DQN):
         }
         return Losses(terms, {"q": td_loss.slope, "logits": cloning.slope + penalty.slope})
 
-    def targets(self, batch: Batch, q_t_selector: Tensor | None) -> Tensor:
+    def targets(self, batch: Batch) -> Tensor:
         """The learning network chooses among likely actions, the target network judges."""
-        assert q_t_selector is not None
         likely = likely_actions(
             self.outputs("logits", batch.next_observations), self.config.threshold
         )
-        q_t_selector = allowed_only(q_t_selector, likely)
+        q_t_selector = allowed_only(self.outputs("q", batch.next_observations), likely)
         q_t_value = self.target_outputs(batch)
         return bellman_target(batch.rewards, batch.discounts, q_t_value, best_actions(q_t_selector))

@@ -46,8 +46,8 @@ class CQL(DoubleDQN):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of Double DQN plus alpha times the penalty."""
-        q_tm1, q_t = self.learn_values(batch)
-        td_loss = self.td_loss(q_tm1, batch, q_t)
+        q_tm1 = self.learn("q", batch.observations)
+        td_loss = self.td_loss(q_tm1, batch)
         penalty = conservative_penalty(q_tm1, batch.actions)
         alpha = self.config.alpha
         terms = {

@@ -83,35 +83,25 @@ class DQN(Learner):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of the temporal difference."""
-        q_tm1, q_t = self.learn_values(batch)
-        td_loss = self.td_loss(q_tm1, batch, q_t)
+        q_tm1 = self.learn("q", batch.observations)
+        td_loss = self.td_loss(q_tm1, batch)
         q_a_tm1 = chosen(mean_values(q_tm1), batch.actions)
         return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
 
     def judge(self, batch: Batch) -> dict[str, Tensor]:
         """The values of the actions taken, and how far they are from their targets."""
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
-        target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))
+        target_tm1 = self.targets(batch)
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
         return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
 
-    def learn_values(self, batch: Batch) -> tuple[Tensor, Tensor | None]:
-        """Values of the states, to be learned from; and of the next ones, if targets need them."""
-        return self.learn("q", batch.observations), None
-
-    def td_loss(self, q_tm1: Tensor, batch: Batch, q_t_selector: Tensor | None) -> Loss:
+    def td_loss(self, q_tm1: Tensor, batch: Batch) -> Loss:
         """How far the values of the actions taken are from their targets."""
         regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
-        return regression(q_tm1, batch.actions, self.targets(batch, q_t_selector))
+        return regression(q_tm1, batch.actions, self.targets(batch))
 
-    def targets(self, batch: Batch, q_t_selector: Tensor | None) -> Tensor:
-        """The target network both chooses the next action and judges it.
-
-        Args:
-            batch: of transitions.
-            q_t_selector: values of the next states under the network that learns, which Double DQN
-                chooses by; None where `learn_values` leaves them out.
-        """
+    def targets(self, batch: Batch) -> Tensor:
+        """The target network both chooses the next action and judges it."""
         return q_learning_target(batch.rewards, batch.discounts, self.target_outputs(batch))
 
     def target_outputs(self, batch: Batch) -> Tensor:
@@ -126,12 +116,8 @@ class DoubleDQN(DQN):
     config_type: ClassVar[type[TrainingConfig]] = DoubleDQNConfig
     config: DoubleDQNConfig
 
-    def learn_values(self, batch: Batch) -> tuple[Tensor, Tensor | None]:
-        """Values of the states, to be learned from, and of the next ones."""
-        return self.learn_with_next("q", batch)
-
-    def targets(self, batch: Batch, q_t_selector: Tensor | None) -> Tensor:
+    def targets(self, batch: Batch) -> Tensor:
         """The learning network chooses, the target network judges."""
-        assert q_t_selector is not None
+        q_t_selector = self.outputs("q", batch.next_observations)
         q_t_value = self.target_outputs(batch)
         return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)

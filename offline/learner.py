@@ -191,14 +191,6 @@ class Learner(ABC):
         """A model's outputs for observations that it is to learn from."""
         return allowed_only(self.models[name].learn_from(observations), observations.mask)
 
-    def learn_with_next(self, name: str, batch: Batch) -> tuple[Tensor, Tensor]:
-        """A model's outputs for states that it is to learn from, and for their next states."""
-        here, there = self.models[name].learn_beside(batch.observations, batch.next_observations)
-        return (
-            allowed_only(here, batch.observations.mask),
-            allowed_only(there, batch.next_observations.mask),
-        )
-
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """A model's outputs."""
         return allowed_only(self.models[name](observations), observations.mask)

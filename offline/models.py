@@ -58,13 +58,6 @@ class Model(ABC):
     def learn_from(self, observations: Observations) -> Tensor:
         """The outputs (R, *output_shape); remembers what `backward` needs."""
 
-    def learn_beside(
-        self, observations: Observations, others: Observations
-    ) -> tuple[Tensor, Tensor]:
-        """The outputs of `learn_from`, and those for as many others that are not learned from."""
-        outputs = self(others)
-        return self.learn_from(observations), outputs
-
     @abstractmethod
     def backward(self, slope: Tensor) -> None:
         """Set `gradients` from d loss / d outputs (R, *output_shape) of the last `learn_from`."""
@@ -131,23 +124,12 @@ class StackedMLP(Model):
 
     def __call__(self, observations: Observations) -> Tensor:
         """The outputs, with nothing remembered."""
-        return self._forward(self._by_seed(observations))[-1].view(-1, *self._output_shape)
+        return self._forward(observations)[-1].view(-1, *self._output_shape)
 
     def learn_from(self, observations: Observations) -> Tensor:
         """The outputs; remembers what went into each layer."""
-        *self._inputs, outputs = self._forward(self._by_seed(observations))
+        *self._inputs, outputs = self._forward(observations)
         return outputs.view(-1, *self._output_shape)
-
-    def learn_beside(
-        self, observations: Observations, others: Observations
-    ) -> tuple[Tensor, Tensor]:
-        """The same in one pass: small batches cost little beside fetching the weights for them."""
-        both = torch.cat([self._by_seed(observations), self._by_seed(others)], 1)
-        count = both.shape[1] // 2
-        *inputs, outputs = self._forward(both)
-        self._inputs = [part[:, :count] for part in inputs]
-        shape = (-1, *self._output_shape)
-        return outputs[:, :count].reshape(shape), outputs[:, count:].reshape(shape)
 
     def backward(self, slope: Tensor) -> None:
         """The chain rule, layer by layer: y = x W^T + b, so dW = dy^T x, db = sum dy, dx = dy W."""
@@ -161,13 +143,9 @@ class StackedMLP(Model):
                 # ReLU lets through what was above 0.
                 slope = torch.bmm(slope, self._layers[index][0]).mul_(inputs > 0)
 
-    def _by_seed(self, observations: Observations) -> Tensor:
-        """(K, B, width)."""
-        return observations.vector.view(len(self.weights), -1, observations.vector.shape[1])
-
-    def _forward(self, vectors: Tensor) -> list[Tensor]:
+    def _forward(self, observations: Observations) -> list[Tensor]:
         """What goes into each layer (K, B, width), and what comes out of the last."""
-        values = [vectors]
+        values = [observations.vector.view(len(self.weights), -1, observations.vector.shape[1])]
         last = len(self._layers) - 1
         for index, (matrix, bias) in enumerate(self._layers):
             outputs = torch.baddbmm(bias, values[-1], matrix.mT)

@@ -117,20 +117,6 @@ def test_the_written_out_backward_pass_is_that_of_autograd(
         torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
-@pytest.mark.parametrize("seeds", [1, 3])
-def test_others_beside_leave_what_is_learned_as_it_is(model_type: type[Model], seeds: int) -> None:
-    seen, others = vectors(seeds * 7, 5), vectors(seeds * 7, 5, seed=1)
-    slope = torch.randn(seeds * 7, 4)
-    alone, beside = (model_type(networks(seeds)) for _ in range(2))
-    outputs, expected = gradients(alone, seen, slope)
-    found = beside.learn_beside(seen, others)
-    beside.backward(slope)
-    for mine, reference in zip(found, (outputs, alone(others)), strict=True):
-        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(beside.gradients, expected, rtol=1e-5, atol=1e-6)
-
-
 def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
     seen, slope = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
     together = gradients(model_type(networks(4)), seen, slope)
