@@ -38,9 +38,7 @@ def draw_curves(folder: Path) -> Path:
         # A line through one point cannot be seen.
         marker = "o" if len(shortest) == 1 else None
         for curve in curves:
-            panel.plot(
-                curve["update"], curve[name], color=color, lw=0.7, alpha=0.5, marker=marker
-            )
+            panel.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5, marker=marker)
         mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
         panel.plot(shortest, mean, color=color, lw=1.8, marker=marker)
         panel.set_title(name.replace("_", " "))
