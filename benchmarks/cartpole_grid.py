@@ -4,7 +4,8 @@
 
 5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target every 200, 256x256. A figure is
 the mean return of the last three evaluations (after 4000, 4500 and 5000 updates), 10 episodes each.
-d3rlpy takes part where it is installed, with one seed. The result is FOLDER/grid.json and a table.
+d3rlpy takes part where it is installed, with one seed. The result is FOLDER/grid.json, and a table
+with the gates that hold or do not, in docs/results.md.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.cartpole_data import make_logs
+from benchmarks.page import write_section
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.config import BootstrapConfig
@@ -165,23 +167,28 @@ def main() -> None:
             )
     result = {"behavior": behavior, "mcaprl": found, "d3rlpy": rivals}
     (arguments.folder / "grid.json").write_text(json.dumps(result, indent=2) + "\n")
-    print_table(result)
+    print(text := table(result))
     if set(ALGOS) <= set(arguments.only.split(",")):
-        for gate, holds in gates(found, behavior).items():
-            print(f"{'holds' if holds else 'FAILS'}: {gate}")
+        verdicts = [
+            f"- {'holds' if holds else 'does not hold'}: {gate}"
+            for gate, holds in gates(found, behavior).items()
+        ]
+        print("\n".join(verdicts))
+        write_section("cartpole-grid", "\n".join([text, "", *verdicts]))
 
 
-def print_table(result: dict[str, Any]) -> None:
+def table(result: dict[str, Any]) -> str:
     """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's."""
     algos = list(next(iter(result["mcaprl"].values())))
-    print(f"| data (behavior) | {' | '.join(algos)} |\n|---|{'---|' * len(algos)}")
+    lines = [f"| data (behavior) | {' | '.join(algos)} |", "|---|" + "---|" * len(algos)]
     for name, row in result["mcaprl"].items():
         cells = []
         for algo in algos:
             values, rival = row[algo], result["d3rlpy"][name].get(algo)
             beside = f"; d3rlpy {rival[0]:.0f}" if rival else ""
             cells.append(f"{np.mean(values):.0f} ({min(values):.0f}-{max(values):.0f}){beside}")
-        print(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(cells)} |")
+        lines.append(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

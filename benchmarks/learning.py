@@ -1,18 +1,27 @@
 """Updates per second of Double DQN and CQL beside d3rlpy's and SB3's DQN, as ratios.
 
-    python -m benchmarks.learning
+    python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
 
 One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
-time on one thread, the best of ROUNDS turns. Needs d3rlpy and stable-baselines3 beside mcaprl.
-Prints the ratios and writes them to benchmarks/learning.json.
+time on one thread, the best of several turns. The last row is the whole way: a log of LOG_ROWS
+steps on disk is read and packed, and CQL makes LOG_UPDATES updates of batch 256; the other way is
+mcap with mcap-ros2-support, and d3rlpy. There a part of the work is done and scaled up: a tenth of
+the log, and as many updates as fit into the turns. Prints the ratios, writes them to
+benchmarks/learning.json, and the table into docs/results.md. With --only 256, 32 or whole the other
+rows stay as an earlier run found them.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import d3rlpy
@@ -24,14 +33,29 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.logger import configure
 
 import mcaprl
+from benchmarks import rivals
+from benchmarks.page import write_section
+from benchmarks.workloads import EPISODE_STEPS, vectors
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
 
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
-ROUNDS = 7
-TURN_S = 1.0
+LOG_ROWS, LOG_SHARE, LOG_UPDATES = 1_000_000, 0.1, 8_000
 HIDDEN = [256, 256]
 RESULTS = Path(__file__).with_name("learning.json")
+LIBRARIES = ("torch", "d3rlpy", "stable-baselines3", "mcap", "mcap-ros2-support")
+DDQN, CQL, SB3 = "Double DQN / d3rlpy's", "CQL / d3rlpy's", "Double DQN / SB3's DQN"
+SEEDS = "CQL, four seeds at once / one after the other"
+WHOLE = "from a log of a million steps to a CQL policy / mcap-ros2-support and d3rlpy"
+GOALS = {
+    f"{DDQN}, batch 256": 2.5,
+    f"{CQL}, batch 256": 3.3,
+    f"{SB3}, batch 256": 1.25,
+    f"{DDQN}, batch 32": 3.0,
+    f"{CQL}, batch 32": 3.8,
+    f"{SB3}, batch 32": 2.0,
+    WHOLE: 4.0,
+}
 Update = Callable[[], object]
 
 
@@ -57,7 +81,7 @@ def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Up
     return ALGORITHMS[algo](config, buffer, range(seeds)).update
 
 
-def d3rlpys(data: mcaprl.Dataset, config: str, batch_size: int) -> Update:
+def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
     """One update of d3rlpy, its batch drawn from its own buffer."""
     log = d3rlpy.dataset.MDPDataset(
         data.observations,
@@ -94,45 +118,110 @@ def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
     return lambda: model.train(gradient_steps=10, batch_size=batch_size)
 
 
-def best_rates(sides: dict[str, tuple[Update, int]]) -> dict[str, float]:
+@dataclass(frozen=True)
+class Turns:
+    """How sides take turns.
+
+    Attributes:
+        rounds: turns of each.
+        seconds: of CPU time, of one.
+    """
+
+    rounds: int
+    seconds: float
+
+
+def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, float]:
     """Updates per CPU second of each side, in its best turn; a call makes so many updates."""
     best = dict.fromkeys(sides, 0.0)
-    for _ in range(ROUNDS):
+    for _ in range(turns.rounds):
         for name, (update, count) in sides.items():
             start, done = time.process_time(), 0
-            while (elapsed := time.process_time() - start) < TURN_S:
+            while (elapsed := time.process_time() - start) < turns.seconds:
                 update()
                 done += count
             best[name] = max(best[name], done / elapsed)
     return best
 
 
+def whole_way(folder: Path, turns: Turns) -> float:
+    """How many times the CPU time of ours the others need from a log on disk to a policy."""
+    log, part = folder / "log.mcap", folder / "part.mcap"
+    vectors(LOG_ROWS).save(log)
+    rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
+    start = time.process_time()
+    update = ours(mcaprl.open(log), "cql", 256)
+    ours_s = time.process_time() - start
+    start = time.process_time()
+    columns = rivals.read_mcap(part)
+    their_update = d3rlpys(logged(columns), "DiscreteCQLConfig", 256)
+    theirs_s = (time.process_time() - start) / LOG_SHARE
+    rates = best_rates({"ours": (update, 1), "theirs": (their_update, 1)}, turns)
+    print(f"reading takes the others {theirs_s / ours_s:.0f} times as long", flush=True)
+    return (theirs_s + LOG_UPDATES / rates["theirs"]) / (ours_s + LOG_UPDATES / rates["ours"])
+
+
+def logged(columns: dict[str, Any]) -> Any:
+    """Columns under the names that a dataset has for them; where episodes end is given away."""
+    rows = len(columns["action"])
+    return SimpleNamespace(
+        observations=columns["observation"],
+        actions=columns["action"],
+        rewards=columns["reward"],
+        terminated=np.zeros(rows, bool),
+        truncated=np.arange(1, rows + 1) % EPISODE_STEPS == 0,
+    )
+
+
+def rows_of(size: int, turns: Turns) -> dict[str, float]:
+    """The ratios at one batch size."""
+    data = transitions()
+    sides = {
+        "ddqn": (ours(data, "double-dqn", size), 1),
+        "cql": (ours(data, "cql", size), 1),
+        "four seeds": (ours(data, "cql", size, seeds=4), 4),
+        "d3rlpy ddqn": (d3rlpys(data, "DoubleDQNConfig", size), 1),
+        "d3rlpy cql": (d3rlpys(data, "DiscreteCQLConfig", size), 1),
+        "sb3 dqn": (sb3s(data, size), 10),
+    }
+    rates = best_rates(sides, turns)
+    return {
+        f"{DDQN}, batch {size}": rates["ddqn"] / rates["d3rlpy ddqn"],
+        f"{CQL}, batch {size}": rates["cql"] / rates["d3rlpy cql"],
+        f"{SB3}, batch {size}": rates["ddqn"] / rates["sb3 dqn"],
+        f"{SEEDS}, batch {size}": rates["four seeds"] / rates["cql"],
+    }
+
+
 def main() -> None:
     """Measure, print ratios, and write them to learning.json."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--turn-s", type=float, default=1.0)
+    parser.add_argument("--only", choices=("256", "32", "whole"))
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    data = transitions()
+    turns = Turns(arguments.rounds, arguments.turn_s)
     results: dict[str, float] = {}
+    if arguments.only and RESULTS.exists():
+        results = json.loads(RESULTS.read_text())
     for size in (256, 32):
-        rates = best_rates(
-            {
-                "ddqn": (ours(data, "double-dqn", size), 1),
-                "cql": (ours(data, "cql", size), 1),
-                "four seeds": (ours(data, "cql", size, seeds=4), 4),
-                "d3rlpy ddqn": (d3rlpys(data, "DoubleDQNConfig", size), 1),
-                "d3rlpy cql": (d3rlpys(data, "DiscreteCQLConfig", size), 1),
-                "sb3 dqn": (sb3s(data, size), 10),
-            }
-        )
-        results |= {
-            f"Double DQN / d3rlpy's, batch {size}": rates["ddqn"] / rates["d3rlpy ddqn"],
-            f"CQL / d3rlpy's, batch {size}": rates["cql"] / rates["d3rlpy cql"],
-            f"Double DQN / SB3's DQN, batch {size}": rates["ddqn"] / rates["sb3 dqn"],
-            f"CQL, four seeds at once / one after the other, batch {size}": rates["four seeds"]
-            / rates["cql"],
-        }
-    for name, value in results.items():
-        print(f"{value:6.2f}  {name}")
+        if arguments.only in (None, str(size)):
+            results |= rows_of(size, turns)
+    if arguments.only in (None, "whole"):
+        with tempfile.TemporaryDirectory() as folder:
+            results[WHOLE] = whole_way(Path(folder), turns)
+    print(table := as_table(results))
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    write_section("learning-speed", table)
+
+
+def as_table(results: dict[str, float]) -> str:
+    """Markdown, with the goals and the versions."""
+    lines = ["| what | times as fast | goal |", "|---|---|---|"]
+    lines += [f"| {name} | {x:.2f} | {GOALS.get(name, '')} |" for name, x in results.items()]
+    versions = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
+    return "\n".join([*lines, "", f"Versions: {versions}."])
 
 
 if __name__ == "__main__":

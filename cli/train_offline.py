@@ -43,6 +43,12 @@ class _TrainCommand(click.Command):
     type=click.IntRange(1),
     help="Of torch, and to read with; more than one pays with big batches on an idle machine.",
 )
+@click.option(
+    "--device",
+    default="cpu",
+    show_default=True,
+    help="cpu, or cuda: data and networks on the GPU, each update one CUDA graph.",
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Learn from logs that are still being written, too.")
 @click.option("--other-data", is_flag=True, help="When resuming, go on even with other DATA.")
@@ -53,6 +59,7 @@ def train_offline(
     seeds: int,
     seed: int,
     threads: int,
+    device: str,
     resume: bool,
     follow: bool,
     other_data: bool,
@@ -103,6 +110,7 @@ def train_offline(
         # Logs that grew since are not what the checkpoints are of.
         other_data=other_data or follow,
         follow=growing,
+        device=device,
     )
     for line in describe_seeds(summaries):
         click.echo(line)

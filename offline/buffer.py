@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
 
 
+_ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
+
+
 @dataclass(frozen=True)
 class Packing:
     """How transitions are made from a log.
@@ -144,8 +147,21 @@ class TransitionBuffer:
         """The number of transitions."""
         return len(self.actions)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the transitions are."""
+        return self.actions.device
+
+    def to(self, device: torch.device) -> TransitionBuffer:
+        """The same transitions, all of them on another device.
+
+        Rows are drawn on the CPU all the same, so that a seed draws the same ones everywhere.
+        """
+        parts = {name: getattr(self, name).to(device) for name in _ON_DEVICE}
+        return replace(self, **parts)
+
     def sample_rows(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw (count,) rows with replacement, by their weights."""
+        """Draw (count,) rows with replacement, by their weights, on the CPU."""
         if self.cumulative is None:
             total = len(self) if self.drawable is None else len(self.drawable)
             draws = torch.randint(total, (count,), generator=generator)
@@ -180,7 +196,7 @@ class TransitionBuffer:
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
         """Draw transitions."""
-        return self.batch(self.sample_rows(batch_size, generator))
+        return self.batch(self.sample_rows(batch_size, generator).to(self.device))
 
     def observe(self, places: Tensor) -> Observations:
         """What is seen at frames (R,): each frame, with those before it if frames are stacked."""

@@ -74,11 +74,13 @@ def _legend(curves: list[Curve]) -> str:
 
 def _draw(axes: Any, curves: list[Curve], name: str) -> None:
     color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
-    for curve in curves:
-        axes.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5)
     shortest = min((curve["update"] for curve in curves), key=len)
+    # A line through one point cannot be seen.
+    marker = "o" if len(shortest) == 1 else None
+    for curve in curves:
+        axes.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5, marker=marker)
     mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
-    axes.plot(shortest, mean, color=color, lw=1.8)
+    axes.plot(shortest, mean, color=color, lw=1.8, marker=marker)
 
 
 def read_curve(path: Path) -> Curve:

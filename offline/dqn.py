@@ -14,7 +14,7 @@ never shows, and both overrate them: they are the baseline that CQL mends.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -33,9 +33,7 @@ from mcaprl.offline.losses import (
     q_learning_target,
     quantile_regression,
 )
-from mcaprl.offline.models import Model
 from mcaprl.offline.networks import Architecture
-from mcaprl.offline.target import HardTarget
 
 
 @dataclass(frozen=True)
@@ -76,8 +74,7 @@ class DQN(Learner):
     def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
         """Start with random weights, and the same ones as target."""
         super().__init__(config, buffer, seeds)
-        rows_per_sync = config.batch_size * config.target_interval
-        self.target = HardTarget(self.models["q"], buffer, rows_per_sync)
+        self.target = self.add_target("q", config.target_interval)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """A value for each action, or quantiles."""
@@ -110,22 +107,6 @@ class DQN(Learner):
     def target_outputs(self, batch: Batch) -> Tensor:
         """(R, A) values of the next states, or (R, A, N) quantiles, under the target network."""
         return allowed_only(self.target.outputs(batch), batch.next_observations.mask)
-
-    def update(self) -> dict[str, Tensor]:
-        """Make one gradient step, then copy the weights into the target when it is due."""
-        terms = super().update()
-        if self.step % self.config.target_interval == 0:
-            self.target.sync(self.models["q"])
-        return terms
-
-    def everything(self) -> dict[str, Model]:
-        """The model that learns and its target."""
-        return {**self.models, "target": self.target.model}
-
-    def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go back to what `state` returned after `step` updates."""
-        super().load_state(seed, tensors, step)
-        self.target.forget()
 
 
 class DoubleDQN(DQN):

@@ -88,7 +88,7 @@ def with_more_data(learner: Learner, dataset: Dataset, never_drawn: NDArray[np.i
     weights[never_drawn] = 0.0
     buffer = TransitionBuffer.from_dataset(
         dataset, learner.config.packing, encoder=learner.buffer.encoder, weights=weights
-    )
+    ).to(learner.buffer.device)
     grown = type(learner)(learner.config, buffer, learner.seeds)
     for seed in learner.seeds:
         grown.load_state(seed, learner.state(seed), learner.step)

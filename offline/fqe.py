@@ -13,7 +13,7 @@ about actions that the log never shows answers with anything.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,8 +23,7 @@ from mcaprl.offline.buffer import Batch, Packing, TransitionBuffer
 from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.learner import ActsBy, Learner, Losses
 from mcaprl.offline.losses import chosen, expected_sarsa_target, square_regression
-from mcaprl.offline.models import Model
-from mcaprl.offline.target import HardTarget, outputs_everywhere
+from mcaprl.offline.target import outputs_everywhere
 
 SYNCS_PER_HORIZON = 5.0
 """Fewer copies than 5 / (1 - gamma), and Q has not seen the end of its horizon."""
@@ -84,8 +83,7 @@ class FQE(Learner):
         """
         super().__init__(config, buffer, seeds)
         self.pi_t = pi_t
-        rows_per_sync = config.batch_size * config.target_interval
-        self.target = HardTarget(self.models["q"], buffer, rows_per_sync)
+        self.target = self.add_target("q", config.target_interval)
         rewards, _ = buffer.returns
         drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
         self.low, self.high = reachable(drawn, config.gamma)
@@ -103,22 +101,6 @@ class FQE(Learner):
         td_loss = square_regression(q_tm1, batch.actions, target_tm1)
         q_a_tm1 = chosen(q_tm1, batch.actions)
         return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
-
-    def update(self) -> dict[str, Tensor]:
-        """Make one gradient step, then copy the weights into the target when it is due."""
-        terms = super().update()
-        if self.step % self.config.target_interval == 0:
-            self.target.sync(self.models["q"])
-        return terms
-
-    def everything(self) -> dict[str, Model]:
-        """The model that learns and its target."""
-        return {**self.models, "target": self.target.model}
-
-    def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go back to what `state` returned after `step` updates."""
-        super().load_state(seed, tensors, step)
-        self.target.forget()
 
     def values(self, *, next_states: bool) -> Tensor:
         """(N, A) the first seed's values of the buffer's states, or next states, within reach."""

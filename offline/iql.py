@@ -14,7 +14,7 @@ each action; hard copies of the target where the paper averages; the Huber loss 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -31,8 +31,6 @@ from mcaprl.offline.losses import (
     huber_regression,
     scaled,
 )
-from mcaprl.offline.models import Model
-from mcaprl.offline.target import HardTarget
 
 MAX_WEIGHT = 100.0
 """The most that one action can count in the policy's loss, as in the paper's code."""
@@ -69,10 +67,8 @@ class IQL(Learner):
     def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
         """Start with random weights, and the same ones as targets."""
         super().__init__(config, buffer, seeds)
-        rows = config.batch_size * config.target_interval
-        self.targets = {
-            name: HardTarget(self.models[name], buffer, rows, next_states=False) for name in _TWINS
-        }
+        for name in _TWINS:
+            self.add_target(name, config.target_interval, next_states=False)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Two networks of values, one of states, and the policy's logits."""
@@ -81,7 +77,7 @@ class IQL(Learner):
 
     def losses(self, batch: Batch) -> Losses:
         """Each network has a loss of its own; what is logged is their sum."""
-        values = [chosen(self.targets[name].outputs(batch), batch.actions) for name in _TWINS]
+        values = [chosen(self.copies[name].outputs(batch), batch.actions) for name in _TWINS]
         q_a_tm1 = torch.minimum(*values)
         target_tm1 = self.next_values(batch)
         v_tm1 = self.models["v"].learn_from(batch.observations)
@@ -117,22 +113,3 @@ class IQL(Learner):
         """(R,) r + gamma V(s')."""
         v_t = self.models["v"](batch.next_observations).squeeze(1)
         return batch.rewards + batch.discounts * v_t
-
-    def update(self) -> dict[str, Tensor]:
-        """Make one gradient step, then copy the weights into the targets when it is due."""
-        terms = super().update()
-        if self.step % self.config.target_interval == 0:
-            for name, target in self.targets.items():
-                target.sync(self.models[name])
-        return terms
-
-    def everything(self) -> dict[str, Model]:
-        """The models that learn and the targets."""
-        targets = {f"{name}_target": target.model for name, target in self.targets.items()}
-        return {**self.models, **targets}
-
-    def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Go back to what `state` returned after `step` updates."""
-        super().load_state(seed, tensors, step)
-        for target in self.targets.values():
-            target.forget()

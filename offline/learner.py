@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from mcaprl.offline.buffer import Batch, TransitionBuffer
+from mcaprl.offline.captured import StaticUpdate
 from mcaprl.offline.config import TrainingConfig
 from mcaprl.offline.losses import allowed_only
 from mcaprl.offline.models import Model, build_model
 from mcaprl.offline.networks import Network
 from mcaprl.offline.observations import Observations
+from mcaprl.offline.target import HardTarget
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
 """What a trained policy takes the best action of: see `policy`."""
@@ -36,14 +38,24 @@ class Losses(NamedTuple):
 
 
 class NotFiniteError(ArithmeticError):
-    """A term of the loss is NaN or infinite."""
+    """A term of the loss is NaN or infinite.
+
+    Attributes:
+        update: number of the update, from 1, that met it.
+    """
+
+    def __init__(self, message: str, update: int) -> None:
+        """Say which term, and when."""
+        super().__init__(message)
+        self.update = update
 
 
 class Learner(ABC):
     """One algorithm at work on one data set with K seeds; a subclass says what its losses are.
 
     Everything random comes from the seeds: the same seed, data and machine give the same weights,
-    whichever seeds learn beside it.
+    whichever seeds learn beside it. Networks live where the buffer is; on a GPU an update is one
+    CUDA graph (see `captured`), and a loss that is not finite is told by `check` alone.
 
     Attributes:
         name: of the algorithm, as a user writes it.
@@ -52,7 +64,9 @@ class Learner(ABC):
         policy_models: names of the models that the policy needs.
         seeds: K of them.
         models: K networks each, by name.
+        copies: targets of some of them, which stand still between two synchronisations, by name.
         step: updates done.
+        static_update: makes the updates where nothing may wait for the device; None on a CPU.
     """
 
     name: ClassVar[str]
@@ -77,13 +91,18 @@ class Learner(ABC):
         self.models: dict[str, Model] = {
             name: build_model([mine[name] for mine in networks]) for name in networks[0]
         }
+        self.copies: dict[str, HardTarget] = {}
+        self._sync_interval = 0
         self._weights = [model.weights for model in self.models.values()]
+        on_gpu = buffer.device.type == "cuda"
         self.optimizer = torch.optim.AdamW(
-            self._weights, weight_decay=config.weight_decay, fused=True
+            self._weights, weight_decay=config.weight_decay, fused=True, capturable=on_gpu
         )
         for weights in self._weights:
             moments = {name: torch.zeros_like(weights) for name in _MOMENTS}
-            self.optimizer.state[weights] = {"step": torch.tensor(0.0), **moments}
+            steps = torch.tensor(0.0, device=buffer.device)
+            self.optimizer.state[weights] = {"step": steps, **moments}
+        self.static_update: StaticUpdate | None = StaticUpdate(self) if on_gpu else None
 
     @abstractmethod
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -104,6 +123,8 @@ class Learner(ABC):
     def update(self) -> dict[str, Tensor]:
         """Make one gradient step on one random batch for each seed.
 
+        Copies of the weights into targets are made behind it when they are due.
+
         Returns:
             The terms of `losses`.
 
@@ -111,16 +132,53 @@ class Learner(ABC):
             NotFiniteError: the loss is NaN or infinite; the weights are as before.
         """
         size = self.config.batch_size
-        rows = [self.buffer.sample_rows(size, sampler) for sampler in self.samplers]
-        terms, slopes = self.losses(self.buffer.batch(torch.cat(rows)))
-        if not math.isfinite(terms["loss"].sum().item()):
-            raise NotFiniteError(self._first_bad(terms))
-        for name, slope in slopes.items():
-            self.models[name].backward(slope.div_(size))
-        self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
-        self.optimizer.step()
+        rows = torch.cat([self.buffer.sample_rows(size, sampler) for sampler in self.samplers])
+        for target in self.copies.values():
+            target.prepare()
+        if self.static_update is not None:
+            terms = self.static_update(rows, self.config.learning_rate_at(self.step))
+        else:
+            terms = self.find_gradients(rows)
+            if not math.isfinite(terms["loss"].sum().item()):
+                raise self.not_finite(self.seed_means(terms), self.step + 1)
+            self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
+            self.optimizer.step()
         self.step += 1
+        if self.copies and self.step % self._sync_interval == 0:
+            for name, target in self.copies.items():
+                target.sync(self.models[name])
         return terms
+
+    def find_gradients(self, rows: Tensor) -> dict[str, Tensor]:
+        """Set the gradients of all models from a batch, given by its rows (R,); gives the terms."""
+        terms, slopes = self.losses(self.buffer.batch(rows))
+        for name, slope in slopes.items():
+            self.models[name].backward(slope.div_(self.config.batch_size))
+        return terms
+
+    def check(self) -> None:
+        """Tell if a loss was not finite since the last call, where `update` did not wait to see.
+
+        Raises:
+            NotFiniteError: it was; the weights are of no use.
+        """
+        if self.static_update is not None:
+            self.static_update.check()
+
+    def add_target(self, name: str, interval: int, *, next_states: bool = True) -> HardTarget:
+        """Give a model a target, which gets its weights now and every `interval` updates.
+
+        Args:
+            name: of the model.
+            interval: the same for all targets.
+            next_states: whether it is asked for values of the next states, or of the states.
+        """
+        rows = self.config.batch_size * interval
+        self._sync_interval = interval
+        self.copies[name] = HardTarget(
+            self.models[name], self.buffer, rows, next_states=next_states
+        )
+        return self.copies[name]
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
         """The means of (R,) terms over each seed's own rows."""
@@ -138,12 +196,18 @@ class Learner(ABC):
         return allowed_only(self.models[name](observations), observations.mask)
 
     def everything(self) -> dict[str, Model]:
-        """Every model with weights of its own, by name; not only those that learn."""
-        return dict(self.models)
+        """Every model with weights of its own, by name: those that learn, and the targets."""
+        targets = {f"{name}_target": target.model for name, target in self.copies.items()}
+        return {**self.models, **targets}
 
     def network(self, name: str, seed: int) -> Network:
         """One seed's network, with its present weights."""
         return self.models[name].networks[self.seeds.index(seed)]
+
+    def changed_by_updates(self) -> list[Tensor]:
+        """The tensors on the device that an update changes, synchronisations aside."""
+        moments = [self.optimizer.state[weights] for weights in self._weights]
+        return [*self._weights, *(tensor for mine in moments for tensor in mine.values())]
 
     def state(self, seed: int) -> dict[str, Tensor]:
         """All that a seed's next update depends on, save `step`: weights, optimiser, generator."""
@@ -170,6 +234,8 @@ class Learner(ABC):
             moments["step"].fill_(step)
             for moment in _MOMENTS:
                 _copy(moments[moment][k], tensors[f"{name}.{moment}"])
+        for target in self.copies.values():
+            target.forget()
         self.samplers[k].set_state(tensors["generator.sampler"])
         self.step = step
 
@@ -178,17 +244,19 @@ class Learner(ABC):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return {
-                name: Network(buffer.vector_width, buffer.image_shapes, shape, architecture)
+                name: Network(buffer.vector_width, buffer.image_shapes, shape, architecture).to(
+                    buffer.device
+                )
                 for name, shape in self.output_shapes().items()
             }
 
-    def _first_bad(self, terms: Mapping[str, Tensor]) -> str:
+    def not_finite(self, seed_means: Sequence[Mapping[str, float]], update: int) -> NotFiniteError:
         """Name the first bad term; the loss is last and bad whenever one of its parts is."""
-        for seed, means in zip(self.seeds, self.seed_means(terms), strict=True):
+        for seed, means in zip(self.seeds, seed_means, strict=True):
             for name, value in means.items():
                 if not math.isfinite(value):
-                    return f"{name} of seed {seed} is {value}"
-        return "the sum of the losses is beyond float32"
+                    return NotFiniteError(f"{name} of seed {seed} is {value}", update)
+        return NotFiniteError("the sum of the losses is beyond float32", update)
 
 
 def _copy(into: Tensor, tensor: Tensor) -> None:

@@ -42,13 +42,12 @@ class Model(ABC):
         self.weights = torch.zeros(len(networks), padded, device=device)
         self.gradients = torch.zeros_like(self.weights)
         self.weights.grad = self.gradients
-        for row, gradients, network in zip(self.weights, self.gradients, networks, strict=True):
+        for row, network in zip(self.weights, networks, strict=True):
             start = 0
             for parameter in network.parameters():
                 stop = start + parameter.numel()
                 row[start:stop] = parameter.detach().flatten()
                 parameter.data = row[start:stop].view_as(parameter)
-                parameter.grad = gradients[start:stop].view_as(parameter)
                 start = stop
 
     @abstractmethod
@@ -84,8 +83,12 @@ class AnyModel(Model):
 
     def backward(self, slope: Tensor) -> None:
         """Let autograd go on from the outputs."""
-        self.gradients.zero_()
-        torch.autograd.backward(self._outputs, slope)
+        counts = [len(list(network.parameters())) for network in self.networks]
+        parameters = [p for network in self.networks for p in network.parameters()]
+        found = iter(torch.autograd.grad(self._outputs, parameters, slope))
+        for row, count in zip(self.gradients, counts, strict=True):
+            flat = [next(found).flatten() for _ in range(count)]
+            torch.cat(flat, out=row[: sum(map(len, flat))])
 
     def _forward(self, observations: Observations) -> Tensor:
         parts = observations.split(len(observations) // len(self.networks))

@@ -42,8 +42,10 @@ class HardTarget:
         self._next_states = next_states
         self._use_table = len(buffer) <= rows_per_sync
         self._table: Tensor | None = None
+        self._is_fresh = False
         self._seeds = len(model.weights)
-        self._offsets = torch.arange(self._seeds).unsqueeze(1) * len(buffer)
+        numbers = torch.arange(self._seeds, device=buffer.device)
+        self._offsets = numbers.unsqueeze(1) * len(buffer)
 
     def sync(self, model: Model) -> None:
         """Copy the weights of `model`."""
@@ -51,17 +53,30 @@ class HardTarget:
         self.forget()
 
     def forget(self) -> None:
-        """Compute values anew when they are next asked for: the weights have changed."""
-        self._table = None
+        """Compute values anew before they are next asked for: the weights have changed."""
+        self._is_fresh = False
+
+    def prepare(self) -> None:
+        """Compute the values that `outputs` looks up, if the weights have changed.
+
+        They stay where they are in memory, so that an update that was captured once as a CUDA graph
+        finds them.
+        """
+        if not self._use_table or self._is_fresh:
+            return
+        values = outputs_everywhere(self.model, self._buffer, next_states=self._next_states)
+        if self._table is None:
+            self._table = values
+        else:
+            self._table.copy_(values)
+        self._is_fresh = True
 
     def outputs(self, batch: Batch) -> Tensor:
         """(R, ...) the model's outputs for the batch's states, or next states."""
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
-        if self._table is None:
-            self._table = outputs_everywhere(
-                self.model, self._buffer, next_states=self._next_states
-            )
+        self.prepare()
+        assert self._table is not None
         rows = batch.rows
         if self._seeds > 1:
             rows = (rows.view(self._seeds, -1) + self._offsets).flatten()

@@ -13,10 +13,11 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
+from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.offline.algorithms import choose_algorithm
 from mcaprl.offline.buffer import TransitionBuffer
+from mcaprl.offline.captured import choose_device
 from mcaprl.offline.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -51,6 +53,8 @@ from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progres
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
 
+_T = TypeVar("_T")
+
 
 def train(
     dataset: Dataset,
@@ -63,6 +67,7 @@ def train(
     resume: bool = False,
     other_data: bool = False,
     follow: GrowingLogs | None = None,
+    device: str = "cpu",
     progress: ProgressCallback | None = None,
 ) -> list[RunSummary]:
     """Train on a dataset; the same seed, data and machine give the same weights.
@@ -80,6 +85,7 @@ def train(
         other_data: when resuming, go on even if the checkpoints are from other data.
         follow: logs that `dataset` was read from and that grow; each episode that is finished
             while the networks learn is learned from, too.
+        device: `cpu` or `cuda`: there the data and the networks are, and the updates are made.
         progress: called with each row of metrics; None shows a bar where stderr is a terminal.
 
     Returns:
@@ -87,12 +93,14 @@ def train(
 
     Raises:
         UnknownNameError: there is no such algorithm.
+        UsageError: there is no such device.
         OutputExistsError: `out` is taken.
         SpaceError: the algorithm cannot learn with these observations or actions.
         TrainingError: the loss is NaN or infinite, or `out` has a run with other data or settings.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
+    place = choose_device(device)
     learner_type, config = choose_algorithm(algo)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     _check_weights(weights, len(dataset.episodes))
@@ -105,7 +113,7 @@ def train(
         config.packing,
         encoder=_earlier_encoder(folder) if resume and other_data else None,
         weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
-    )
+    ).to(place)
     folder.open(resume)
     if message := horizon_warning(config):
         warnings.warn(message, stacklevel=2)
@@ -194,11 +202,12 @@ class _Run:
         """Update until something is to be written, and write it."""
         config = learner.config
         while True:
-            terms = self._update(learner)
+            terms = self._check(learner.update)
             last = learner.step == config.updates
             checkpoint_due = last or learner.step % config.checkpoint_interval == 0
             if checkpoint_due or learner.step % config.log_interval == 0:
                 break
+        self._check(learner.check)
         values = learner.seed_means(terms)
         if self.held_out is not None:
             judged = self.held_out.terms(learner)
@@ -227,14 +236,15 @@ class _Run:
             save_policy(folder, learner, seed, self.dataset.env_id, self.dataset.env_kwargs)
             save_checkpoint(folder, learner, seed, self.folder.identity)
 
-    def _update(self, learner: Learner) -> dict[str, Any]:
+    def _check(self, work: Callable[[], _T]) -> _T:
+        """Do a part of the work; a loss that is not finite stops the run."""
         try:
-            return learner.update()
+            return work()
         except NotFiniteError as error:
-            paths = [self.folder.of_seed(seed) / CHECKPOINT_NAME for seed in learner.seeds]
-            good = ", ".join(str(path) for path in paths if path.exists()) or "none yet"
+            paths = sorted(self.folder.path.glob(f"seed-*/{CHECKPOINT_NAME}"))
+            good = ", ".join(map(str, paths)) or "none yet"
             raise TrainingError(
-                f"update {learner.step + 1} of {self.folder.path}: {error}. Last good checkpoint:"
+                f"update {error.update} of {self.folder.path}: {error}. Last good checkpoint:"
                 f" {good}. Look for huge values in the data, or lower the learning rate"
             ) from error
 

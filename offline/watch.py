@@ -50,7 +50,7 @@ class HeldOut:
         if known.any():
             rows, returns = rows[known], returns[known]
         chosen = np.unique(np.linspace(0, len(rows) - 1, MAX_ROWS).round().astype(np.int64))
-        self._rows = torch.from_numpy(rows[chosen])
+        self._rows = torch.from_numpy(rows[chosen]).to(buffer.device)
         self._buffer = buffer
         self.mean_return = float(returns[chosen].mean())
 

@@ -160,7 +160,7 @@ def test_looking_up_the_target_is_the_same_as_computing_it(
         learner.buffer.sample_rows(64 * len(seeds), torch.Generator().manual_seed(0))
     )
     if isinstance(learner, IQL):
-        target, seen = learner.targets["q_twin"], batch.observations
+        target, seen = learner.copies["q_twin"], batch.observations
     else:
         assert isinstance(learner, DQN)
         target, seen = learner.target, batch.next_observations

@@ -1,0 +1,24 @@
+"""Puts tables into docs/results.md, between the marks that say whose place it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mcaprl.files import write_atomically
+
+PAGE = Path(__file__).parent.parent / "docs" / "results.md"
+
+
+def write_section(name: str, text: str, page: Path = PAGE) -> None:
+    """Replace what stands between `<!-- name -->` and `<!-- /name -->`.
+
+    Raises:
+        ValueError: the page does not have these two marks, once each.
+    """
+    begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->"
+    before, found, rest = page.read_text().partition(begin)
+    _, closed, after = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"{page} has no place for {name}: no {begin.strip()} and {end}")
+    whole = f"{before}{begin}\n{text.strip()}\n\n{end}{after}"
+    write_atomically(page, whole.encode())

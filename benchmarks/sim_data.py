@@ -1,0 +1,146 @@
+"""Six logs of each of our sims, of about 20,000 transitions each, to learn from offline.
+
+random   actions at random
+medium   an online run's policy as soon as it scores half of the pilot, one action in ten random
+expert   the sim's pilot
+replay   all that this online run did until then
+mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and actions at random
+weak     a drowsy pilot: it mostly does nothing, and now and then what it should
+
+Most actions of the weak pilot are bad ones, in most states: who imitates it does nothing. What
+would be better is in the log all the same, and its rewards tell.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import mcaprl
+from mcaprl.online.policy import load_policies
+from mcaprl.online.task import Task
+from mcaprl.online.train import train as train_online
+from mcaprl.progress import TrainingProgress
+from mcaprl.sims import make_sim
+from mcaprl.sims.pilots import make_pilot
+from mcaprl.sims.rollout import EpsilonGreedy, Policy, rollout
+
+STEPS = 20_000
+NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
+MEDIUM_SCORE = 0.5
+"""Where random is 0 and the pilot 1, over the 30 episodes of an evaluation while learning."""
+NOTHING = {"lane": "straight", "powerline": "no change", "racer": "none"}
+"""The action of each sim that a sleeper takes."""
+ASLEEP, CLUMSY = 0.6, 0.1
+"""How often the weak pilot does nothing, and how often any action, of the rest, at random."""
+MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
+MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
+
+
+class Drowsy(EpsilonGreedy):
+    """A policy that does nothing most of the time."""
+
+    def __init__(self, policy: Policy, env: gym.Env[Any, Any], nothing: int) -> None:
+        """Send `policy` to sleep; awake, it is a little clumsy."""
+        super().__init__(policy, CLUMSY, env.action_space)
+        self.name, self._nothing = "weak pilot", nothing
+
+    def choose(self, observation: Any) -> tuple[Any, float]:
+        """The action for one observation, and the probability with which it is chosen."""
+        assert self.policy is not None
+        chances = np.full(self._count, (1 - ASLEEP) * CLUMSY / self._count)
+        chances[int(self.policy.act(observation[None])[0])] += (1 - ASLEEP) * (1 - CLUMSY)
+        chances[self._nothing] += ASLEEP
+        action = int(self._random.choice(self._count, p=chances))
+        return action, float(chances[action])
+
+
+def make_logs(folder: Path, sim: str) -> dict[str, Path]:
+    """Make the logs of a sim that are not there yet; gives the paths of all six."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {name: folder / f"{name}.mcap" for name in NAMES}
+    online = folder / "online"
+    if not paths["replay"].exists():
+        _learn_online(sim, online, paths["replay"])
+    for name, make_behaviors in _behaviors(sim, online).items():
+        if not paths[name].exists():
+            _record(paths[name], sim, make_behaviors)
+    return paths
+
+
+def _learn_online(sim: str, out: Path, log: Path) -> None:
+    """Learn with the sim's own settings, and stop halfway; `out` has the best policy then."""
+
+    def stop_halfway(now: TrainingProgress) -> None:
+        if now.terms["score"] >= MEDIUM_SCORE:
+            raise _HalfwayError
+
+    shutil.rmtree(out, ignore_errors=True)
+    part = log.with_suffix(".part.mcap")
+    part.unlink(missing_ok=True)
+    with contextlib.suppress(_HalfwayError):
+        train_online(
+            Task.for_sim(sim, eval_interval=2_000), out, record=part, progress=stop_halfway
+        )
+    part.rename(log)
+
+
+class _HalfwayError(Exception):
+    """Stops an online run."""
+
+
+def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
+    """Who acts in each log, one after the other."""
+
+    def pilot(epsilon: float) -> MakeBehavior:
+        return lambda env: EpsilonGreedy(make_pilot(env), epsilon, env.action_space)
+
+    def medium(env: gym.Env[Any, Any]) -> EpsilonGreedy:
+        return EpsilonGreedy(load_policies(online)[0], 0.1, env.action_space)
+
+    def weak(env: gym.Env[Any, Any]) -> EpsilonGreedy:
+        meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
+        return Drowsy(make_pilot(env), env, meanings.index(NOTHING[sim]))
+
+    return {
+        "random": [pilot(1.0)],
+        "medium": [medium],
+        "expert": [pilot(0.0)],
+        "mixed": [pilot(epsilon) for epsilon in MIXED_EPSILONS],
+        "weak": [weak],
+    }
+
+
+def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
+    """Record whole episodes until each behavior has made its part of the steps."""
+    part = path.with_suffix(".part.mcap")
+    with (
+        closing(make_sim(sim)) as env,
+        closing(
+            mcaprl.RecordMcap(env, part, policy=path.stem, scene=False, overwrite=True)
+        ) as recorder,
+    ):
+
+        def tell_probability(probability: float) -> None:
+            recorder.behavior_prob = probability
+
+        for make_behavior in make_behaviors:
+            behavior, done = make_behavior(env), 0
+            while done < STEPS // len(make_behaviors):
+                (episode,) = rollout(
+                    recorder,
+                    behavior,
+                    seed=NAMES.index(path.stem),
+                    episodes=1,
+                    first_episode=recorder.episodes,
+                    on_action=tell_probability,
+                )
+                done += episode.length
+    part.rename(path)

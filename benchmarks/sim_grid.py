@@ -1,0 +1,159 @@
+"""Six logs of each of our sims, five algorithms, four seeds: what is learned from which log.
+
+    python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos cql,bc]
+
+The logs are those of `sim_data`; the settings of each sim are below and the same for all its logs.
+What counts are the networks after the last update: nothing is chosen by how it does in the sim. A
+score is the mean return over 30 episodes of each seed where random is 0 and the pilot 1, with a
+95 % bootstrap interval over seeds and episodes. Each cell is kept in FOLDER/SIM/scores.json; those
+that are there are not made anew, so a run that was stopped goes on. In the end the tables go to
+docs/results.md, with a dash for each cell that is not there yet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import mcaprl
+from benchmarks.page import write_section
+from benchmarks.sim_data import NAMES, make_logs
+from mcaprl.files import write_json
+from mcaprl.offline.algorithms import ALGORITHMS
+from mcaprl.offline.config import BootstrapConfig
+from mcaprl.offline.policy import load_policies
+from mcaprl.offline.train import train
+from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims.evaluate import PolicyScore, evaluate, normalize
+from mcaprl.sims.pilots import make_pilot
+from mcaprl.sims.rollout import Policy
+
+SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
+ALGOS = ("cql", "bc", "double-dqn", "bcq", "iql")
+SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "lane": {"gamma": 0.97},
+    "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
+    "racer": {"gamma": 0.98, "n_steps": 3},
+}
+"""Of the learners of values; behavior cloning takes of these the learning rate alone."""
+Cell = dict[str, Any]
+
+
+def main() -> None:
+    """Make the cells that are asked for and not there, and the tables if all are."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--sims", default=",".join(SETTINGS))
+    parser.add_argument("--data", default=",".join(NAMES))
+    parser.add_argument("--algos", default=",".join(ALGOS))
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    for sim in arguments.sims.split(","):
+        folder = arguments.folder / sim
+        paths = make_logs(folder, sim)
+        wanted = [
+            (name, algo)
+            for algo in arguments.algos.split(",")
+            for name in arguments.data.split(",")
+        ]
+        _fill(folder, sim, paths, wanted)
+        found = {sim: _read(arguments.folder / sim) for sim in SETTINGS}
+        write_section("sim-grid", "\n".join(table(sim, found[sim]) for sim in SETTINGS))
+
+
+def _fill(
+    folder: Path, sim: str, paths: dict[str, Path], wanted: Sequence[tuple[str, str]]
+) -> None:
+    """Make the cells that are not there."""
+    with closing(make_sim(sim)) as env:
+        random = run(sim, [None])
+        pilot = run(sim, [make_pilot(env)], env)
+    for name, algo in wanted:
+        cells = _read(folder)
+        row = cells.setdefault(name, {})
+        if algo in row:
+            continue
+        data = mcaprl.open(paths[name])
+        behavior = normalize_mean(data.statistics.mean_return, random, pilot)
+        row["behavior"] = {"score": behavior, "transitions": len(data)}
+        row[algo] = learn(sim, data, algo, folder / "run", random, pilot)
+        print(sim, name, f"behavior {behavior:.2f}", algo, row[algo], flush=True)
+        write_json(folder / "scores.json", cells)
+
+
+def learn(
+    sim: str, data: mcaprl.Dataset, algo: str, out: Path, random: PolicyScore, pilot: PolicyScore
+) -> Cell:
+    """Train all seeds on a log and score them."""
+    config_type = ALGORITHMS[algo].config_type
+    given = {**SHARED, **SETTINGS[sim]}
+    if not issubclass(config_type, BootstrapConfig):
+        given = {name: value for name, value in given.items() if name not in ("gamma", "n_steps")}
+    shutil.rmtree(out, ignore_errors=True)
+    train(data, config_type(**given), out, seeds=SEEDS, progress=lambda _: None)
+    score = normalize(run(sim, list(load_policies(out))), random, pilot)
+    assert score.normalized_score is not None
+    assert score.normalized_interval is not None
+    return {
+        "score": score.normalized_score,
+        "interval": list(score.normalized_interval),
+        "seeds": [
+            normalize_mean(float(mean), random, pilot) for mean in score.returns.mean(axis=1)
+        ],
+        "ends": score.ends,
+    }
+
+
+def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
+    """The same episodes for all; in `env`, one by one, or side by side."""
+    with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
+        return evaluate(
+            env or own,
+            policies,
+            name="",
+            episodes=EPISODES,
+            seed=EPISODE_SEED,
+            envs=None if env else envs,
+        )
+
+
+def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) -> float:
+    """0 as random, 1 as the pilot."""
+    return (mean_return - random.mean_return) / (pilot.mean_return - random.mean_return)
+
+
+def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
+    """Markdown: each cell has the mean score and its interval."""
+    lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
+    lines.append("|---|" + "---|" * len(ALGOS))
+    for name in NAMES:
+        row = cells.get(name, {})
+        behavior = f" ({row['behavior']['score']:.2f})" if row else ""
+        texts = [_text(row.get(algo)) for algo in ALGOS]
+        lines.append(f"| {name}{behavior} | {' | '.join(texts)} |")
+    return "\n".join([*lines, ""])
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return "-"
+    low, high = cell["interval"]
+    return f"{cell['score']:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _read(folder: Path) -> dict[str, dict[str, Cell]]:
+    path = folder / "scores.json"
+    found: dict[str, dict[str, Cell]] = json.loads(path.read_text()) if path.exists() else {}
+    return found
+
+
+if __name__ == "__main__":
+    main()
