@@ -81,10 +81,10 @@ def curve_picture(
         MissingExtraError: matplotlib is not installed.
         ReportError: it cannot be written.
     """
-    save_png(curve_figure(runs, title), path)
+    save_png(curve_figure(runs, title, value), path)
 
 
-def curve_figure(runs: Sequence[RunCurve], title: str) -> Any:
+def curve_figure(runs: Sequence[RunCurve], title: str, value: str | None = None) -> Any:
     """The same as a figure."""
     figure, axes = new_figure((7.2, 4.0))
     if value is None:
