@@ -72,8 +72,9 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     ## Rewards
 
-    min(ds / 2.5 m, 1) exp(-d / 4 m) for progress ds along the line beyond the furthest point so
-    far, at distance d from it. 5 more for finishing, -5 for leaving the line or a collision.
+    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds along the line beyond the
+    furthest point so far, at distance d from it: 5 m/s are paid best, and what is faster is paid
+    less. 5 more for finishing, -5 for leaving the line or a collision.
 
     ## Starting State
 

@@ -131,7 +131,8 @@ def moved(along_m: float, to_m: float, z: float = 0.0) -> tuple[Flight, Flight]:
     [
         (100.0, 101.25, 0.0, FLYING, 0.5),
         (100.0, 102.5, 0.0, FLYING, 1.0),
-        (100.0, 104.0, 0.0, FLYING, 1.0),
+        (100.0, 103.5, 0.0, FLYING, 0.6),
+        (100.0, 105.0, 0.0, FLYING, 0.0),
         (100.0, 100.0, 0.0, FLYING, 0.0),
         (100.0, 98.0, 0.0, FLYING, 0.0),
         (100.0, 101.25, 0.0, OFF_LINE, -5.0),
