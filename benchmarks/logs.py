@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,6 +14,9 @@ import mcaprl
 from benchmarks import rivals
 from benchmarks.measure import OURS, Side, Table, compare
 from benchmarks.workloads import EPISODE_STEPS, Constant, images, run_env, vectors
+from mcaprl.recorder.check import check_log
+from mcaprl.recorder.log_writer import STEP_TOPIC
+from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.schema import message_dtype
 
 # Message by message a million takes minutes: such sides do this share of it, and are scaled up.
@@ -30,11 +35,14 @@ def tables(folder: Path, transitions: int) -> list[Table]:
     data.save(log)
     return [
         _recording(folder, encoded, minari),
-        _writing(folder, data, part, encoded, minari),
+        _writing(folder, log, data, part, encoded, minari),
         _reading(folder, log, data, part, minari),
+        _threads(log),
+        _short_episodes(folder),
         _episode(log),
         _interleaved(folder, encoded),
         *_images(folder),
+        _checking(folder, log),
     ]
 
 
@@ -85,16 +93,20 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
 
 def _writing(
     folder: Path,
+    log: Path,
     data: mcaprl.Dataset,
     part: mcaprl.Dataset,
     encoded: list[bytes],
     minari: rivals.MinariFolder,
 ) -> Table:
     scratch = folder / "written"
+    chunks = rivals.raw_chunks(log, STEP_TOPIC)
     return compare(
         "Writing transitions that are in memory",
         [
             Side(OURS, lambda: data.save(folder / "written.mcap", overwrite=True)),
+            Side("plain zstd 1 of the same chunks", lambda: rivals.plain_compression(chunks)),
+            Side("memcpy of the same chunks", lambda: [bytearray(chunk) for chunk in chunks]),
             Side(
                 "mcap's Writer, messages ready-made",
                 lambda: rivals.write_mcap(encoded, scratch),
@@ -137,7 +149,7 @@ def _reading(
     hdf5, parquet, npz = folder / "table.h5", folder / "table.parquet", folder / "table.npz"
     sides = [
         Side(OURS, lambda: mcaprl.open(log)),
-        Side("plain zstd of the same chunks", lambda: rivals.plain_zstd(log, "/rl/step")),
+        Side("plain zstd of the same chunks", _plain(log)),
         Side("memcpy of the columns", lambda: [c.copy() for c in rivals.columns_of(data).values()]),
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOW_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOW_SHARE),
@@ -160,6 +172,52 @@ def _reading(
     )
 
 
+def _threads(log: Path) -> Table:
+    """By the clock on the wall: threads take no less CPU time."""
+    return compare(
+        "Reading that log with several threads",
+        [
+            Side(OURS, lambda: mcaprl.open(log)),
+            Side(f"{OURS}, 2 threads", lambda: mcaprl.open(log, threads=2)),
+            Side(f"{OURS}, 4 threads", lambda: mcaprl.open(log, threads=4)),
+            Side("check", lambda: check_log(log)),
+            Side("check, 2 threads", lambda: check_log(log, threads=2)),
+        ],
+        clock=time.perf_counter,
+        unit=f"time that passes on {os.cpu_count()} cores, ours with one thread = 1",
+    )
+
+
+def _short_episodes(folder: Path) -> Table:
+    """As recorded: a chunk of `/rl/step`, and others, for each episode."""
+    path, steps = folder / "short.mcap", 20
+    run_env(mcaprl.RecordMcap(Constant(steps), path), 1000, steps)
+    return compare(
+        f"Reading a recording of 1,000 episodes of {steps} steps",
+        [
+            Side(OURS, lambda: mcaprl.open(path)),
+            Side("plain zstd of the same chunks", _plain(path)),
+            Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(path)),
+        ],
+    )
+
+
+def _checking(folder: Path, log: Path) -> Table:
+    """Checking and recovering are reading, and, of the latter, writing."""
+    out = folder / "recovered.mcap"
+    return compare(
+        "Checking and recovering the log of vectors",
+        [
+            Side(OURS, lambda: check_log(log)),
+            Side("reading it into columns", lambda: mcaprl.open(log)),
+            Side("plain zstd of the same chunks", _plain(log)),
+            Side("recovering it", lambda: recover_log(log, out, overwrite=True)),
+        ],
+        goal="a check takes as long as reading",
+        rounds=3,
+    )
+
+
 def _episode(log: Path) -> Table:
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
@@ -168,6 +226,7 @@ def _episode(log: Path) -> Table:
         f"Reading one episode of {len(episodes)}",
         [
             Side(OURS, lambda: mcaprl.open(log, episodes=number)),
+            Side("plain zstd of its chunks", _plain(log, start_ns=start, stop_ns=stop)),
             Side(
                 "mcap + mcap-ros2-support, by time", lambda: rivals.read_mcap(log, start, stop + 1)
             ),
@@ -183,7 +242,8 @@ def _interleaved(folder: Path, encoded: list[bytes]) -> Table:
         "Reading another writer's log, topics interleaved",
         [
             Side(OURS, lambda: mcaprl.open(path)),
-            Side("plain zstd of the same chunks", lambda: rivals.plain_zstd(path, "/rl/step")),
+            Side("plain zstd of the same chunks", _plain(path)),
+            Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(path)),
         ],
         goal="70 % of plain zstd's speed",
     )
@@ -192,6 +252,7 @@ def _interleaved(folder: Path, encoded: list[bytes]) -> Table:
 def _images(folder: Path) -> list[Table]:
     packed, plain = folder / "images.mcap", folder / "plain.mcap"
     data = images(IMAGE_STEPS)
+    pictures = data.observations["depth"]
     data.save(packed)
     data.save(plain, compression="none")
     reading = compare(
@@ -200,8 +261,9 @@ def _images(folder: Path) -> list[Table]:
             Side(OURS, lambda: mcaprl.open(packed, images="memory")),
             Side(
                 "plain zstd of the same chunks",
-                lambda: rivals.plain_zstd(packed, "/rl/step", DEPTH),
+                _plain(packed, STEP_TOPIC, DEPTH),
             ),
+            Side("memcpy of the pictures", lambda: [pictures.copy()]),
             Side(f"{OURS}, vectors alone", lambda: mcaprl.open(packed, columns=["state"])),
         ],
         goal="85 % of plain zstd's speed; vectors alone 30 times cheaper",
@@ -217,9 +279,16 @@ def _images(folder: Path) -> list[Table]:
             Side(f"{OURS}, in memory", lambda: [memory.batch(rows) for rows in batches]),
             Side("NumPy, one array in memory", lambda: [(frames[r], frames[r]) for r in batches]),
         ],
+        goal="300,000 transitions a second on disk; NumPy's speed is the limit",
         ours=f"{OURS}, on disk",
     )
     return [reading, drawing]
+
+
+def _plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
+    """Plain decompression of a log's chunks, by default those of `/rl/step`."""
+    chunks = rivals.compressed_chunks(path, topics or (STEP_TOPIC,), **times)
+    return lambda: rivals.plain_zstd(chunks)
 
 
 def _with_episodes(encoded: list[bytes]) -> list[bytes]:

@@ -65,7 +65,14 @@ class Table:
 
 
 def compare(
-    title: str, sides: Sequence[Side], *, goal: str = "", rounds: int = 5, ours: str = OURS
+    title: str,
+    sides: Sequence[Side],
+    *,
+    goal: str = "",
+    rounds: int = 5,
+    ours: str = OURS,
+    clock: Callable[[], float] = time.process_time,
+    unit: str = "CPU time, ours = 1",
 ) -> Table:
     """Time sides in turns.
 
@@ -75,22 +82,24 @@ def compare(
         goal: what we want to reach, in words.
         rounds: turns of each side.
         ours: the side whose time is 1.
+        clock: what measures it, in seconds.
+        unit: what the ratios are of, in words.
     """
     table, best = (
-        Table(title, goal=goal),
+        Table(title, goal=goal, unit=unit),
         dict.fromkeys((side.name for side in sides), float("inf")),
     )
     for _ in range(rounds):
         for side in sides:
             if side.name in table.missing:
                 continue
-            start = time.process_time()
+            start = clock()
             try:
                 side.run()
             except ImportError as error:
                 table.missing[side.name] = str(error)
                 continue
-            taken = (time.process_time() - start) / side.share
+            taken = (clock() - start) / side.share
             best[side.name] = min(best[side.name], taken)
     times = {
         side.name: best[side.name] - (best[side.floor] if side.floor else 0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -271,24 +270,45 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         return {name: file[name] for name in file.files}
 
 
-def compressed_chunks(path: Path, topics: tuple[str, ...]) -> Iterator[memoryview]:
-    """The bytes of the chunks that hold a topic, as they stand in the file."""
+def compressed_chunks(
+    path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
+) -> list[memoryview]:
+    """The bytes of the chunks that hold a topic in a time, as they stand in the file."""
     from mcaprl.recorder.mcap_reader import McapReader
 
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
+    found = []
     for chunk in reader.chunks:
-        if ids & set(chunk.message_index_offsets):
+        is_then = chunk.message_start_time < stop_ns and chunk.message_end_time >= start_ns
+        if ids & set(chunk.message_index_offsets) and is_then:
             start = chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size
-            yield reader.view[start : start + chunk.compressed_size]
+            found.append(reader.view[start : start + chunk.compressed_size])
+    return found
 
 
-def plain_zstd(path: Path, *topics: str) -> None:
-    """Decompress the chunks of topics, and nothing else: what no reader can do without."""
+def plain_zstd(chunks: list[memoryview]) -> None:
+    """Decompress chunks, and nothing else: what no reader can do without."""
     import zstandard
 
-    for data in compressed_chunks(path, topics):
+    for data in chunks:
         zstandard.decompress(data)
+
+
+def raw_chunks(path: Path, topic: str) -> list[bytes]:
+    """The records of a topic's chunks."""
+    import zstandard
+
+    return [zstandard.decompress(data) for data in compressed_chunks(path, (topic,))]
+
+
+def plain_compression(chunks: list[bytes]) -> None:
+    """Compress chunks with zstd 1, and nothing else: what no writer can do without."""
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=1)
+    for records in chunks:
+        compressor.compress(records)
 
 
 def record_bare(episodes: int) -> None:

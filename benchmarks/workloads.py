@@ -21,10 +21,10 @@ class Constant(gym.Env[Any, Any]):
 
     observation_space, action_space = OBSERVATION, ACTION
 
-    def __init__(self) -> None:
+    def __init__(self, episode_steps: int = EPISODE_STEPS) -> None:
         """Prepare the one observation."""
         self.observation = np.arange(19, dtype=np.float32)
-        self.step_number = 0
+        self.step_number, self.episode_steps = 0, episode_steps
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
@@ -34,14 +34,14 @@ class Constant(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Give the same observation again."""
         self.step_number += 1
-        return self.observation, 1.0, False, self.step_number == EPISODE_STEPS, {}
+        return self.observation, 1.0, False, self.step_number == self.episode_steps, {}
 
 
-def run_env(env: gym.Env[Any, Any], episodes: int) -> None:
+def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -> None:
     """Step through episodes."""
     for _ in range(episodes):
         env.reset()
-        for _ in range(EPISODE_STEPS):
+        for _ in range(steps):
             env.step(3)
     env.close()
 

@@ -274,6 +274,9 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
 
 def _numbers(bounds: NDArray[Any]) -> Any:
     """Bounds as JSON: a single number where all are equal; infinities as strings."""
+    # Of pictures there are many, and nearly always they are one.
+    if bounds.size and (bounds == bounds.flat[0]).all():
+        return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]
     return flat[0] if len(set(flat)) == 1 else flat
 
