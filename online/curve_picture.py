@@ -87,7 +87,7 @@ def curve_figure(runs: Sequence[RunCurve], title: str) -> Any:
     dots = "; dots: best checkpoints on fresh episodes" if any(run.finals for run in runs) else ""
     axes.set_xlabel(f"environment steps{dots}")
     axes.set_title(title)
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower right", frameon=False)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Keeps Ctrl-C, SIGTERM and a closed terminal from falling between two writes that belong together."""
+"""Keeps Ctrl-C, SIGTERM and a closed terminal from falling between writes that belong together."""
 
 from __future__ import annotations
 
