@@ -108,7 +108,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         for i in np.flatnonzero(chosen).tolist():
             if seeds[i] is not None:
                 self._randoms[i] = seeding.np_random(seeds[i])[0]
-            self._begin(i, starts[i])
+            self.fleet.begin(i, self._randoms[i], starts[i])
+        self._steps[chosen], self._ended[chosen] = 0, False
         self._is_started = True
         return self.fleet.observations(), self._told(chosen, np.zeros_like(chosen))
 
@@ -131,9 +132,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
         fleet.advance(numbers)
         self._steps += 1
-        for i in np.flatnonzero(fresh).tolist():
-            # These were at their end already: their step is a reset.
-            self._begin(i, None)
+        # These were at their end already: their step is a reset.
+        self._begin_all(np.flatnonzero(fresh))
         ended_itself = fleet.ends != GOING_ON
         cut = self._truncates[fleet.ends]
         terminated = ended_itself & ~cut
@@ -158,9 +158,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             )
         return self._ended.copy()
 
-    def _begin(self, i: int, options: dict[str, Any] | None) -> None:
-        self.fleet.begin(i, self._randoms[i], options)
-        self._steps[i], self._ended[i] = 0, False
+    def _begin_all(self, chosen: NDArray[np.int64]) -> None:
+        if len(chosen):
+            self.fleet.begin_all(chosen, self._randoms)
+            self._steps[chosen], self._ended[chosen] = 0, False
 
     def _infos(self, ended_itself: Bools) -> dict[str, Any]:
         """Give the infos of a step; in mode `SameStep`, reset what has ended."""
@@ -169,9 +170,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             return self._told(np.ones_like(ended), ended_itself)
         last = np.full(self.num_envs, None, dtype=object)
         final = self._told(ended, ended_itself)
-        for i in np.flatnonzero(ended).tolist():
+        chosen = np.flatnonzero(ended)
+        for i in chosen.tolist():
             last[i] = self.fleet.observation(i)
-            self._begin(i, None)
+        self._begin_all(chosen)
         return {
             "final_obs": last,
             "_final_obs": ended,

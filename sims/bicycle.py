@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mcaprl.sims.compiled import compiled
+from mcaprl.sims.compiled import compiled, inlined
+from mcaprl.sims.geometry import Heading, heading_of, sine, turned
 
 
 class Motion(NamedTuple):
@@ -15,9 +16,17 @@ class Motion(NamedTuple):
     y_m: float
     yaw_rad: float
     speed_m_s: float
+    heading: Heading
+    """Of the yaw, turned with it step by step; `moving` computes it anew."""
 
 
 @compiled
+def moving(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Motion:
+    """Make a motion."""
+    return Motion(x_m, y_m, yaw_rad, speed_m_s, heading_of(yaw_rad))
+
+
+@inlined
 def roll(
     motion: Motion,
     slip_sine: float,
@@ -25,7 +34,7 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step.
+    """Advance a bicycle by one explicit Euler step, in which it turns by at most 90 degrees.
 
     With slip angle beta, half the wheelbase l and speed v: x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, v' = acceleration. Polack, Altche,
@@ -33,22 +42,27 @@ def roll(
     feasible trajectories for autonomous vehicles?", IEEE IV 2017, eq. 1. The sums of angles are
     written out as products, since beta is known by its sine alone.
     """
-    cos, sin = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
+    cos, sin = motion.heading
     slip_cosine = math.sqrt(1.0 - slip_sine * slip_sine)
     distance_m = motion.speed_m_s * duration_s
+    turn_rad = distance_m * slip_sine / (0.5 * wheelbase_m)
     return Motion(
         motion.x_m + distance_m * (cos * slip_cosine - sin * slip_sine),
         motion.y_m + distance_m * (sin * slip_cosine + cos * slip_sine),
-        motion.yaw_rad + distance_m * slip_sine / (0.5 * wheelbase_m),
+        motion.yaw_rad + turn_rad,
         motion.speed_m_s + acceleration_m_s2 * duration_s,
+        turned(motion.heading, turn_rad),
     )
 
 
 @compiled
 def slip_of(steering_rad: float) -> float:
-    """Give sin(beta) for an angle of the front wheels: tan(beta) = tan(steering) / 2."""
-    tangent = 0.5 * math.tan(steering_rad)
-    return tangent / math.sqrt(1.0 + tangent * tangent)
+    """Give sin(beta) for an angle of the front wheels of at most 45 degrees.
+
+    tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)).
+    """
+    steering_sine = sine(steering_rad)
+    return steering_sine / math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
 
 
 @compiled
@@ -64,6 +78,5 @@ def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) 
     The car turns on a radius of l / sin(beta), so v^2 sin(beta) / l = lateral; at low speed no turn
     reaches it and the answer is 1.
     """
-    sine = 0.5 * wheelbase_m * lateral_m_s2
-    square = speed_m_s * speed_m_s
-    return 1.0 if sine >= square else sine / square
+    least = 0.5 * wheelbase_m * lateral_m_s2
+    return least / max(speed_m_s * speed_m_s, least)

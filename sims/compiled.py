@@ -16,7 +16,9 @@ def compiled(function: AnyFunction) -> AnyFunction:
     """Compile a function with numba at its first call, and keep the result on disk.
 
     Without `fastmath`: sums keep the order they are written in, so the same input gives the same
-    bits. The decorator says to a type checker that the signature stays as written.
+    bits. A division by 0 gives inf or NaN, as in NumPy: a check before each would keep the compiler
+    from doing several at once. The decorator says to a type checker that the signature stays as
+    written.
 
     The result is kept in `__pycache__` beside the source; where that cannot be written, in the
     user's cache folder; where NUMBA_CACHE_DIR is set, there. Where nothing can be written, it lasts
@@ -25,11 +27,25 @@ def compiled(function: AnyFunction) -> AnyFunction:
     The cache notices an edit of the function's own file only. After an edit of a function that is
     called from other files, delete the `__pycache__` folder.
     """
+    return _compiled(function)
+
+
+def inlined(function: AnyFunction) -> AnyFunction:
+    """Compile a function into each that calls it, however long it is.
+
+    A loop over vehicles can then do several of them at once; by itself the compiler inlines short
+    functions only.
+    """
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:
+    options = {"error_model": "numpy", **options}
     try:
-        machine_code = numba.njit(cache=True)(function)
+        machine_code = numba.njit(cache=True, **options)(function)
     except RuntimeError:
         _Announcer.lasts = "in each process, as no cache folder can be written: set NUMBA_CACHE_DIR"
-        machine_code = numba.njit(function)
+        machine_code = numba.njit(**options)(function)
     return cast(AnyFunction, machine_code)
 
 

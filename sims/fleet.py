@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -64,6 +65,16 @@ class Fleet(ABC):
         Raises:
             UsageError: `options` has an unknown key, or a pose that cannot be started from.
         """
+
+    def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
+        """Start an episode of some vehicles, as `begin` does without options.
+
+        Args:
+            chosen: (K,) which.
+            randoms: a generator for each of the N vehicles.
+        """
+        for i in chosen.tolist():
+            self.begin(i, randoms[i], None)
 
     @abstractmethod
     def advance(self, actions: NDArray[np.int64]) -> None:

@@ -58,12 +58,64 @@ def closed_path(corners: ArrayLike) -> Path:
 @compiled
 def wrap_angle(angle_rad: float) -> float:
     """Bring an angle into [-pi, pi)."""
-    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+    turns = math.floor((angle_rad + math.pi) / (2.0 * math.pi))
+    wrapped = max(angle_rad - 2.0 * math.pi * turns, -math.pi)
+    # Rounding may leave it a hair outside on the other side.
+    return wrapped if wrapped < math.pi else -math.pi
 
 
 @compiled
-def leg_at(path: Path, along_m: float) -> int:
-    """Give the index of the leg that holds a distance along the path; any lap will do."""
+def sine(angle_rad: float) -> float:
+    """Give the sine of an angle of at most 45 degrees, to the last bit or two.
+
+    Without a branch or a call, so that the compiler can do those of several vehicles at once. The
+    series x - x^3/3! + x^5/5! - ...: the first term left out is below 6e-17 of the sine.
+    """
+    square = angle_rad * angle_rad
+    rest = 1.0 / 6227020800.0 - square * (1.0 / 1307674368000.0)
+    rest = 1.0 / 39916800.0 - square * rest
+    rest = 1.0 / 362880.0 - square * rest
+    rest = 1.0 / 5040.0 - square * rest
+    rest = 1.0 / 120.0 - square * rest
+    rest = 1.0 / 6.0 - square * rest
+    return angle_rad * (1.0 - square * rest)
+
+
+class Heading(NamedTuple):
+    """The direction of a yaw, as a unit vector."""
+
+    cos: float
+    sin: float
+
+
+@compiled
+def heading_of(yaw_rad: float) -> Heading:
+    """Give the direction of a yaw."""
+    return Heading(math.cos(yaw_rad), math.sin(yaw_rad))
+
+
+@compiled
+def turned(heading: Heading, angle_rad: float) -> Heading:
+    """Turn a direction to the left, by at most 90 degrees either way.
+
+    The sum formulas need the angle's own sine and cosine; 1 - cos is 2 sin^2 of half the angle.
+    """
+    half = sine(0.5 * angle_rad)
+    cos = 1.0 - 2.0 * half * half
+    sin = 2.0 * half * math.sqrt(1.0 - half * half)
+    return Heading(heading.cos * cos - heading.sin * sin, heading.sin * cos + heading.cos * sin)
+
+
+class Spot(NamedTuple):
+    """A place on a path: on which leg, and how far from the leg's start."""
+
+    leg: int
+    rest_m: float
+
+
+@compiled
+def spot_at(path: Path, along_m: float) -> Spot:
+    """Find the place at a distance along the path; any lap will do."""
     rest_m = along_m % path.length_m
     leg, beyond = 0, len(path.yaw_rad)
     while beyond - leg > 1:
@@ -72,16 +124,38 @@ def leg_at(path: Path, along_m: float) -> int:
             leg = middle
         else:
             beyond = middle
-    return leg
+    return Spot(leg, rest_m - path.along_m[leg])
+
+
+@compiled
+def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
+    """Go on from a place by a distance of 0 or more, metres."""
+    leg, rest_m = spot.leg, spot.rest_m + ahead_m
+    length_m = path.along_m[leg + 1] - path.along_m[leg]
+    while rest_m >= length_m:
+        rest_m -= length_m
+        leg = leg + 1 if leg + 1 < len(path.yaw_rad) else 0
+        length_m = path.along_m[leg + 1] - path.along_m[leg]
+    return Spot(leg, rest_m)
+
+
+@compiled
+def point_of(path: Path, spot: Spot) -> tuple[float, float]:
+    """Give the coordinates (x, y) of a place, metres."""
+    start, forward = path.points_m[spot.leg], path.forward[spot.leg]
+    return start[0] + spot.rest_m * forward[0], start[1] + spot.rest_m * forward[1]
+
+
+@compiled
+def leg_at(path: Path, along_m: float) -> int:
+    """Give the index of the leg that holds a distance along the path; any lap will do."""
+    return spot_at(path, along_m).leg
 
 
 @compiled
 def point_at(path: Path, along_m: float) -> tuple[float, float]:
     """Give the point (x, y) at a distance along the path, metres; any lap will do."""
-    leg = leg_at(path, along_m)
-    rest_m = along_m % path.length_m - path.along_m[leg]
-    start, forward = path.points_m[leg], path.forward[leg]
-    return start[0] + rest_m * forward[0], start[1] + rest_m * forward[1]
+    return point_of(path, spot_at(path, along_m))
 
 
 @compiled
@@ -91,8 +165,8 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
     The window [from_m, to_m] keeps a traveller on its own pass where the path meets itself. It may
     begin on any lap, and the result's `along_m` lies inside it.
     """
-    leg = leg_at(path, from_m)
-    leg_start_m = from_m - (from_m % path.length_m - path.along_m[leg])
+    leg, rest_m = spot_at(path, from_m)
+    leg_start_m = from_m - rest_m
     nearest, along_m, leftward, yaw_rad = math.inf, from_m, True, 0.0
     while leg_start_m <= to_m:
         leg_length_m = path.along_m[leg + 1] - path.along_m[leg]
@@ -106,7 +180,7 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
             nearest, along_m, yaw_rad = square, leg_start_m + along_leg_m, path.yaw_rad[leg]
             leftward = cos * dy - sin * dx >= 0.0
         leg_start_m += leg_length_m
-        leg = (leg + 1) % len(path.yaw_rad)
+        leg = leg + 1 if leg + 1 < len(path.yaw_rad) else 0
     distance_m = math.sqrt(nearest)
     return Projection(along_m, distance_m if leftward else -distance_m, yaw_rad)
 

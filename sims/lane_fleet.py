@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,7 +36,7 @@ from mcaprl.sims.lane_rules import (
     step_cars,
     store_car,
 )
-from mcaprl.sims.lane_start import car_from, start_car
+from mcaprl.sims.lane_start import car_from, start_car, start_cars
 
 RULES = ("default", "classic", "classic-code")
 STARTS = ("anywhere", "line")
@@ -104,6 +105,19 @@ class LaneFleet(Fleet):
         if self._has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
         self._depth_m.pop(i, None)
+
+    def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
+        """Start an episode of some cars."""
+        shares = np.array([randoms[i].random(4) for i in chosen.tolist()])
+        start_cars(chosen, shares, self._on_line, self._classic, self._cars, self._states)
+        self._started_at_m[chosen] = self._cars[chosen, ALONG]
+        self.rewards[chosen], self.ends[chosen] = 0.0, GOING_ON
+        if self._has_rays:
+            seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
+            observe_all_rays(self._cars[chosen], seen)
+            self._rays[chosen] = seen
+        for i in chosen.tolist():
+            self._depth_m.pop(i, None)
 
     def advance(self, actions: NDArray[np.int64]) -> None:
         """Drive on for a decision."""

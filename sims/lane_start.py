@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.sims.arguments import pose_from
-from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.bicycle import moving
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import leg_at, project
 from mcaprl.sims.lane_classic import CLASSIC_SUBSTEPS, STRAIGHT
@@ -60,7 +60,7 @@ def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) 
     cos, sin = COURSE.forward[leg]
     x_m = COURSE.points_m[leg, 0] + rest_m * cos - offset_m * sin
     y_m = COURSE.points_m[leg, 1] + rest_m * sin + offset_m * cos
-    motion = Motion(x_m, y_m, COURSE.yaw_rad[leg] + error_rad, speed_m_s)
+    motion = moving(x_m, y_m, COURSE.yaw_rad[leg] + error_rad, speed_m_s)
     return located(motion, 0.0, along_m, 0.0)
 
 
@@ -88,6 +88,30 @@ def start_car(
     observe(car, observation)
 
 
+@compiled
+def start_cars(
+    chosen: NDArray[np.int64],
+    shares: NDArray[np.float64],
+    on_line: bool,
+    classic: bool,
+    cars: NDArray[np.float64],
+    observations: NDArray[np.float32],
+) -> None:
+    """Start K of N cars as `start_car` does.
+
+    Args:
+        chosen: (K,) which.
+        shares: (K, 4) numbers from 0 to 1.
+        on_line: as of `start_car`.
+        classic: as of `start_car`.
+        cars: (N, 9) rows of `Car`.
+        observations: (N, 12).
+    """
+    for k in range(len(chosen)):
+        i = chosen[k]
+        start_car(shares[k], on_line, classic, cars[i], observations[i])
+
+
 def car_from(options: dict[str, Any]) -> Car:
     """Read a start from the options of `reset`.
 
@@ -101,4 +125,4 @@ def car_from(options: dict[str, Any]) -> Car:
             f"pose ({pose.x_m}, {pose.y_m}) is {abs(place.offset_m):.1f} m from the path:"
             f" at most {LANE_HALF_WIDTH_M} m is on the lane"
         )
-    return located(Motion(*pose), 0.0, place.along_m, 0.0)
+    return located(moving(*pose), 0.0, place.along_m, 0.0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.compiled import compiled
+from mcaprl.sims.compiled import compiled, inlined
 from mcaprl.sims.vectors import (
     Quaternion,
     Vector,
@@ -43,6 +43,8 @@ ROTOR_OFFSET_M = 0.15
 TORQUE_PER_THRUST_M = 0.016
 MAX_ROTOR_THRUST_N = 5.5
 ROTOR_LAG_S = 0.02
+ROTOR_SHARE = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
+"""Of the way to a commanded thrust, in one time step."""
 DRAG_PER_S = 0.25
 """Drag is linear in the speed through the air; per mass."""
 
@@ -167,7 +169,7 @@ def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
     )
 
 
-@compiled
+@inlined
 def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
     """Advance a quadrotor by 2 ms: control it, then move it."""
     wanted = wanted_acceleration(drone, command_m_s)
@@ -190,7 +192,7 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
     )
 
 
-@compiled
+@inlined
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
     """Ask for the acceleration that brings the velocity to the command.
 
@@ -216,7 +218,7 @@ def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> f
     return min(max(grown, -MAX_INTEGRAL_M_S2), MAX_INTEGRAL_M_S2)
 
 
-@compiled
+@inlined
 def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
     """Choose the rotors' thrusts, newtons, for a wanted acceleration.
 
@@ -244,7 +246,7 @@ def angular_momentum(rates_rad_s: Vector) -> Vector:
     return Vector(about_x * rates_rad_s.x, about_y * rates_rad_s.y, about_z * rates_rad_s.z)
 
 
-@compiled
+@inlined
 def _mixed(thrust_n: float, torque_n_m: Vector) -> Rotors:
     """Share a thrust and torques among the rotors; none pulls down or beyond its limit."""
     each = 0.25 * thrust_n
@@ -264,15 +266,14 @@ def _limited(thrust_n: float) -> float:
     return min(max(thrust_n, 0.0), MAX_ROTOR_THRUST_N)
 
 
-@compiled
+@inlined
 def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     """Advance a rigid body by 2 ms: rates and velocity first, then attitude and position with them.
 
     m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega, q' = q (0, omega) / 2, and
     each thrust follows its command with a lag of 20 ms.
     """
-    share = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
-    old = drone.thrusts_n
+    share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(
         old.front_right + share * (rotors.front_right - old.front_right),
         old.rear_left + share * (rotors.rear_left - old.rear_left),
@@ -297,7 +298,7 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     )
 
 
-@compiled
+@inlined
 def _turned(rates_rad_s: Vector, thrusts: Rotors) -> Vector:
     """Give the angular velocity after 2 ms."""
     right, left = thrusts.front_right + thrusts.rear_right, thrusts.front_left + thrusts.rear_left

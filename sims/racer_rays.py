@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.compiled import compiled
+from mcaprl.sims.geometry import heading_of
 from mcaprl.sims.racer_car import Racer, corner_at
 from mcaprl.sims.racer_track import METRES_PER_PX
 from mcaprl.sims.ray_code import FAR_M
@@ -18,6 +19,8 @@ JOINT = 1e-9
 CENTRE_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
 """Directions of the rays from the car's centre; right is positive."""
 CENTRE_RAYS_RAD = tuple(math.radians(angle) for angle in CENTRE_RAYS_DEG)
+_COS: NDArray[np.float64] = np.cos(CENTRE_RAYS_RAD)
+_SIN: NDArray[np.float64] = np.sin(CENTRE_RAYS_RAD)
 CENTRE_RAYS = len(CENTRE_RAYS_DEG)
 RAYS = CENTRE_RAYS + 4
 RAY_NAMES = (
@@ -68,24 +71,54 @@ def crossing(
 
 
 @compiled
-def ray_length(walls: NDArray[np.float64], x_px: float, y_px: float, angle_rad: float) -> float:
-    """Give the distance from a point to the nearest wall in a direction, at most 1000 pixels.
+def aim(car: Racer, classic: bool, rays: NDArray[np.float64]) -> None:
+    """Write a car's rays (4, 18): where each starts, x and y, and from there to 1000 pixels away.
 
-    As `crossing` has it, but divided only for the few walls that the ray does cross.
+    The left corner's sideways ray looks to the left; in the classic rules across the car's nose.
     """
-    dx, dy = FAR_PX * math.cos(angle_rad), FAR_PX * math.sin(angle_rad)
-    nearest = 1.0
-    for i in range(len(walls)):
-        x1, y1 = walls[i, 0], walls[i, 1]
-        ex, ey, ax, ay = walls[i, 2] - x1, walls[i, 3] - y1, x1 - x_px, y1 - y_px
-        cross = dx * ey - dy * ex
-        size = abs(cross)
-        along = math.copysign(1.0, cross) * (ax * dy - ay * dx)
-        if size > 0.0 and -JOINT * size <= along <= (1.0 + JOINT) * size:
-            share = (ax * ey - ay * ex) / cross
-            if 0.0 < share < nearest:
-                nearest = share
-    return nearest * FAR_PX
+    cos, sin = heading_of(car.heading_rad)
+    for ray in range(CENTRE_RAYS):
+        rays[0, ray], rays[1, ray] = car.x_px, car.y_px
+        rays[2, ray] = FAR_PX * (cos * _COS[ray] - sin * _SIN[ray])
+        rays[3, ray] = FAR_PX * (sin * _COS[ray] + cos * _SIN[ray])
+    for corner in range(2):
+        right = 2.0 * corner - 1.0
+        side = -right if classic else right
+        sideways, ahead = CENTRE_RAYS + corner, CENTRE_RAYS + 2 + corner
+        x_px, y_px = corner_at(car, 1.0, right)
+        rays[0, sideways], rays[1, sideways] = x_px, y_px
+        rays[0, ahead], rays[1, ahead] = x_px, y_px
+        rays[2, sideways], rays[3, sideways] = -FAR_PX * side * sin, FAR_PX * side * cos
+        rays[2, ahead], rays[3, ahead] = FAR_PX * cos, FAR_PX * sin
+
+
+@compiled
+def cast(
+    walls: NDArray[np.float64], rays: NDArray[np.float64], shares: NDArray[np.float64]
+) -> None:
+    """Find where rays first meet a wall.
+
+    As `crossing` has it, for all rays at once: without a branch, so that the compiler can do
+    several together. Parallels give inf or NaN, which are in no interval.
+
+    Args:
+        walls: (W, 4).
+        rays: (4, R) as `aim` writes them.
+        shares: (R,) to be filled with the share of each ray's length; 1 without a wall.
+    """
+    x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
+    shares[:] = 1.0
+    for wall in range(len(walls)):
+        x1, y1 = walls[wall, 0], walls[wall, 1]
+        ex, ey = walls[wall, 2] - x1, walls[wall, 3] - y1
+        for ray in range(len(shares)):
+            ax, ay = x1 - x_px[ray], y1 - y_px[ray]
+            inverse = 1.0 / (dx[ray] * ey - dy[ray] * ex)
+            share = (ax * ey - ay * ex) * inverse
+            along = (ax * dy[ray] - ay * dx[ray]) * inverse
+            is_nearer = (share > 0.0) & (share < shares[ray])
+            is_hit = is_nearer & (along >= -JOINT) & (along <= 1.0 + JOINT)
+            shares[ray] = share if is_hit else shares[ray]
 
 
 @compiled
@@ -98,35 +131,18 @@ def floored_distance(car: Racer, line: NDArray[np.float64], share: float) -> flo
 
 @compiled
 def floored_ray_length(
-    walls: NDArray[np.float64], car: Racer, x_px: float, y_px: float, angle_rad: float
+    walls: NDArray[np.float64], car: Racer, rays: NDArray[np.float64], ray: int
 ) -> float:
     """Give the classic length of a ray: from the car's centre to the nearest floored hit.
 
     Hits are floored to whole pixels before they are compared; without a hit it is 1000.
     """
-    dx, dy = FAR_PX * math.cos(angle_rad), FAR_PX * math.sin(angle_rad)
     nearest = math.inf
     for wall in walls:
-        share, along_wall = crossing(x_px, y_px, dx, dy, wall)
+        share, along_wall = crossing(rays[0, ray], rays[1, ray], rays[2, ray], rays[3, ray], wall)
         if 0.0 < share < 1.0 and 0.0 < along_wall < 1.0:
             nearest = min(nearest, floored_distance(car, wall, along_wall))
     return nearest if nearest < math.inf else FAR_PX
-
-
-@compiled
-def ray_start(car: Racer, ray: int, classic: bool) -> tuple[float, float, float]:
-    """Give where a ray starts, x and y in pixels, and its direction, radians clockwise from x.
-
-    The left corner's sideways ray looks to the left; in the classic rules across the car's nose.
-    """
-    if ray < CENTRE_RAYS:
-        return car.x_px, car.y_px, car.heading_rad + CENTRE_RAYS_RAD[ray]
-    right = 1.0 if (ray - CENTRE_RAYS) % 2 else -1.0
-    x_px, y_px = corner_at(car, 1.0, right)
-    if ray >= CENTRE_RAYS + 2:
-        return x_px, y_px, car.heading_rad
-    side = -right if classic else right
-    return x_px, y_px, car.heading_rad + 0.5 * math.pi * side
 
 
 @compiled
@@ -134,23 +150,24 @@ def measure(
     walls: NDArray[np.float64], car: Racer, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
     """Write the lengths (18,) of the car's rays; the classic ones are all from its centre."""
-    for ray in range(RAYS):
-        x_px, y_px, angle_rad = ray_start(car, ray, classic)
-        if classic:
-            lengths_px[ray] = floored_ray_length(walls, car, x_px, y_px, angle_rad)
-        else:
-            lengths_px[ray] = ray_length(walls, x_px, y_px, angle_rad)
+    rays = np.empty((4, RAYS))
+    aim(car, classic, rays)
+    if classic:
+        for ray in range(RAYS):
+            lengths_px[ray] = floored_ray_length(walls, car, rays, ray)
+    else:
+        cast(walls, rays, lengths_px)
+        for ray in range(RAYS):
+            lengths_px[ray] *= FAR_PX
 
 
 def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
     """Give the rays as lines (18, 2, 2) from their start to the wall, x and y in pixels."""
-    ends = []
-    for ray in range(RAYS):
-        x_px, y_px, angle_rad = ray_start(car, ray, False)
-        length_px = ray_length(walls, x_px, y_px, angle_rad)
-        hit = (x_px + length_px * math.cos(angle_rad), y_px + length_px * math.sin(angle_rad))
-        ends.append(((x_px, y_px), hit))
-    return np.array(ends)
+    rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
+    aim(car, False, rays)
+    cast(walls, rays, shares)
+    starts = rays[:2].T
+    return np.stack([starts, starts + shares[:, np.newaxis] * rays[2:].T], axis=1)
 
 
 @compiled

@@ -8,7 +8,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.sims.bicycle import Motion, roll, slip_of
+from mcaprl.sims.bicycle import moving, roll, slip_of
 from mcaprl.sims.lane_rules import (
     ACTION_MEANINGS,
     BRAKE,
@@ -42,13 +42,13 @@ def test_each_step_of_a_trajectory_agrees(
 ) -> None:
     """Equal: wheelbase 2.7 m, time step .05 s, start; steering and acceleration at each step."""
     theirs = their_car(3.0, -2.0, yaw_rad, speed_m_s)
-    ours = Motion(3.0, -2.0, yaw_rad, speed_m_s)
+    ours = moving(3.0, -2.0, yaw_rad, speed_m_s)
     for steering_rad, acceleration_m_s2 in commands:
         theirs.act({"steering": steering_rad, "acceleration": acceleration_m_s2})
         theirs.step(SUBSTEP_S)
         ours = roll(ours, slip_of(steering_rad), acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
         expected = (*theirs.position, theirs.heading, theirs.speed)
-        assert ours == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert ours[:4] == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @given(st.floats(0.0, 30.0), st.lists(st.integers(0, 5), min_size=1, max_size=40))
@@ -56,7 +56,7 @@ def test_each_step_of_a_trajectory_agrees(
 def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -> None:
     """Equal besides: the wheel angle of `wheel_angle`, and throttle and brake as documented."""
     theirs = their_car(20.0, 1.0, 0.0, speed_m_s)
-    ours = located(Motion(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
+    ours = located(moving(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
     steering = 0.0
     for action in actions:
         steering = steering if action == BRAKE else STEERING[action]
@@ -76,7 +76,7 @@ def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -
 
 @pytest.mark.parametrize("action", range(len(ACTION_MEANINGS)))
 def test_actions_turn_the_way_they_are_called(action: int) -> None:
-    after = drive(located(Motion(20.0, 1.0, 0.0, 8.0), 0.0, 20.0, 0.0), action)
+    after = drive(located(moving(20.0, 1.0, 0.0, 8.0), 0.0, 20.0, 0.0), action)
     meaning = ACTION_MEANINGS[action]
     assert (after.yaw_rad > 0) == ("left" in meaning)
     assert (after.yaw_rad < 0) == ("right" in meaning)

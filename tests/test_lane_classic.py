@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.bicycle import moving
 from mcaprl.sims.lane import LaneKeepingEnv
 from mcaprl.sims.lane_classic import (
     classic_decide,
@@ -112,7 +112,7 @@ def test_the_distance_is_to_the_nearest_endless_line(
 
 def test_a_decision_lasts_a_second() -> None:
     """Full throttle from 10 m/s: v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
-    car = located(Motion(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
+    car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
     after, hit = classic_decide(car, STRAIGHT)
     assert not hit
     assert after.speed_m_s == pytest.approx(30.0 - 20.0 * (1.0 - 0.2 / 30.0) ** 20)

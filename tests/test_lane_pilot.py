@@ -7,7 +7,7 @@ import pytest
 
 from mcaprl.errors import UnknownNameError
 from mcaprl.sims import make_sim
-from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.bicycle import moving
 from mcaprl.sims.lane_pilot import HORIZON, choose, pursue, worth
 from mcaprl.sims.lane_rules import DRIVING, drive, end_of, located
 from mcaprl.sims.pilots import make_pilot
@@ -41,7 +41,7 @@ def test_it_laps_the_course_from_the_start_line() -> None:
 
 def test_it_thinks_ahead_where_pursuit_would_fail() -> None:
     """8 m before a corner at 11.4 m/s it is too late to brake first and turn then."""
-    car = located(Motion(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
+    car = located(moving(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
     assert worth(car) < HORIZON
     assert choose(car) != pursue(car)
     for _ in range(HORIZON):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.sims import make_sim
-from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.bicycle import moving
 from mcaprl.sims.lane import LaneKeepingEnv
 from mcaprl.sims.lane_course import buildings, rails
 from mcaprl.sims.lane_obstacles import BODY_LENGTH_M, BODY_WIDTH_M, ray_length, touches
@@ -21,7 +21,7 @@ BOXES = (*rails(), *buildings())
 
 
 def car_at(x_m: float, y_m: float, yaw_rad: float) -> Car:
-    return located(Motion(x_m, y_m, yaw_rad, 5.0), 0.0, 60.0, 0.0)
+    return located(moving(x_m, y_m, yaw_rad, 5.0), 0.0, 60.0, 0.0)
 
 
 def lane() -> LaneKeepingEnv:
@@ -103,7 +103,7 @@ def test_the_way_tells_the_crossing_s_streets_apart() -> None:
     observation = np.zeros(20, dtype=np.float32)
     way = []
     for near_m in (125.0, 637.0):
-        observe_rays(located(Motion(125.0, 1.0, 0.0, 5.0), 0.0, near_m, 0.0), observation)
+        observe_rays(located(moving(125.0, 1.0, 0.0, 5.0), 0.0, near_m, 0.0), observation)
         way.append(observation[18:].tolist())
     assert way == [[0.25, -0.75], [0.25, 0.75]]
 

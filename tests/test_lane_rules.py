@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaprl.sims.bicycle import Motion
+from mcaprl.sims.bicycle import moving
 from mcaprl.sims.lane_rules import (
     BRAKE,
     DRIVING,
@@ -33,7 +33,7 @@ STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 
 def placed(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float, near_m: float) -> Car:
     """A car at a pose, its place on the path looked for around a distance along it."""
-    return located(Motion(x_m, y_m, yaw_rad, speed_m_s), 0.0, near_m, 0.0)
+    return located(moving(x_m, y_m, yaw_rad, speed_m_s), 0.0, near_m, 0.0)
 
 
 def at_rest() -> Car:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaprl.sims.racer_car import is_beyond, placed, racer_at
-from mcaprl.sims.racer_rays import RAY_NAMES, RAYS, measure, ray_ends, ray_length
+from mcaprl.sims.racer_rays import FAR_PX, RAY_NAMES, RAYS, cast, measure, ray_ends
 from mcaprl.sims.racer_rules import (
     ACTION_MEANINGS,
     CRASH,
@@ -167,9 +167,12 @@ def test_observation_by_hand() -> None:
 def test_no_ray_slips_out_through_a_joint_of_walls() -> None:
     track = make_track()
     x_px, y_px = 50.0, 300.0
-    for joint_x, joint_y in track.walls_px[:, :2]:
-        angle_rad = math.atan2(joint_y - y_px, joint_x - x_px)
-        assert ray_length(track.walls_px, x_px, y_px, angle_rad) < 990.0
+    away = track.walls_px[:, :2] - (x_px, y_px)
+    reach = FAR_PX * away.T / np.hypot(*away.T)
+    rays = np.vstack([np.full_like(reach, [[x_px], [y_px]]), reach])
+    shares = np.empty(len(away))
+    cast(track.walls_px, rays, shares)
+    assert (FAR_PX * shares < 990.0).all()
 
 
 @given(st.floats(0, 250), st.floats(-20, 20), st.floats(-3, 3))
