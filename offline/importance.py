@@ -151,6 +151,20 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
         return float(discounts.sum() / (discounts @ (1 / sizes)))
 
 
+def mean_weight(estimator: str, episodes: EpisodeTable) -> Quotients | None:
+    """The mean of an unbiased estimator's weights, over steps with their discounts: 1 is right.
+
+    It is clearly less where the log lacks whole episodes that the policy would make: the few that
+    could stand for them would have huge weights, and none happened to be logged. None for the
+    estimators that divide by it.
+    """
+    if estimator == "TIS":
+        return Quotients.mean(episodes.rho[:, -1])
+    if estimator in ("PDIS", "DR"):
+        return Quotients.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
+    return None
+
+
 def _returns(episodes: EpisodeTable) -> Floats:
     """(E,) discounted."""
     returns: Floats = (episodes.discounts * episodes.rewards).sum(1)

@@ -22,6 +22,7 @@ from mcaprl.offline.importance import (
     ESTIMATORS,
     EpisodeTable,
     effective_sample_size,
+    mean_weight,
 )
 from mcaprl.offline.quotients import Floats, Quotients
 
@@ -34,6 +35,8 @@ RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
 _ROWS_AT_ONCE = 4096
+_STANDARD_ERRORS = 4.0
+"""So far from what must be, chance no longer explains it."""
 
 
 class StochasticPolicy(Protocol):
@@ -252,8 +255,18 @@ class OffPolicyEvaluator:
             float(value),
             estimate.interval(self._counts),
             size,
-            _verdict(size),
+            self._verdict_on_weights(estimator, table, size),
         )
+
+    def _verdict_on_weights(self, estimator: str, table: EpisodeTable, size: float) -> str:
+        verdict, weights = _verdict(size), mean_weight(estimator, table)
+        if verdict != TRUSTED or weights is None:
+            return verdict
+        once = np.ones((1, len(self._lengths)))
+        mean, error = float(weights.values(once)[0]), float(weights.errors(once)[0])
+        if abs(mean - 1) <= _STANDARD_ERRORS * error + 1e-9:
+            return verdict
+        return f"refused: weights of {mean:.2f} in the mean, not 1: the log lacks what it does"
 
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
         """The model's mean value of the first states; the interval knows of no other model.

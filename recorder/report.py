@@ -15,6 +15,7 @@ from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.lint import Finding
+from mcaprl.recorder.reader import open_logs
 from mcaprl.recorder.tracks import Track, tracks_of
 
 _BINS = 30
@@ -154,17 +155,26 @@ def _cards(dataset: Dataset, tracks: Sequence[Track]) -> list[Card]:
     best = order[:_SHOWN_EPISODES]
     worst = order[len(best) :][-_SHOWN_EPISODES:][::-1]
     shown = [("best", int(k)) for k in best] + [("worst", int(k)) for k in worst]
-    places = np.concatenate([np.empty((0, 2)), *tracks])
-    return [_card(kind, dataset, dataset.episodes[k], tracks[k], places) for kind, k in shown]
+    places, commands = np.concatenate([np.empty((0, 2)), *tracks]), _commands(dataset)
+    return [_card(kind, dataset.episodes[k], tracks[k], places, commands[k]) for kind, k in shown]
 
 
-def _card(kind: str, dataset: Dataset, episode: Episode, track: Track, places: Track) -> Card:
+def _commands(dataset: Dataset) -> list[str]:
+    """What replays each episode; empty where the files do not tell which it is."""
+    counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
+    if sum(counts) != len(dataset.episodes):
+        return [""] * len(dataset.episodes)
+    return [
+        f"mcaprl replay {path} --episode {number}"
+        for path, count in zip(dataset.sources, counts, strict=True)
+        for number in range(count)
+    ]
+
+
+def _card(kind: str, episode: Episode, track: Track, places: Track, command: str) -> Card:
     text = f"return {episode.total_reward:.4g}, {len(episode)} steps, {episode.reason or 'unknown'}"
     if episode.policy:
         text += f", by {episode.policy}"
-    command = ""
-    if len(dataset.sources) == 1:
-        command = f"mcaprl replay {dataset.sources[0]} --episode {episode.index}"
     return Card(
         f"{kind}: episode {episode.index}", text, _thumbnail(episode, track, places), command
     )

@@ -28,6 +28,7 @@ def comparison_figure(
     scores: Sequence[PolicyScore],
     title: str,
     behavior: tuple[float, float, float] | None,
+    width: float = 8.0,
 ) -> Any:
     """Mean returns with their intervals, a dot for each training seed.
 
@@ -35,11 +36,12 @@ def comparison_figure(
         scores: from top to bottom.
         title: over the picture.
         behavior: mean, low and high of the logged episodes' returns, drawn as a band.
+        width: inches.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    figure, axes = new_figure((8, 0.62 * len(scores) + 1.8))
+    figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
     if behavior is not None:
         mean, low, high = behavior
         axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)
@@ -64,7 +66,7 @@ def comparison_figure(
     axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
     axes.set_title(title)
     if behavior is not None:
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return figure
 
 
@@ -86,23 +88,40 @@ def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> 
     figure, panels = new_figure((4.2 * columns, 5.6 * rows), rows, columns, grid=True)
     panels = panels.ravel()
     for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
-        _draw_world(axes, world)
-        color = COLORS[row % len(COLORS)]
-        episodes = [episode for seed in score.results for episode in seed]
-        stride = -(-len(episodes) // _MAX_PATHS)
-        for episode in episodes[::stride]:
-            x, y = episode.positions.T
-            axes.plot(x, y, color=color, lw=1.1, alpha=0.75)
-            if episode.reason != "time_limit":
-                axes.plot(x[-1], y[-1], "x", color=INK, ms=5, mew=1.3)
-        ends = ", ".join(f"{count} {reason}" for reason, count in score.ends.items())
-        axes.set_title(f"{score.policy}\n{ends}")
-        axes.set_aspect("equal")
-        axes.set_xlabel("x, m")
-        axes.set_ylabel("y, m")
+        _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+        axes.set_title(f"{score.policy}\n{_ends(score)}")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     return figure
+
+
+def _ways(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
+    """The same for pages: a figure for each policy, which a phone shows below each other."""
+    figures = []
+    for row, score in enumerate(scores):
+        if score.results[0][0].positions.size:
+            figure, axes = new_figure((4.2, 4.8))
+            _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+            figures.append(Figure.of(f"{score.policy}: {_ends(score)}", figure))
+    return figures
+
+
+def _draw_ways(axes: Any, score: PolicyScore, world: Sequence[Shape], color: str) -> None:
+    _draw_world(axes, world)
+    episodes = [episode for seed in score.results for episode in seed]
+    stride = -(-len(episodes) // _MAX_PATHS)
+    for episode in episodes[::stride]:
+        x, y = episode.positions.T
+        axes.plot(x, y, color=color, lw=1.1, alpha=0.75)
+        if episode.reason != "time_limit":
+            axes.plot(x[-1], y[-1], "x", color=INK, ms=5, mew=1.3)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+
+
+def _ends(score: PolicyScore) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in score.ends.items())
 
 
 def evaluation_page(
@@ -131,18 +150,19 @@ def evaluation_page(
         MissingExtraError: matplotlib or jinja2 is not installed.
         ReportError: a file cannot be written.
     """
-    comparison = comparison_figure(scores, "mean return", behavior)
+    save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
     ways = trajectory_figure(scores, world)
-    save_png(comparison, folder / "comparison.png")
     if ways is not None:
         save_png(ways, folder / "trajectories.png")
-    figures = [Figure.of("line: 95 % interval; dots: training seeds", comparison)]
+    comparison = comparison_figure(scores, "", behavior, width=5.6)
+    figures = [Figure.of("Mean returns", comparison)]
     sections = [
         Section("Scores", figures=figures, table=_score_table(scores)),
         Section("Against each other", _PAIRS, table=_improvement_table(compared)),
     ]
     if ways is not None:
-        sections.append(Section("Where they went", figures=[Figure.of("", ways)]))
+        text = "A cross is an early end."
+        sections.append(Section("Where they went", text, figures=_ways(scores, world)))
     cards = _cards(scores, world, recorded)
     sections.append(Section("Best and worst episodes", cards=cards))
     if curves:
@@ -161,7 +181,7 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
             f"{float(median(score.returns)):.2f}",
             "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
             "" if score.success_rate is None else f"{score.success_rate:.0%}",
-            ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
+            _ends(score),
         )
         for score in scores
     ]

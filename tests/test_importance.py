@@ -13,6 +13,7 @@ from mcaprl.offline.importance import (
     EpisodeTable,
     effective_sample_size,
     effective_sample_sizes,
+    mean_weight,
 )
 from tests.two_state_task import EVALUATED, TRUE_Q, TRUE_V, play, true_value
 
@@ -64,6 +65,16 @@ def test_effective_sample_sizes_by_hand() -> None:
     assert effective_sample_size("WIS", BY_HAND) == pytest.approx(1.6)
     mean = 1.75 / (13 / 25 + 0.5 / 1.6 + 0.25 / 1.6)
     assert effective_sample_size("PDIS", BY_HAND) == pytest.approx(mean)
+
+
+def test_mean_weights_by_hand() -> None:
+    # rho is 2, 1, 1 and 3, 3, 3; discounts 1, 1/2, 1/4.
+    whole, steps = mean_weight("TIS", BY_HAND), mean_weight("PDIS", BY_HAND)
+    assert whole is not None
+    assert whole.values(ONCE) == pytest.approx([(1 + 3) / 2])
+    assert steps is not None
+    assert steps.values(ONCE) == pytest.approx([(2.75 + 5.25) / 2 / 1.75])
+    assert mean_weight("WIS", BY_HAND) is None
 
 
 def test_no_weight_at_all_is_a_size_of_nought_and_no_crash() -> None:

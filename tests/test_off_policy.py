@@ -140,6 +140,18 @@ def test_a_log_of_other_actions_gives_no_verdict() -> None:
         assert "effective episodes, 10 needed" in found[name].verdict
 
 
+def test_weights_that_do_not_add_up_give_no_verdict() -> None:
+    """Half of the log never does what is asked about: an unbiased mean is half of what it is."""
+    always_one = np.array([[1e-6, 1 - 1e-6], [1e-6, 1 - 1e-6]])
+    data = Dataset.concatenate([log(60), log(60, seed=1, acting=always_one)])
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Table(task.BEHAVIOR), "half"))
+    for name in ("TIS", "PDIS", "DR"):
+        assert found[name].effective_sample_size > 10
+        assert found[name].verdict.startswith("refused: weights of 0.")
+    for name in ("WIS", "WPDIS"):
+        assert found[name].trusted, "these divide by the weights"
+
+
 def test_unknown_probabilities_leave_the_model_alone() -> None:
     data = log(60)
     data.behavior_probs[:5] = math.nan

@@ -111,6 +111,25 @@ def test_it_fits_a_phone_and_the_reader_s_colors(lane_page: Path, width: int, da
     assert svg_ink == ink, "what is drawn has the color of what is written"
 
 
+def test_the_command_names_the_file_that_an_episode_is_in(tmp_path: Path) -> None:
+    for name, count in (("a", 2), ("b", 1)):
+        recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap")
+        for seed in range(count):
+            recorder.reset(seed=seed)
+            while not recorder.step(0)[2]:
+                pass
+        recorder.close()
+    data = mcaprl.open(str(tmp_path))
+    dataset_page(tmp_path / "all.html", data, "", [], [])
+    page = (tmp_path / "all.html").read_text()
+    found = re.findall(r"mcaprl replay \S+/(\w)\.mcap --episode (\d)", page)
+    assert sorted(found) == [("a", "0"), ("a", "1"), ("b", "0")]
+    # Of a part of the log the files no longer tell the numbers.
+    some = data.filter(lambda episode: episode.index > 0)
+    dataset_page(tmp_path / "some.html", some, "", [], [])
+    assert "mcaprl replay" not in (tmp_path / "some.html").read_text()
+
+
 def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> None:
     for seed in range(2):
         (tmp_path / f"online/seed-{seed}").mkdir(parents=True)
