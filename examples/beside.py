@@ -31,10 +31,10 @@ from mcaprl.sims.evaluate import evaluate
 
 SIM = "powerline"
 EPISODES = 10
-ONLINE = {"steps": 12_000, "eval-interval": 1_000, "eval-episodes": 10, "final-episodes": 10}
+ONLINE = {"steps": 8_000, "eval-interval": 1_000, "eval-episodes": 10, "final-episodes": 10}
 OFFLINE = {
     "algo": "cql",
-    "updates": 5_000,
+    "updates": 3_000,
     "batch-size": 128,
     "target-interval": 100,
     "gamma": 0.95,

@@ -94,7 +94,7 @@ def curve_picture(
     dots = "; dots: best checkpoints on fresh episodes" if _has_finals(runs, value) else ""
     axes.set_xlabel(f"environment steps{dots}")
     axes.set_title(title)
-    axes.legend(loc="lower right")
+    axes.legend(loc="best")
     save_png(figure, path)
 
 
