@@ -1,33 +1,52 @@
-"""What recording costs beside learning: `python -m benchmarks.online`.
+"""What recording and being watched cost beside learning: `python -m benchmarks.online`.
 
-The same training runs with and without a log, in turns, by CPU time; the best of several counts.
+The same training runs plainly, with a log, and shown to a viewer (Node, see tests/node), in turns,
+by CPU time of all its threads; the best of several counts.
 """
 
 from __future__ import annotations
 
 import argparse
+import subprocess
 import tempfile
 import time
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import torch
 
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
+from mcaprl.online.live import LiveTraining
 from mcaprl.online.task import Task
 from mcaprl.progress import TrainingProgress
 
+KINDS = ("plain", "recorded", "watched")
+_VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
 
-def training_s(task: Task, folder: Path, *, recorded: bool) -> float:
-    """CPU seconds of a training, its one evaluation included."""
+
+def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
+    """CPU seconds of a training, its one evaluation included; and how many frames were seen."""
     folder.mkdir()
-    path = folder / "log.mcap" if recorded else None
-    agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), record=path)
-    with closing(agent):
-        began_s = time.process_time()
-        agent.learn(_silent)
-        return time.process_time() - began_s
+    path = folder / "log.mcap" if kind == "recorded" else None
+    shown = LiveTraining(task, port=0) if kind == "watched" else nullcontext()
+    with closing(shown) if isinstance(shown, LiveTraining) else shown as live:
+        viewer = _viewer(live.stream.url) if live is not None else None
+        scale = Scale(0.0, 1.0)
+        agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, scale, record=path, live=live)
+        with closing(agent):
+            began_s = time.process_time()
+            agent.learn(_silent)
+            taken_s = time.process_time() - began_s
+    return taken_s, 0 if viewer is None else viewer.communicate()[0].count('"/rl/step","time"')
+
+
+def _viewer(url: str) -> subprocess.Popen[str]:
+    """Somebody who looks at everything."""
+    viewer = subprocess.Popen(["node", str(_VIEWER), url], stdout=subprocess.PIPE, text=True)
+    assert viewer.stdout is not None
+    viewer.stdout.readline()
+    return viewer
 
 
 def _silent(_: TrainingProgress) -> None:
@@ -39,22 +58,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     steps = arguments.steps
     task = Task.for_sim(
         "lane", steps=steps, eval_interval=steps, eval_episodes=1, checkpoint_interval=2 * steps
     )
-    best = {True: float("inf"), False: float("inf")}
+    best = dict.fromkeys(arguments.kinds, float("inf"))
+    frames = 0
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(arguments.rounds):
-            for recorded in best:
-                taken_s = training_s(task, Path(folder) / f"{turn}-{recorded}", recorded=recorded)
-                best[recorded] = min(best[recorded], taken_s)
-    added = best[True] / best[False] - 1
-    print(
-        f"lane, {steps} steps of Double DQN: recording adds {added:.1%} of the training's CPU time"
-    )
+            for kind in best:
+                taken_s, seen = training_s(task, Path(folder) / f"{turn}-{kind}", kind)
+                best[kind], frames = min(best[kind], taken_s), max(frames, seen)
+    print(f"lane, {steps} steps of Double DQN, of the training's CPU time:")
+    if "recorded" in best:
+        print(f"  recording adds {best['recorded'] / best['plain'] - 1:.1%}")
+    if "watched" in best:
+        added = best["watched"] / best["plain"] - 1
+        print(f"  being watched adds {added:.1%}, for {frames} frames")
 
 
 if __name__ == "__main__":

@@ -212,6 +212,9 @@ class _Run:
         if self.held_out is not None:
             judged = self.held_out.terms(learner)
             values = [mine | held for mine, held in zip(values, judged, strict=True)]
+        if self.follow is not None:
+            known = {"transitions": float(len(learner.buffer))}
+            values = [mine | known for mine in values]
         rate = config.learning_rate_at(learner.step - 1)
         for writer, mine in zip(metrics, values, strict=True):
             writer.write(learner.step, rate, mine)

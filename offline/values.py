@@ -44,7 +44,8 @@ def value_columns(
     """What a policy thinks of an episode: the fields of `recorder.schema.values_schema`.
 
     Args:
-        policy: with or without Q-values; without, all that comes of them is NaN.
+        policy: with or without Q-values; without, all that comes of them is NaN. One that stacks
+            frames is given each observation with those before it.
         episode: of T steps.
         action_space: of the log.
         gamma: the discount that the policy learned with.
@@ -58,7 +59,8 @@ def value_columns(
     """
     if not isinstance(action_space, spaces.Discrete):
         raise UsageError(f"values are of discrete actions; the log's are {action_space}")
-    observations = _with_last(episode.observations, episode.next_observations)
+    seen = _with_last(episode.observations, episode.next_observations)
+    observations = _in_a_row(seen, getattr(policy, "frame_stack", 1))
     taken = episode.actions - int(action_space.start)
     try:
         q = policy.q_values(observations)
@@ -139,3 +141,16 @@ def _with_last(observations: Any, next_observations: Any) -> Any:
     if isinstance(observations, dict):
         return {k: _with_last(observations[k], next_observations[k]) for k in observations}
     return np.concatenate([observations, next_observations[-1:]])
+
+
+def _in_a_row(observations: Any, count: int) -> Any:
+    """(T + 1, count, ...) each observation with those before it, oldest first; the first repeats.
+
+    One alone stays as it is, (T + 1, ...).
+    """
+    if count == 1:
+        return observations
+    if isinstance(observations, dict):
+        return {key: _in_a_row(part, count) for key, part in observations.items()}
+    rows = np.arange(len(observations))[:, None] - np.arange(count)[::-1]
+    return observations[np.maximum(rows, 0)]

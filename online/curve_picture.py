@@ -99,7 +99,7 @@ def curve_figure(runs: Sequence[RunCurve], title: str, value: str | None = None)
     dots = "; dots: best checkpoints on fresh episodes" if _has_finals(runs, value) else ""
     axes.set_xlabel(f"environment steps{dots}")
     axes.set_title(title)
-    axes.legend(loc="lower right", frameon=False)
+    axes.legend(loc="best", frameon=False)
     return figure
 
 

@@ -66,23 +66,6 @@ def joined(frames: Any, space: spaces.Space[Any]) -> Any:
     return whole_of(found)
 
 
-def in_a_row(observations: Any, count: int) -> Any:
-    """Give each of an episode's observations with those before it.
-
-    Args:
-        observations: (T, *shape), or a dict of such.
-        count: k.
-
-    Returns:
-        (T, k, *shape), oldest first.
-    """
-    found = {}
-    for key, part in parts_of(observations).items():
-        rows = np.arange(len(part))[:, None] - np.arange(count)[::-1]
-        found[key] = part[np.maximum(rows, 0)]
-    return whole_of(found)
-
-
 class FrameMemory:
     """The last k observations of each of B episodes.
 

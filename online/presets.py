@@ -1,6 +1,6 @@
 """Published settings, as they were, for the sims with their published rules.
 
-What they have in common: pictures or rays, one environment, classic rules. docs/presets.md says
+What they have in common: pictures or rays, one environment, classic rules. docs/online.md says
 which faults of the published programs they keep and which they leave behind.
 
     autonomysim-car, autonomysim-drone      https://github.com/nervosys/AutonomySim

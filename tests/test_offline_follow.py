@@ -17,6 +17,7 @@ from mcaprl.cli import run
 from mcaprl.errors import LogError
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.cql import CQL, CQLConfig
+from mcaprl.offline.curves import read_curve
 from mcaprl.offline.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.train import train
 from mcaprl.progress import TrainingProgress
@@ -122,6 +123,9 @@ def test_new_episodes_are_learned_from(tmp_path: Path) -> None:
     recorder.env.close()
     per_check = CHECK_INTERVAL // SMALL.log_interval
     assert seen == [3] * per_check + [7] * per_check
+    whole = np.cumsum(mcaprl.open(tmp_path / "log.mcap").episode_lengths)
+    metrics = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")
+    assert metrics["transitions"].tolist() == [whole[2]] * per_check + [whole[6]] * per_check
 
 
 def test_the_command_learns_beside_a_recorder_in_another_process(tmp_path: Path) -> None:

@@ -1,0 +1,28 @@
+"""Draw the curves of online runs in one picture.
+
+python examples/compare_curves.py RUN... --out curves.png [--value mean_progress_m]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from mcaprl.online.curve_picture import VALUES, curve_picture, read_run
+
+
+def main() -> None:
+    """Read the runs and draw."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    parser.add_argument("--out", required=True, type=Path)
+    parser.add_argument("--title", default="")
+    parser.add_argument("--value", choices=VALUES, help="what of the curves; default: the score")
+    arguments = parser.parse_args()
+    runs = [read_run(folder) for folder in arguments.runs]
+    curve_picture(arguments.out, runs, arguments.title, arguments.value)
+    print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
