@@ -4,8 +4,8 @@
 
 5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target every 200, 256x256. A figure is
 the mean return of the last three evaluations (after 4000, 4500 and 5000 updates), 10 episodes each.
-d3rlpy takes part where it is installed, with one seed. The result is FOLDER/grid.json, and a table
-with the gates that hold or do not, in docs/results.md.
+d3rlpy takes part where it is installed, with one seed. Each cell is kept in FOLDER/grid.json, so a
+run that was stopped goes on; the table goes to docs/results.md, with the gates that hold or do not.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.cartpole_data import make_logs
+from benchmarks.cartpole_data import NAMES, make_logs
 from benchmarks.page import write_section
+from mcaprl.files import write_json
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.config import BootstrapConfig
@@ -39,7 +40,7 @@ SHARED: dict[str, Any] = {
     "final_learning_rate_fraction": 1.0,
 }
 VALUES: dict[str, Any] = {"gamma": 0.99, "target_interval": 200}
-ALGOS = ("double-dqn", "cql", "bcq", "bc", "iql")
+ALGOS = ("cql", "double-dqn", "bc", "bcq", "iql")
 RIVALS = {
     "double-dqn": "DoubleDQNConfig",
     "cql": "DiscreteCQLConfig",
@@ -144,50 +145,62 @@ def gates(found: dict[str, dict[str, list[float]]], behavior: dict[str, float]) 
 
 
 def main() -> None:
-    """Run the grid, print it, and say which gates hold."""
+    """Run what is not there yet of the grid, print it, and say which gates hold."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--only", default=",".join(ALGOS))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    has_rival = importlib.util.find_spec("d3rlpy") is not None
-    found: dict[str, dict[str, list[float]]] = {}
-    rivals: dict[str, dict[str, list[float]]] = {}
-    behavior: dict[str, float] = {}
-    for name, data in make_logs(arguments.folder).items():
-        behavior[name] = data.statistics.mean_return
-        found[name], rivals[name] = {}, {}
-        for algo in arguments.only.split(","):
-            found[name][algo] = ours(data, algo, arguments.seeds)
-            if has_rival and algo in RIVALS:
-                rivals[name][algo] = theirs(data, algo)
-            print(
-                name, algo, found[name][algo], rivals[name].get(algo), file=sys.stderr, flush=True
+    logs, path = make_logs(arguments.folder), arguments.folder / "grid.json"
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    result["behavior"] = {name: data.statistics.mean_return for name, data in logs.items()}
+    for side, algo, name in cells(arguments.only.split(",")):
+        row = result.setdefault(side, {}).setdefault(name, {})
+        if algo not in row:
+            is_ours = side == "mcaprl"
+            row[algo] = (
+                ours(logs[name], algo, arguments.seeds) if is_ours else theirs(logs[name], algo)
             )
-    result = {"behavior": behavior, "mcaprl": found, "d3rlpy": rivals}
-    (arguments.folder / "grid.json").write_text(json.dumps(result, indent=2) + "\n")
-    print(text := table(result))
-    if set(ALGOS) <= set(arguments.only.split(",")):
-        verdicts = [
-            f"- {'holds' if holds else 'does not hold'}: {gate}"
-            for gate, holds in gates(found, behavior).items()
-        ]
-        print("\n".join(verdicts))
-        write_section("cartpole-grid", "\n".join([text, "", *verdicts]))
+            print(side, name, algo, row[algo], file=sys.stderr, flush=True)
+            write_json(path, result)
+    print(text := summary(result))
+    write_section("cartpole-grid", text)
+
+
+def cells(algos: list[str]) -> list[tuple[str, str, str]]:
+    """Side, algorithm and log of each cell: first ours, and what the gates are about."""
+    wanted = sorted(algos, key=ALGOS.index)
+    mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
+    if importlib.util.find_spec("d3rlpy") is None:
+        return mine
+    return mine + [("d3rlpy", algo, name) for algo in wanted if algo in RIVALS for name in NAMES]
+
+
+def summary(result: dict[str, Any]) -> str:
+    """The table, and below it the gates whose cells are all there."""
+    lines = [table(result), ""]
+    try:
+        found = gates(result["mcaprl"], result["behavior"])
+    except KeyError:
+        return lines[0]
+    return "\n".join(
+        lines
+        + [f"- {'holds' if holds else 'does not hold'}: {gate}" for gate, holds in found.items()]
+    )
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's."""
-    algos = list(next(iter(result["mcaprl"].values())))
-    lines = [f"| data (behavior) | {' | '.join(algos)} |", "|---|" + "---|" * len(algos)]
-    for name, row in result["mcaprl"].items():
-        cells = []
-        for algo in algos:
-            values, rival = row[algo], result["d3rlpy"][name].get(algo)
-            beside = f"; d3rlpy {rival[0]:.0f}" if rival else ""
-            cells.append(f"{np.mean(values):.0f} ({min(values):.0f}-{max(values):.0f}){beside}")
-        lines.append(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(cells)} |")
+    """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's; a dash is not run."""
+    lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
+    for name in NAMES:
+        texts = []
+        for algo in ALGOS:
+            values = result["mcaprl"].get(name, {}).get(algo)
+            rival = result.get("d3rlpy", {}).get(name, {}).get(algo)
+            own = f"{np.mean(values):.0f} ({min(values):.0f}-{max(values):.0f})" if values else "-"
+            texts.append(own + (f"; d3rlpy {rival[0]:.0f}" if rival else ""))
+        lines.append(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 
