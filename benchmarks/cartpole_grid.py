@@ -4,8 +4,8 @@
 
 5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target every 200, 256x256. A figure is
 the mean return of the last three evaluations (after 4000, 4500 and 5000 updates), 10 episodes each.
-d3rlpy takes part where it is installed, with one seed. The result is FOLDER/grid.json, and a table
-with the gates that hold or do not, in docs/results.md.
+d3rlpy takes part where it is installed, with one seed. Each cell is kept in FOLDER/grid.json, so a
+run that was stopped goes on; the table goes to docs/results.md, with the gates that hold or do not.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from benchmarks.cartpole_data import make_logs
+from benchmarks.cartpole_data import NAMES, make_logs
 from benchmarks.page import write_section
+from mcaprl.files import write_json
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.buffer import TransitionBuffer
 from mcaprl.offline.config import BootstrapConfig
@@ -39,13 +40,14 @@ SHARED: dict[str, Any] = {
     "final_learning_rate_fraction": 1.0,
 }
 VALUES: dict[str, Any] = {"gamma": 0.99, "target_interval": 200}
-ALGOS = ("double-dqn", "cql", "bcq", "bc", "iql")
+ALGOS = ("cql", "double-dqn", "bc", "bcq", "iql")
 RIVALS = {
     "double-dqn": "DoubleDQNConfig",
     "cql": "DiscreteCQLConfig",
     "bcq": "DiscreteBCQConfig",
     "bc": "DiscreteBCConfig",
 }
+GOOD_LOGS = ("medium", "expert")
 Act = Callable[[NDArray[Any]], NDArray[Any]]
 
 
@@ -127,67 +129,88 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
     return [float(np.mean(found))]
 
 
-def gates(found: dict[str, dict[str, list[float]]], behavior: dict[str, float]) -> dict[str, bool]:
-    """What must hold of our own."""
-    good = ("medium", "expert")
-    return {
-        "Double DQN collapses on medium and expert data": all(
-            np.mean(found[name]["double-dqn"]) < 0.5 * behavior[name] for name in good
-        ),
-        "CQL keeps .95 of the behavior there, each seed": all(
-            min(found[name]["cql"]) >= 0.95 * behavior[name] for name in good
-        ),
-        "CQL reaches 125 on random data": np.mean(found["random"]["cql"]) >= 125,
-        "CQL reaches 250 on mixed data, and more than Double DQN": np.mean(found["mixed"]["cql"])
-        >= max(250.0, float(np.mean(found["mixed"]["double-dqn"]))),
-    }
+Found = dict[str, dict[str, list[float]]]
+GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
+    "Double DQN collapses on medium and expert data, to less than half of the behavior": (
+        lambda found, behavior: all(
+            bool(np.mean(found[name]["double-dqn"]) < 0.5 * behavior[name]) for name in GOOD_LOGS
+        )
+    ),
+    "CQL keeps .95 of the behavior there, each seed": (
+        lambda found, behavior: all(
+            min(found[name]["cql"]) >= 0.95 * behavior[name] for name in GOOD_LOGS
+        )
+    ),
+    "CQL reaches 125 on random data": (
+        lambda found, _: bool(np.mean(found["random"]["cql"]) >= 125)
+    ),
+    "CQL reaches 250 on mixed data": lambda found, _: bool(np.mean(found["mixed"]["cql"]) >= 250),
+    "CQL reaches more than Double DQN on mixed data": (
+        lambda found, _: bool(
+            np.mean(found["mixed"]["cql"]) > np.mean(found["mixed"]["double-dqn"])
+        )
+    ),
+}
+"""What must hold of our own."""
+
+
+def verdict(gate: str, result: dict[str, Any]) -> str:
+    """Whether a gate holds, or that its cells are not there."""
+    try:
+        return "holds" if GATES[gate](result["mcaprl"], result["behavior"]) else "does not hold"
+    except KeyError:
+        return "not run"
 
 
 def main() -> None:
-    """Run the grid, print it, and say which gates hold."""
+    """Run what is not there yet of the grid, print it, and say which gates hold."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--only", default=",".join(ALGOS))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    has_rival = importlib.util.find_spec("d3rlpy") is not None
-    found: dict[str, dict[str, list[float]]] = {}
-    rivals: dict[str, dict[str, list[float]]] = {}
-    behavior: dict[str, float] = {}
-    for name, data in make_logs(arguments.folder).items():
-        behavior[name] = data.statistics.mean_return
-        found[name], rivals[name] = {}, {}
-        for algo in arguments.only.split(","):
-            found[name][algo] = ours(data, algo, arguments.seeds)
-            if has_rival and algo in RIVALS:
-                rivals[name][algo] = theirs(data, algo)
-            print(
-                name, algo, found[name][algo], rivals[name].get(algo), file=sys.stderr, flush=True
+    logs, path = make_logs(arguments.folder), arguments.folder / "grid.json"
+    result: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    result["behavior"] = {name: data.statistics.mean_return for name, data in logs.items()}
+    for side, algo, name in cells(arguments.only.split(",")):
+        row = result.setdefault(side, {}).setdefault(name, {})
+        if algo not in row:
+            is_ours = side == "mcaprl"
+            row[algo] = (
+                ours(logs[name], algo, arguments.seeds) if is_ours else theirs(logs[name], algo)
             )
-    result = {"behavior": behavior, "mcaprl": found, "d3rlpy": rivals}
-    (arguments.folder / "grid.json").write_text(json.dumps(result, indent=2) + "\n")
-    print(text := table(result))
-    if set(ALGOS) <= set(arguments.only.split(",")):
-        verdicts = [
-            f"- {'holds' if holds else 'does not hold'}: {gate}"
-            for gate, holds in gates(found, behavior).items()
-        ]
-        print("\n".join(verdicts))
-        write_section("cartpole-grid", "\n".join([text, "", *verdicts]))
+            print(side, name, algo, row[algo], file=sys.stderr, flush=True)
+            write_json(path, result)
+    print(text := summary(result))
+    write_section("cartpole-grid", text)
+
+
+def cells(algos: list[str]) -> list[tuple[str, str, str]]:
+    """Side, algorithm and log of each cell: first ours, and what the gates are about."""
+    wanted = sorted(algos, key=ALGOS.index)
+    mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
+    if importlib.util.find_spec("d3rlpy") is None:
+        return mine
+    return mine + [("d3rlpy", algo, name) for algo in wanted if algo in RIVALS for name in NAMES]
+
+
+def summary(result: dict[str, Any]) -> str:
+    """The table, and below it the gates."""
+    return "\n".join([table(result), "", *(f"- {verdict(gate, result)}: {gate}" for gate in GATES)])
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's."""
-    algos = list(next(iter(result["mcaprl"].values())))
-    lines = [f"| data (behavior) | {' | '.join(algos)} |", "|---|" + "---|" * len(algos)]
-    for name, row in result["mcaprl"].items():
-        cells = []
-        for algo in algos:
-            values, rival = row[algo], result["d3rlpy"][name].get(algo)
-            beside = f"; d3rlpy {rival[0]:.0f}" if rival else ""
-            cells.append(f"{np.mean(values):.0f} ({min(values):.0f}-{max(values):.0f}){beside}")
-        lines.append(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(cells)} |")
+    """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's; a dash is not run."""
+    lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
+    for name in NAMES:
+        texts = []
+        for algo in ALGOS:
+            values = result["mcaprl"].get(name, {}).get(algo)
+            rival = result.get("d3rlpy", {}).get(name, {}).get(algo)
+            own = f"{np.mean(values):.0f} ({min(values):.0f}-{max(values):.0f})" if values else "-"
+            texts.append(own + (f"; d3rlpy {rival[0]:.0f}" if rival else ""))
+        lines.append(f"| {name} ({result['behavior'][name]:.0f}) | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 

@@ -28,6 +28,7 @@ from benchmarks.sim_data import NAMES, make_logs
 from mcaprl.files import write_json
 from mcaprl.offline.algorithms import ALGORITHMS
 from mcaprl.offline.config import BootstrapConfig
+from mcaprl.offline.dqn import DQNConfig
 from mcaprl.offline.policy import load_policies
 from mcaprl.offline.train import train
 from mcaprl.sims import make_sim, make_sims
@@ -38,6 +39,8 @@ from mcaprl.sims.rollout import Policy
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
 ALGOS = ("cql", "bc", "double-dqn", "bcq", "iql")
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
+TARGET_INTERVAL = 150
+"""Updates between two copies into the target: with the default, values would not get far ahead."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
@@ -95,6 +98,8 @@ def learn(
     """Train all seeds on a log and score them."""
     config_type = ALGORITHMS[algo].config_type
     given = {**SHARED, **SETTINGS[sim]}
+    if issubclass(config_type, DQNConfig):
+        given["target_interval"] = TARGET_INTERVAL
     if not issubclass(config_type, BootstrapConfig):
         given = {name: value for name, value in given.items() if name not in ("gamma", "n_steps")}
     shutil.rmtree(out, ignore_errors=True)
