@@ -5,7 +5,7 @@ b is 1 for the unbiased ones and the weights' mean for the weighted ones.
 
 Weights that are products over many steps are skewed: most logs miss the rare heavy episodes and,
 for the same reason, look calm. Percentiles of a bootstrap follow the log in that, and its 95 %
-intervals hold the truth in 85 to 92 of 100 logs of 50 episodes. What is resampled here instead is
+intervals hold the truth in 85 to 93 of 100 logs of 50 episodes. What is resampled here instead is
 the error in units of its own standard error, the bootstrap-t:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5

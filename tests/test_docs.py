@@ -76,7 +76,14 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize(
     "name",
-    ["README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/replay.md", "docs/sims.md"],
+    [
+        "README.md",
+        "CONTRIBUTING.md",
+        "docs/architecture.md",
+        "docs/evaluation.md",
+        "docs/replay.md",
+        "docs/sims.md",
+    ],
 )
 def test_links_and_files_exist(name: str) -> None:
     page = ROOT / name
