@@ -18,7 +18,7 @@ help:
 	@echo "make bench   measure speed against other libraries, as ratios"
 	@echo "make bench-learning   the same of learning and off-policy estimates, beside d3rlpy, SB3, SCOPE-RL"
 	@echo "make bench-gpu   updates per second on a GPU, and the share of what it can do"
-	@echo "make sim-grid    learn offline from six logs of each sim, four seeds: two hours of one core"
+	@echo "make sim-grid    learn offline from six logs of each sim, four seeds; it takes long, and goes on if stopped"
 	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
 	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
 	@echo "make clean   remove what these made"
