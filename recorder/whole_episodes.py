@@ -235,9 +235,13 @@ def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> It
 
 
 def _is_log(reader: McapReader) -> bool:
-    """Whether a file is, or was, a log: its metadata may be lost, and what tells of steps, too."""
-    topics = {channel.topic for channel in reader.channels.values()}
-    return METADATA_NAME in reader.metadata or not topics.isdisjoint((STEP_TOPIC, EPISODE_TOPIC))
+    """Whether a file is, or was, a log: its metadata may be lost, and names of topics, too."""
+    ours = (STEP_TOPIC, EPISODE_TOPIC, "/rl/observation/")
+    return (
+        METADATA_NAME in reader.metadata
+        or any(channel.topic.startswith(ours) for channel in reader.channels.values())
+        or any(schema.name.startswith("mcaprl_msgs/") for schema in reader.schemas.values())
+    )
 
 
 def _schemas(reader: McapReader) -> list[Schema]:

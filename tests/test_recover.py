@@ -330,11 +330,14 @@ def test_command_tells_and_exits(
     assert "cannot be recovered" in capsys.readouterr().err
 
 
-def test_a_log_whose_steps_have_lost_their_name(log_path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("other", [b"/rl/step", b"/rl/episode", b"mcaprl_msgs/msg/Episode"])
+def test_a_log_whose_steps_have_lost_their_name(
+    log_path: Path, tmp_path: Path, other: bytes
+) -> None:
     """What else is in it is no log: nothing is kept of a log without an episode."""
     record(log_path, SPACE, spaces.Discrete(2), [4, 5])
     data = log_path.read_bytes()
-    for name in (b"mcaprl.dataset", b"/rl/step"):
+    for name in {b"mcaprl.dataset", b"/rl/step", other}:
         assert data.count(name) >= 2
         data = data.replace(name, name[:-1] + b"x")
     log_path.write_bytes(data)
