@@ -95,7 +95,7 @@ def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
     (crc,) = struct.unpack("<I", content)
     if crc:
         return bool(crc32(view[:offset]) == crc)
-    return _next_chunk(view, offset) == len(view)
+    return _next_chunk(view, offset, len(view)) == len(view)
 
 
 def _sound_record(view: memoryview, offset: int) -> memoryview | None:
@@ -157,24 +157,26 @@ def _next_record(view: memoryview, damaged: int) -> int:
     """Where the next sound record is behind a damaged one; the file's end if there is none."""
     if damaged + RECORD_HEADER_BYTES <= len(view):
         _, length = RECORD_HEADER.unpack_from(view, damaged)
-        behind = damaged + RECORD_HEADER_BYTES + length
-        if behind < len(view) and view[behind] in _KNOWN and _sound_record(view, behind):
-            return int(behind)
+        behind = int(damaged + RECORD_HEADER_BYTES + length)
+        leads_on = behind < len(view) and view[behind] in _KNOWN and _sound_record(view, behind)
+        # A wrong length may lead to a message within another chunk, past whole ones.
+        if leads_on and _next_chunk(view, damaged + 1, behind) == behind:
+            return behind
     near = min(damaged + _NEAR_BYTES, len(view))
     for offset in range(damaged + 1, near):
         if view[offset] in _SEARCHED and _sound_record(view, offset) is not None:
             return offset
-    return _next_chunk(view, near)
+    return _next_chunk(view, near, len(view))
 
 
-def _next_chunk(view: memoryview, start: int) -> int:
-    """Where the next sound chunk is; the file's end if there is none."""
+def _next_chunk(view: memoryview, start: int, stop: int) -> int:
+    """Where the first sound chunk begins from `start` on; `stop` if there is none before it."""
     bytes_ = np.frombuffer(view, np.uint8)
-    for block in range(start, len(view), _BLOCK_BYTES):
-        for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, len(view))):
+    for block in range(start, stop, _BLOCK_BYTES):
+        for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, stop)):
             if _sound_record(view, offset) is not None:
                 return offset
-    return len(view)
+    return stop
 
 
 def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:

@@ -134,7 +134,7 @@ def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> Non
     for seed in range(2):
         (tmp_path / f"online/seed-{seed}").mkdir(parents=True)
         points = [
-            CurvePoint(step, 2.0 * step + seed, math.nan, 0.0, 9.0, 5.0, best=True)
+            CurvePoint(step, 2.0 * step + seed, math.nan, 0.0, 9.0, 5.0, 7.0, best=True)
             for step in (10, 20, 30)
         ]
         write_curve(tmp_path / f"online/seed-{seed}/curve.csv", points)
