@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import signal
 import threading
 from types import FrameType, TracebackType
@@ -24,7 +25,7 @@ class HoldSignals:
     def __enter__(self) -> None:
         """Begin to hold."""
         self._handlers: dict[int, Any] = {}
-        self._waiting: list[tuple[int, FrameType | None]] = []
+        self._waiting: list[int] = []
         self._holds = threading.current_thread() is threading.main_thread() and not self._is_held
         if not self._holds:
             return
@@ -48,15 +49,16 @@ class HoldSignals:
     ) -> None:
         """Handle what came in the meantime."""
         self._restore()
-        for number, frame in self._waiting:
+        for number in self._waiting:
             handler = self._handlers[number]
             if callable(handler):
-                handler(number, frame)
+                handler(number, inspect.currentframe())
             elif handler is signal.SIG_DFL:
                 signal.raise_signal(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self._waiting.append((number, frame))
+        # Not the frame: as long as it were kept, so would be all that was being worked on in it.
+        self._waiting.append(number)
 
     def _restore(self) -> None:
         if self._holds:

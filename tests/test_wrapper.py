@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, OutputExistsError, SpaceError, UsageError
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.signals import HoldSignals
 from tests.recordings import ScriptedEnv
 
 BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
@@ -322,7 +324,7 @@ def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
         path = log_path.with_name(f"{trial}.mcap")
         env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
         timer = threading.Timer(0.001 + trial * 0.0003, signal.pthread_kill, (main, signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+        with pytest.raises(KeyboardInterrupt):
             timer.start()
             while True:
                 env.reset(seed=trial)
@@ -413,3 +415,18 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
     assert len(data.episodes) > 3
     assert all(episode.terminated[-1] for episode in data.episodes)
     assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
+
+
+def test_a_signal_that_waits_keeps_nothing_alive() -> None:
+    """A buffer that is looked at when the signal comes can be emptied before it is handled."""
+    buffer = BytesIO(b"pictures")
+
+    def look() -> int:
+        view = buffer.getbuffer()
+        signal.raise_signal(signal.SIGINT)
+        return len(view)
+
+    with pytest.raises(KeyboardInterrupt), HoldSignals():
+        assert look() == 8
+        buffer.truncate(0)
+    assert buffer.getvalue() == b""
