@@ -324,7 +324,7 @@ def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
         path = log_path.with_name(f"{trial}.mcap")
         env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
         timer = threading.Timer(0.001 + trial * 0.0003, signal.pthread_kill, (main, signal.SIGINT))
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
             timer.start()
             while True:
                 env.reset(seed=trial)
@@ -426,7 +426,7 @@ def test_a_signal_that_waits_keeps_nothing_alive() -> None:
         signal.raise_signal(signal.SIGINT)
         return len(view)
 
-    with pytest.raises(KeyboardInterrupt), HoldSignals():
+    with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
         assert look() == 8
         buffer.truncate(0)
     assert buffer.getvalue() == b""
