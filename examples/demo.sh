@@ -49,7 +49,8 @@ cat <<TXT
 Done. Under $out/ are now
   data/                     the logs that everything was learnt from
   runs/                     the policies, their checkpoints and curves: tensorboard --logdir $out/runs
-  report/comparison.png     how they compare, with 95 % intervals
+  report/index.html         how they compare, with 95 % intervals: a page for any browser
+  report/comparison.png     the same as a picture
   report/trajectories.png   where they drove
   report/evaluation.json    the same in numbers
   replay.mcap               three drives of the CQL policy: scene, depth camera, rewards
