@@ -116,8 +116,9 @@ class LaneFleet(Fleet):
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
             observe_all_rays(self._cars[chosen], seen)
             self._rays[chosen] = seen
-        for i in chosen.tolist():
-            self._depth_m.pop(i, None)
+        if self._depth_m:
+            for i in chosen.tolist():
+                self._depth_m.pop(i, None)
 
     def advance(self, actions: NDArray[np.int64]) -> None:
         """Drive on for a decision."""

@@ -185,6 +185,11 @@ def viewer_is_there() -> None:
     need(importlib.util.find_spec("foxglove") is not None, "foxglove-sdk is not installed")
 
 
+def _hear_ctrl_c() -> None:
+    """A shell that starts pytest in the background has it, and its children, ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def look(
     arguments: list[str], plan: list[list[Any]], how: signal.Signals = signal.SIGINT
 ) -> tuple[Any, list[str]]:
@@ -196,7 +201,9 @@ def look(
         how: the server is ended.
     """
     command = [sys.executable, "-m", "mcaprl.cli", "replay", *arguments, "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=_hear_ctrl_c
+    ) as server:
         assert server.stdout is not None
         lines = [server.stdout.readline() for _ in range(4)]
         try:

@@ -420,13 +420,18 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
 def test_a_signal_that_waits_keeps_nothing_alive() -> None:
     """A buffer that is looked at when the signal comes can be emptied before it is handled."""
     buffer = BytesIO(b"pictures")
+    # A shell that starts pytest in the background has it ignore Ctrl-C.
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def look() -> int:
         view = buffer.getbuffer()
         signal.raise_signal(signal.SIGINT)
         return len(view)
 
-    with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
-        assert look() == 8
-        buffer.truncate(0)
+    try:
+        with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
+            assert look() == 8
+            buffer.truncate(0)
+    finally:
+        signal.signal(signal.SIGINT, usual)
     assert buffer.getvalue() == b""
