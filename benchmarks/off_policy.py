@@ -200,7 +200,7 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
     Returns:
         For our intervals, and for percentiles of the same resamplings.
     """
-    held = {kind: dict.fromkeys(ESTIMATORS, 0.0) for kind in ("bootstrap-t", "percentiles")}
+    held = {kind: dict.fromkeys(ESTIMATORS, 0.0) for kind in ("ours", "percentiles")}
     for seed in range(logs):
         table = task.play(None, episodes=episodes, seed=seed)
         random = np.random.default_rng(seed)
@@ -209,7 +209,7 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
             estimate = estimator(table)
             low, high = np.percentile(estimate.values(counts), (2.5, 97.5))
             for kind, (start, end) in (
-                ("bootstrap-t", estimate.interval(counts)),
+                ("ours", estimate.interval(counts)),
                 ("percentiles", (low, high)),
             ):
                 held[kind][name] += (start <= task.true_value() <= end) / logs
@@ -219,7 +219,7 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--logs", type=int, default=300, help="of the coverage")
+    parser.add_argument("--logs", type=int, default=1000, help="of the coverage")
     parser.add_argument("--seeds", type=int, default=4, help="of both FQEs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -5,10 +5,12 @@ medium   an online run's policy as soon as it scores half of the pilot, one acti
 expert   the sim's pilot
 replay   all that this online run did until then
 mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and actions at random
-weak     a drowsy pilot: it mostly does nothing, and now and then what it should
+weak     a pilot that mostly does the wrong thing, and now and then what it should: the drone's and
+         the racer's are drowsy and do nothing, the car's is timid and brakes above 5 m/s
 
-Most actions of the weak pilot are bad ones, in most states: who imitates it does nothing. What
-would be better is in the log all the same, and its rewards tell.
+Most actions of the weak pilot are bad ones, in most states: who imitates it does as badly. What
+would be better is in the log all the same, and its rewards tell. A drowsy car would be off its lane
+within eight seconds, and its log would show little of the course.
 """
 
 from __future__ import annotations
@@ -29,37 +31,49 @@ from mcaprl.online.task import Task
 from mcaprl.online.train import train as train_online
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sim
+from mcaprl.sims.lane_rules import Car
 from mcaprl.sims.pilots import make_pilot
-from mcaprl.sims.rollout import EpsilonGreedy, Policy, rollout
+from mcaprl.sims.rollout import EpsilonGreedy, rollout
 
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
 MEDIUM_SCORE = 0.5
 """Where random is 0 and the pilot 1, over the 30 episodes of an evaluation while learning."""
-NOTHING = {"lane": "straight", "powerline": "no change", "racer": "none"}
-"""The action of each sim that a sleeper takes."""
-ASLEEP, CLUMSY = 0.6, 0.1
-"""How often the weak pilot does nothing, and how often any action, of the rest, at random."""
+WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
+"""The action of each sim that its weak pilot prefers."""
+TIMID_ABOVE_M_S = {"lane": 5.0}
+"""Slower than that, the weak pilot errs as little as when it is awake."""
+WEAK, CLUMSY = 0.6, 0.1
+"""How often the weak pilot does the wrong thing, and how often any action, of the rest, at random."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 
 
-class Drowsy(EpsilonGreedy):
-    """A policy that does nothing most of the time."""
+class WeakPilot(EpsilonGreedy):
+    """A pilot that does the wrong thing most of the time."""
 
-    def __init__(self, policy: Policy, env: gym.Env[Any, Any], nothing: int) -> None:
-        """Send `policy` to sleep; awake, it is a little clumsy."""
-        super().__init__(policy, CLUMSY, env.action_space)
-        self.name, self._nothing = "weak pilot", nothing
+    def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
+        """Take the pilot of `env`; where it does right it is a little clumsy."""
+        super().__init__(make_pilot(env), CLUMSY, env.action_space)
+        meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
+        self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
+        self._sim, self._timid_above_m_s = env.unwrapped, TIMID_ABOVE_M_S.get(sim)
 
     def choose(self, observation: Any) -> tuple[Any, float]:
         """The action for one observation, and the probability with which it is chosen."""
         assert self.policy is not None
-        chances = np.full(self._count, (1 - ASLEEP) * CLUMSY / self._count)
-        chances[int(self.policy.act(observation[None])[0])] += (1 - ASLEEP) * (1 - CLUMSY)
-        chances[self._nothing] += ASLEEP
+        weak = WEAK if self._is_weak_here() else 0.0
+        chances = np.full(self._count, (1 - weak) * CLUMSY / self._count)
+        chances[int(self.policy.act(observation[None])[0])] += (1 - weak) * (1 - CLUMSY)
+        chances[self._wrong] += weak
         action = int(self._random.choice(self._count, p=chances))
         return action, float(chances[action])
+
+    def _is_weak_here(self) -> bool:
+        if self._timid_above_m_s is None:
+            return True
+        car: Car = self._sim.car  # type: ignore[attr-defined]
+        return car.speed_m_s > self._timid_above_m_s
 
 
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:
@@ -106,8 +120,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
         return EpsilonGreedy(load_policies(online)[0], 0.1, env.action_space)
 
     def weak(env: gym.Env[Any, Any]) -> EpsilonGreedy:
-        meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
-        return Drowsy(make_pilot(env), env, meanings.index(NOTHING[sim]))
+        return WeakPilot(env, sim)
 
     return {
         "random": [pilot(1.0)],

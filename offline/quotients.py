@@ -9,6 +9,13 @@ intervals hold the truth in 85 to 93 of 100 logs of 50 episodes. What is resampl
 the error in units of its own standard error, the bootstrap-t:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
+
+That standard error is itself an estimate, and one of few degrees of freedom where few episodes carry
+most of it. So the interval is wider by as much as Student's t of so many is than the normal
+distribution; how many follows from how unequal the episodes' shares are:
+
+    Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
+    Bulletin 2, 1946
 """
 
 from __future__ import annotations
@@ -18,6 +25,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, t
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +72,7 @@ class Quotients:
         return np.concatenate(parts)
 
     def interval(self, counts: Floats) -> tuple[float, float]:
-        """95 % bootstrap-t interval.
+        """95 % bootstrap-t interval, wider where few episodes tell how wide it should be.
 
         Resamplings that are all alike have no standard error and are left out; where most are, the
         interval is that of percentiles.
@@ -82,17 +90,37 @@ class Quotients:
             low, high = np.percentile(resampled, tails)
         else:
             far, near = np.percentile((resampled[known] - value) / errors[known], tails)
+            error *= student_factor(self.degrees_of_freedom())
             low, high = value - near * error, value - far * error
         return float(low), float(high)
 
+    def degrees_of_freedom(self) -> float:
+        """Of the standard error of the estimate: (sum_i m_i^2)^2 / sum_i m_i^4 - 1, at least 1.
+
+        m_i is how far episode i moves the estimate. Episodes that all move it alike give E - 1.
+        """
+        once = np.ones((1, len(self.pairs[0][0])))
+        shares = self._moves(once)[:, 0] ** 2
+        return max(1.0, float(shares.sum() ** 2 / max(np.sum(shares**2), 1e-300)) - 1.0)
+
     def _errors(self, counts: Floats) -> Floats:
+        errors: Floats = np.sqrt((counts.T * self._moves(counts) ** 2).sum(0))
+        return errors
+
+    def _moves(self, counts: Floats) -> Floats:
+        """(E, B) how far each episode moves the estimate, in each resampling."""
         moved = np.zeros((counts.shape[1], len(counts)))
         for a, b in self.pairs:
             totals = counts @ b
             per_unit = quotient(np.broadcast_to(self.weights, totals.shape), totals)
             moved += a @ per_unit.T - b @ (quotient(counts @ a, totals) * per_unit).T
-        errors: Floats = np.sqrt((counts.T * moved**2).sum(0))
-        return errors
+        return moved
+
+
+def student_factor(degrees_of_freedom: float) -> float:
+    """How much further Student's t reaches for 95 % than the normal distribution does."""
+    tail = 0.5 + CONFIDENCE / 2
+    return float(t.ppf(tail, degrees_of_freedom) / norm.ppf(tail))
 
 
 def quotient(numerators: Floats, denominators: Floats) -> Floats:

@@ -47,6 +47,8 @@ COMPRESSIONS = ("zstd", "lz4", "none")
 # Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
 # themselves so much that a slower search halves them.
 _ROWS_LEVEL, _MESSAGES_LEVEL = 1, 9
+# So few bytes are sooner copied than handed to the operating system piece by piece.
+_JOINED_BYTES = 2**16
 
 
 class McapWriter:
@@ -324,6 +326,8 @@ class McapWriter:
             with HoldSignals():
                 if self.untouched:
                     self._cut_off_summary()
+                if sum(map(len, parts)) <= _JOINED_BYTES:
+                    parts = (b"".join(parts),)
                 for part in parts:
                     rest = memoryview(part)
                     while rest:

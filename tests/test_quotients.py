@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from mcaprl.offline.importance import ESTIMATORS
-from mcaprl.offline.quotients import Quotients
+from mcaprl.offline.quotients import Quotients, student_factor
 from tests import two_state_task as task
 
 columns = st.integers(2, 9).flatmap(
@@ -91,3 +91,22 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
             held[name] += low <= task.true_value() <= high
     for name, times in held.items():
         assert abs(times / logs - 0.95) <= margin, name
+
+
+def test_degrees_of_freedom_by_hand() -> None:
+    # 0 and 2 lie as far from 1: two episodes tell alike, one degree. 0 0 0 4 lie 1 1 1 3 from it:
+    # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) = 144 / 84 is less than two, and one the least.
+    assert Quotients.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
+    assert Quotients.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
+    alike = Quotients.mean(np.array([-1.0, 1.0] * 10))
+    assert alike.degrees_of_freedom() == pytest.approx(19.0)
+    # 0 0 0 2 2 4 4 4 lie 2 2 2 0 0 2 2 2 from their mean: six of eight tell, five degrees.
+    some = Quotients.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
+    assert some.degrees_of_freedom() == pytest.approx(5.0)
+
+
+def test_students_factor_by_the_table() -> None:
+    # 97.5 % of Student's t: 12.706 of one degree, 2.228 of ten; of the normal distribution 1.960.
+    assert student_factor(1.0) == pytest.approx(12.706 / 1.960, rel=1e-3)
+    assert student_factor(10.0) == pytest.approx(2.228 / 1.960, rel=1e-3)
+    assert student_factor(1e9) == pytest.approx(1.0)
