@@ -44,7 +44,7 @@ WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
 TIMID_ABOVE_M_S = {"lane": 5.0}
 """Slower than that, the weak pilot errs as little as when it is awake."""
 WEAK, CLUMSY = 0.6, 0.1
-"""How often the weak pilot does the wrong thing, and how often any action, of the rest, at random."""
+"""How often the weak pilot does the wrong thing, and how often, of the rest, any action."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 

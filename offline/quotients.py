@@ -10,8 +10,8 @@ the error in units of its own standard error, the bootstrap-t:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
 
-That standard error is itself an estimate, and one of few degrees of freedom where few episodes carry
-most of it. So the interval is wider by as much as Student's t of so many is than the normal
+That standard error is itself an estimate, and one of few degrees of freedom where few episodes
+carry most of it. So the interval is wider by as much as Student's t of so many is than the normal
 distribution; how many follows from how unequal the episodes' shares are:
 
     Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
