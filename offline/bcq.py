@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mcaprl.offline.buffer import Batch
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.dqn import DQN, DQNConfig
+from mcaprl.offline.dqn import DQN, DQNConfig, temporal_difference
 from mcaprl.offline.learner import ActsBy, Losses
 from mcaprl.offline.losses import (
     allowed_only,
@@ -64,9 +64,10 @@ class BCQ(DQN):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of the temporal difference; for the clone its cross entropy."""
-        q_tm1 = self.learn("q", batch.observations)
-        td_loss = self.td_loss(q_tm1, batch)
-        logits_tm1 = self.learn("logits", batch.observations)
+        q_tm1, q_t = self.learn_with_next("q", batch)
+        logits_tm1, logits_t = self.learn_with_next("logits", batch)
+        target_tm1 = self._targets(batch, q_t, logits_t)
+        td_loss = temporal_difference(q_tm1, batch.actions, target_tm1)
         cloning = cross_entropy(logits_tm1, batch.actions)
         penalty = scaled(square_penalty(logits_tm1), self.config.logits_penalty)
         terms = {
@@ -79,9 +80,11 @@ class BCQ(DQN):
 
     def targets(self, batch: Batch) -> Tensor:
         """The learning network chooses among likely actions, the target network judges."""
-        likely = likely_actions(
-            self.outputs("logits", batch.next_observations), self.config.threshold
-        )
-        q_t_selector = allowed_only(self.outputs("q", batch.next_observations), likely)
+        q_t = self.outputs("q", batch.next_observations)
+        return self._targets(batch, q_t, self.outputs("logits", batch.next_observations))
+
+    def _targets(self, batch: Batch, q_t: Tensor, logits_t: Tensor) -> Tensor:
+        likely = likely_actions(logits_t, self.config.threshold)
+        q_t_selector = allowed_only(q_t, likely)
         q_t_value = self.target_outputs(batch)
         return bellman_target(batch.rewards, batch.discounts, q_t_value, best_actions(q_t_selector))

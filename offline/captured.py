@@ -62,7 +62,7 @@ class StaticUpdate:
         size = len(learner.seeds) * learner.config.batch_size
         self._rows = torch.zeros(size, dtype=torch.int64, device=device)
         self._rate = torch.tensor(learner.config.learning_rate, device=device)
-        learner.optimizer.param_groups[0]["lr"] = self._rate
+        learner.optimizer.learning_rate = self._rate
         self._updates = torch.zeros((), dtype=torch.int64, device=device)
         self._bad_update = torch.full_like(self._updates, -1)
         self._bad_means: Tensor | None = None

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mcaprl.offline.buffer import Batch
 from mcaprl.offline.config import TrainingConfig
-from mcaprl.offline.dqn import DoubleDQN, DoubleDQNConfig
+from mcaprl.offline.dqn import DoubleDQN, DoubleDQNConfig, temporal_difference
 from mcaprl.offline.learner import Losses
 from mcaprl.offline.losses import Loss, chosen, cross_entropy, mean_values
 
@@ -46,8 +46,8 @@ class CQL(DoubleDQN):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of Double DQN plus alpha times the penalty."""
-        q_tm1 = self.learn("q", batch.observations)
-        td_loss = self.td_loss(q_tm1, batch)
+        q_tm1, target_tm1 = self.learn_q(batch)
+        td_loss = temporal_difference(q_tm1, batch.actions, target_tm1)
         penalty = conservative_penalty(q_tm1, batch.actions)
         alpha = self.config.alpha
         terms = {

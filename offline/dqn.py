@@ -83,8 +83,8 @@ class DQN(Learner):
 
     def losses(self, batch: Batch) -> Losses:
         """The loss of the temporal difference."""
-        q_tm1 = self.learn("q", batch.observations)
-        td_loss = self.td_loss(q_tm1, batch)
+        q_tm1, target_tm1 = self.learn_q(batch)
+        td_loss = temporal_difference(q_tm1, batch.actions, target_tm1)
         q_a_tm1 = chosen(mean_values(q_tm1), batch.actions)
         return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
 
@@ -95,10 +95,9 @@ class DQN(Learner):
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
         return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
 
-    def td_loss(self, q_tm1: Tensor, batch: Batch) -> Loss:
-        """How far the values of the actions taken are from their targets."""
-        regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
-        return regression(q_tm1, batch.actions, self.targets(batch))
+    def learn_q(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Values (R, A) or quantiles (R, A, N) to be learned from, and the targets of some."""
+        return self.learn("q", batch.observations), self.targets(batch)
 
     def targets(self, batch: Batch) -> Tensor:
         """The target network both chooses the next action and judges it."""
@@ -116,8 +115,21 @@ class DoubleDQN(DQN):
     config_type: ClassVar[type[TrainingConfig]] = DoubleDQNConfig
     config: DoubleDQNConfig
 
+    def learn_q(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """What is learned from, and the next states' values, come out of one pass."""
+        q_tm1, q_t_selector = self.learn_with_next("q", batch)
+        return q_tm1, self._targets(batch, q_t_selector)
+
     def targets(self, batch: Batch) -> Tensor:
         """The learning network chooses, the target network judges."""
-        q_t_selector = self.outputs("q", batch.next_observations)
+        return self._targets(batch, self.outputs("q", batch.next_observations))
+
+    def _targets(self, batch: Batch, q_t_selector: Tensor) -> Tensor:
         q_t_value = self.target_outputs(batch)
         return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)
+
+
+def temporal_difference(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
+    """The regression of values (R, A), or quantiles (R, A, N), of actions to their targets."""
+    regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
+    return regression(q_tm1, a_tm1, target_tm1)

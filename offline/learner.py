@@ -18,11 +18,11 @@ from mcaprl.offline.losses import allowed_only
 from mcaprl.offline.models import Model, build_model
 from mcaprl.offline.networks import Network
 from mcaprl.offline.observations import Observations
+from mcaprl.offline.optimizer import MOMENTS, AdamW
 from mcaprl.offline.target import HardTarget
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
 """What a trained policy takes the best action of: see `policy`."""
-_MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class Losses(NamedTuple):
@@ -93,15 +93,9 @@ class Learner(ABC):
         }
         self.copies: dict[str, HardTarget] = {}
         self._sync_interval = 0
-        self._weights = [model.weights for model in self.models.values()]
+        weights = [model.weights for model in self.models.values()]
+        self.optimizer = AdamW(weights, config.learning_rate, config.weight_decay)
         on_gpu = buffer.device.type == "cuda"
-        self.optimizer = torch.optim.AdamW(
-            self._weights, weight_decay=config.weight_decay, fused=True, capturable=on_gpu
-        )
-        for weights in self._weights:
-            moments = {name: torch.zeros_like(weights) for name in _MOMENTS}
-            steps = torch.tensor(0.0, device=buffer.device)
-            self.optimizer.state[weights] = {"step": steps, **moments}
         self.static_update: StaticUpdate | None = StaticUpdate(self) if on_gpu else None
 
     @abstractmethod
@@ -141,7 +135,7 @@ class Learner(ABC):
             terms = self.find_gradients(rows)
             if not math.isfinite(terms["loss"].sum().item()):
                 raise self.not_finite(self.seed_means(terms), self.step + 1)
-            self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
+            self.optimizer.learning_rate = self.config.learning_rate_at(self.step)
             self.optimizer.step()
         self.step += 1
         if self.copies and self.step % self._sync_interval == 0:
@@ -191,6 +185,12 @@ class Learner(ABC):
         """A model's outputs for observations that it is to learn from."""
         return allowed_only(self.models[name].learn_from(observations), observations.mask)
 
+    def learn_with_next(self, name: str, batch: Batch) -> tuple[Tensor, Tensor]:
+        """As `learn` for a batch's observations, and `outputs` for its next observations."""
+        here, there = batch.observations, batch.next_observations
+        outputs, next_outputs = self.models[name].learn_beside(here, there)
+        return allowed_only(outputs, here.mask), allowed_only(next_outputs, there.mask)
+
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """A model's outputs."""
         return allowed_only(self.models[name](observations), observations.mask)
@@ -206,16 +206,16 @@ class Learner(ABC):
 
     def changed_by_updates(self) -> list[Tensor]:
         """The tensors on the device that an update changes, synchronisations aside."""
-        moments = [self.optimizer.state[weights] for weights in self._weights]
-        return [*self._weights, *(tensor for mine in moments for tensor in mine.values())]
+        weights = [model.weights for model in self.models.values()]
+        moments = [tensor for mine in self.optimizer.moments for tensor in mine.values()]
+        return [*weights, *self.optimizer.steps, *moments]
 
     def state(self, seed: int) -> dict[str, Tensor]:
         """All that a seed's next update depends on, save `step`: weights, optimiser, generator."""
         k = self.seeds.index(seed)
         tensors = {f"{name}.weights": model.weights[k] for name, model in self.everything().items()}
-        for name, model in self.models.items():
-            moments = self.optimizer.state[model.weights]
-            tensors |= {f"{name}.{moment}": moments[moment][k] for moment in _MOMENTS}
+        for name, moments in zip(self.models, self.optimizer.moments, strict=True):
+            tensors |= {f"{name}.{moment}": moments[moment][k] for moment in MOMENTS}
         tensors["generator.sampler"] = self.samplers[k].get_state()
         return tensors
 
@@ -229,10 +229,10 @@ class Learner(ABC):
         k = self.seeds.index(seed)
         for name, model in self.everything().items():
             _copy(model.weights[k], tensors[f"{name}.weights"])
-        for name, model in self.models.items():
-            moments = self.optimizer.state[model.weights]
-            moments["step"].fill_(step)
-            for moment in _MOMENTS:
+        for steps in self.optimizer.steps:
+            steps.fill_(step)
+        for name, moments in zip(self.models, self.optimizer.moments, strict=True):
+            for moment in MOMENTS:
                 _copy(moments[moment][k], tensors[f"{name}.{moment}"])
         for target in self.copies.values():
             target.forget()

@@ -14,8 +14,8 @@ _ROWS_AT_ONCE = 1024
 class HardTarget:
     """Values under a model that is copied every so many updates.
 
-    Between two copies the values do not change. So, where the data set is smaller than what is
-    sampled in that time, each is computed once for the whole data set and then looked up.
+    Between two copies the values do not change. So, where that takes less time than to compute them
+    for each batch, they are computed once for the whole data set and then looked up.
 
     Attributes:
         model: the copy.
@@ -40,7 +40,7 @@ class HardTarget:
         self.model = model.clone()
         self._buffer = buffer
         self._next_states = next_states
-        self._use_table = len(buffer) <= rows_per_sync
+        self._use_table = len(buffer) <= rows_per_sync * model.bulk_gain
         self._table: Tensor | None = None
         self._is_fresh = False
         self._seeds = len(model.weights)

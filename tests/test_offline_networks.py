@@ -117,6 +117,21 @@ def test_the_written_out_backward_pass_is_that_of_autograd(
         torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_learning_from_some_beside_others_is_learning_from_them_alone(
+    model_type: type[Model], seeds: int
+) -> None:
+    seen, others, slope = vectors(seeds * 7, 5), vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
+    model = model_type(networks(seeds))
+    outputs, alone = gradients(model, seen, slope)
+    beside, looked_up = model.learn_beside(seen, others)
+    model.backward(slope)
+    for found, reference in ((beside, outputs), (looked_up, model(others))):
+        torch.testing.assert_close(found, reference, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(model.gradients, alone, rtol=1e-5, atol=1e-6)
+
+
 def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
     seen, slope = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
     together = gradients(model_type(networks(4)), seen, slope)
