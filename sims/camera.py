@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 _NEAR_M = 0.1
 """What is nearer than this before the lens is not seen."""
+_SURELY_M = 1e-6
+"""Further behind a triangle than that, a camera sees its back, whatever the rounding."""
 
 
 class Lens(NamedTuple):
@@ -59,12 +61,27 @@ def level_axes(yaw_rad: float) -> Floats:
     return np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
 
 
+def fronts(mesh: Floats) -> Floats:
+    """Give the (T, 4) planes of triangles: unit vectors to the front, and their distance from 0."""
+    ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
+
+
 @compiled
-def draw(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: Floats) -> None:
+def draw(
+    mesh: Floats,
+    planes: Floats,
+    eye_m: Floats,
+    axes: Floats,
+    focal_px: float,
+    inverse_z: Floats,
+) -> None:
     """Fill `inverse_z`, (height, width) 1/m, with what a camera sees; 0 where it sees nothing.
 
     Args:
         mesh: (T, 3, 3) triangles; only the side whose corners run counter-clockwise is seen.
+        planes: (T, 4) `fronts` of the mesh.
         eye_m: (3,) where the camera is.
         axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
         focal_px: of the lens; its axis meets the middle of the picture.
@@ -72,13 +89,30 @@ def draw(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, inverse_z: 
     """
     inverse_z[:] = 0.0
     corners, polygon = np.empty((3, 3)), np.empty((4, 3))
+    # How far the picture reaches to each side where z is 1; a corner on its border counts as in it.
+    wide, high = 0.5 * inverse_z.shape[1] / focal_px, 0.5 * inverse_z.shape[0] / focal_px
     for face in range(len(mesh)):
+        before_m = planes[face, 0] * eye_m[0] + planes[face, 1] * eye_m[1]
+        before_m += planes[face, 2] * eye_m[2] - planes[face, 3]
+        if before_m < -_SURELY_M:
+            continue
+        behind = right = left = below = above = True
         for i in range(3):
-            x = mesh[face, i, 0] - eye_m[0]
-            y = mesh[face, i, 1] - eye_m[1]
-            z = mesh[face, i, 2] - eye_m[2]
-            for k in range(3):
-                corners[i, k] = axes[k, 0] * x + axes[k, 1] * y + axes[k, 2] * z
+            dx = mesh[face, i, 0] - eye_m[0]
+            dy = mesh[face, i, 1] - eye_m[1]
+            dz = mesh[face, i, 2] - eye_m[2]
+            x = axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz
+            y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
+            z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
+            corners[i, 0], corners[i, 1], corners[i, 2] = x, y, z
+            behind &= z < _NEAR_M
+            right &= x > wide * z
+            left &= x < -wide * z
+            below &= y > high * z
+            above &= y < -high * z
+        # A triangle with all corners beyond the same border has nothing in the picture.
+        if behind or right or left or below or above:
+            continue
         plane = _plane(corners)
         if plane.offset < 0.0:
             count = _clip_near(corners, polygon)
@@ -156,9 +190,8 @@ def _fill(polygon: Floats, count: int, plane: _Plane, focal_px: float, inverse_z
         at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
         at_zero = at_v / plane.offset + step * (0.5 - middle_u)
         for column in range(start, end):
-            value = at_zero + step * column
-            if value > inverse_z[row, column]:
-                inverse_z[row, column] = value
+            # Without a branch, so that the compiler can do several pixels at once.
+            inverse_z[row, column] = max(inverse_z[row, column], at_zero + step * column)
 
 
 @compiled

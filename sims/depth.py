@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.camera import Lens, draw, draw_wires, lengths, ray_lengths
+from mcaprl.sims.camera import Lens, draw, draw_wires, fronts, lengths, ray_lengths
 from mcaprl.sims.compiled import compiled
 
 Floats = NDArray[np.float64]
@@ -118,7 +118,7 @@ class DepthCamera:
             small: (h, w) pixels, the size to which they are averaged down.
             wires: (S, 2, 3) metres, drawn into the small picture, one pixel wide.
         """
-        self._mesh = mesh
+        self._mesh, self._planes = mesh, fronts(mesh)
         self._wires = wires
         self._view = view
         self._nearness = 1.0 / ray_lengths(view)
@@ -142,7 +142,8 @@ class DepthCamera:
             (height, width) 1/m along each ray, 0 where nothing is hit.
         """
         inverse = np.empty((self._view.height_px, self._view.width_px))
-        draw(self._mesh, np.array(position_m), axes, self._view.focal_px, inverse)
+        eye_m = np.array(position_m)
+        draw(self._mesh, self._planes, eye_m, axes, self._view.focal_px, inverse)
         inverse *= self._nearness
         return inverse
 

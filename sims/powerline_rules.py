@@ -23,7 +23,7 @@ from mcaprl.sims.powerline_world import (
     tower_distance,
     wire_distance,
 )
-from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
+from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, fly_all, store
 from mcaprl.sims.vectors import Vector, minus, norm, plus, times
 
 ACTION_MEANINGS = (
@@ -213,9 +213,10 @@ def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
 
 
 @compiled
-def reward_of(before: Flight, after: Flight, end: int) -> float:
+def reward_of(furthest_m: float, after: Flight, end: int) -> float:
     """Pay a decision: new progress ds along the line, less for flying beside it.
 
+    Before the decision the drone had been at most `furthest_m` along the line. Pays
     min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, at distance d; -5 for a failure, 5 more for the
     finish. Beyond 5 m/s each metre costs what it would have paid: if it cost nothing, hurrying
     would waste the rest of the line, but only beyond the horizon of whoever discounts.
@@ -223,7 +224,7 @@ def reward_of(before: Flight, after: Flight, end: int) -> float:
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD
     distance_m = nearest_on_line(after.drone.position_m).distance_m
-    progress = (after.furthest_m - before.furthest_m) / PAID_PROGRESS_M
+    progress = (after.furthest_m - furthest_m) / PAID_PROGRESS_M
     progress = min(progress, 2.0 - progress)
     bonus = FINISH_REWARD if end == FINISHED else 0.0
     return progress * math.exp(-distance_m / PAID_DISTANCE_M) + bonus
@@ -308,13 +309,46 @@ def step_flights(
         ends: (N,) to be filled with FLYING, OFF_LINE, COLLISION or FINISHED.
         observations: (N, 18) to be filled.
     """
+    if gust_m_s > 0.0:
+        for i in range(len(flights)):
+            blow(flights[i], gust_m_s, noise[i])
+    befores_m = flights[:, FURTHEST].copy()
+    decide_all(plant, flights, actions, ends)
     for i in range(len(flights)):
-        flight = flight_at(flights[i])
-        gust = flight.gust_m_s
-        if gust_m_s > 0.0:
-            gust = blown(gust, gust_m_s, noise[i])
-        before = Flight(flight.drone, flight.command_m_s, flight.wind_m_s, gust, flight.furthest_m)
-        after, ends[i] = decide(plant, before, actions[i])
-        rewards[i] = reward_of(before, after, ends[i])
+        after = flight_at(flights[i])
+        rewards[i] = reward_of(befores_m[i], after, ends[i])
         observe(after, observations[i])
-        store_flight(after, flights[i])
+
+
+@compiled
+def blow(row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]) -> None:
+    """Renew the gusts of a flight's row; see `blown`."""
+    gust = blown(vector_at(row, GUST), strength_m_s, noise)
+    for k in range(3):
+        row[GUST + k] = gust[k]
+
+
+@compiled
+def decide_all(
+    plant: int,
+    flights: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    ends: NDArray[np.int64],
+) -> None:
+    """Do as `decide` with N drones, (N, 33) rows of `Flight`, and fill their ends (N,)."""
+    count = len(flights)
+    commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
+    for i in range(count):
+        command = commanded(vector_at(flights[i], COMMAND), actions[i])
+        for k in range(3):
+            commands[i, k] = command[k]
+            winds[i, k] = flights[i, WIND + k] + flights[i, GUST + k]
+        ends[i] = FLYING
+    for _ in range(round(DECISION_S / CHECK_S)):
+        flying = np.flatnonzero(ends == FLYING)
+        fly_all(plant, flights, flying, commands, winds, CHECK_S)
+        for number in flying:
+            position_m = vector_at(flights[number], 0)
+            place = nearest_on_line(position_m)
+            flights[number, FURTHEST] = max(flights[number, FURTHEST], place.along_m)
+            ends[number] = end_of(position_m, place)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mcaprl.sims.compiled import compiled
+from mcaprl.sims.compiled import inlined
 
 
 class Vector(NamedTuple):
@@ -25,43 +25,43 @@ class Quaternion(NamedTuple):
     z: float
 
 
-@compiled
+@inlined
 def plus(a: Vector, b: Vector) -> Vector:
     """Give a + b."""
     return Vector(a.x + b.x, a.y + b.y, a.z + b.z)
 
 
-@compiled
+@inlined
 def minus(a: Vector, b: Vector) -> Vector:
     """Give a - b."""
     return Vector(a.x - b.x, a.y - b.y, a.z - b.z)
 
 
-@compiled
+@inlined
 def times(factor: float, a: Vector) -> Vector:
     """Give a vector, made longer by a factor."""
     return Vector(factor * a.x, factor * a.y, factor * a.z)
 
 
-@compiled
+@inlined
 def dot(a: Vector, b: Vector) -> float:
     """Give the scalar product."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
-@compiled
+@inlined
 def cross(a: Vector, b: Vector) -> Vector:
     """Give the vector product."""
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
-@compiled
+@inlined
 def norm(a: Vector) -> float:
     """Give the length."""
     return math.sqrt(dot(a, a))
 
 
-@compiled
+@inlined
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Give the rotation that turns by q first, then by p."""
     return Quaternion(
@@ -72,20 +72,20 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-@compiled
+@inlined
 def inverse(q: Quaternion) -> Quaternion:
     """Give the rotation back."""
     return Quaternion(q.w, -q.x, -q.y, -q.z)
 
 
-@compiled
+@inlined
 def unit(q: Quaternion) -> Quaternion:
     """Bring a quaternion to length 1."""
     scale = 1.0 / math.sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
     return Quaternion(scale * q.w, scale * q.x, scale * q.y, scale * q.z)
 
 
-@compiled
+@inlined
 def rotate(q: Quaternion, a: Vector) -> Vector:
     """Turn a vector: a + 2 u x (u x a + w a), with u the imaginary part of q."""
     axis = Vector(q.x, q.y, q.z)

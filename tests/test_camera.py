@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mcaprl.sims.camera import draw, lens, level_axes, ray_lengths
+from mcaprl.sims.camera import draw, fronts, lens, level_axes, ray_lengths
 from mcaprl.sims.depth import (
     FARTHEST_M,
     NEAREST_M,
@@ -27,6 +27,10 @@ from mcaprl.sims.mesh import box_mesh, ground_mesh
 Floats = NDArray[np.float64]
 
 ALL_CODES = np.arange(256, dtype=np.uint8)
+
+
+def draw_mesh(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, picture: Floats) -> None:
+    draw(mesh, fronts(mesh), eye_m, axes, focal_px, picture)
 
 
 def unit_rays(columns: NDArray[np.int64], rows: NDArray[np.int64], yaw_rad: float) -> Floats:
@@ -93,12 +97,19 @@ def nearest_front(triangles: Floats, ray: Floats) -> float:
     return best
 
 
+def test_backs_are_told_by_the_planes_of_their_fronts() -> None:
+    # In the plane z = 2, counter-clockwise seen from above: its front looks up.
+    flat = np.array([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]])
+    np.testing.assert_allclose(fronts(flat), [[0, 0, 1, 2]])
+    np.testing.assert_allclose(fronts(flat[:, ::-1]), [[0, 0, -1, -2]])
+
+
 def test_a_soup_of_triangles_looks_as_ray_casting_says() -> None:
     random = np.random.default_rng(4)
     picture = np.empty((12, 16))
     for _ in range(40):
         triangles = random.uniform([-4, -4, -3], [4, 4, 9], size=(6, 3, 3))
-        draw(triangles, np.zeros(3), np.eye(3), 8.0, picture)
+        draw_mesh(triangles, np.zeros(3), np.eye(3), 8.0, picture)
         for row, column in random.integers([12, 16], size=(25, 2)):
             ray = np.array([(column + 0.5 - 8) / 8.0, (row + 0.5 - 6) / 8.0, 1.0])
             assert picture[row, column] == pytest.approx(nearest_front(triangles, ray), abs=1e-9)
@@ -108,7 +119,7 @@ def test_a_wall_straight_ahead_has_its_distance() -> None:
     """A wall 10 m ahead: z is 10 m in every pixel, the ray to the corner is longer."""
     wall = box_mesh((15.0, 0.0, 0.0), (10.0, 100.0, 100.0))
     picture = np.empty((144, 256))
-    draw(wall, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
+    draw_mesh(wall, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
     np.testing.assert_allclose(1.0 / picture, 10.0, rtol=1e-12)
     lengths = ray_lengths(LENS)
     assert lengths[0, 0] == pytest.approx(math.sqrt(1 + (127.5 / 128) ** 2 + (71.5 / 128) ** 2))
@@ -116,7 +127,7 @@ def test_a_wall_straight_ahead_has_its_distance() -> None:
 
 def test_level_ground_ends_at_the_middle_row() -> None:
     picture = np.empty((144, 256))
-    draw(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.7), LENS.focal_px, picture)
+    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.7), LENS.focal_px, picture)
     assert np.all(picture[:72] == 0.0)
     # The middle of row 72 lies half a pixel under the horizon: z = 1.4 m x 128 / 0.5.
     np.testing.assert_allclose(1.0 / picture[72], 1.4 * 128 / 0.5, rtol=1e-9)
@@ -127,7 +138,7 @@ def test_left_of_the_car_is_left_in_the_picture() -> None:
     """Facing north (y), a box to the west (-x) is in the left half."""
     west = box_mesh((-5.0, 10.0, 0.0), (2.0, 2.0, 2.0))
     picture = np.empty((144, 256))
-    draw(west, np.zeros(3), level_axes(math.pi / 2), LENS.focal_px, picture)
+    draw_mesh(west, np.zeros(3), level_axes(math.pi / 2), LENS.focal_px, picture)
     assert np.any(picture[:, :128] > 0)
     assert np.all(picture[:, 128:] == 0)
 
@@ -135,7 +146,7 @@ def test_left_of_the_car_is_left_in_the_picture() -> None:
 def test_what_is_behind_or_inside_is_not_seen() -> None:
     picture = np.empty((144, 256))
     for mesh in (box_mesh((-5.0, 0.0, 0.0), (2.0, 2.0, 2.0)), box_mesh((0, 0, 0), (9.0, 9.0, 9.0))):
-        draw(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
+        draw_mesh(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
         assert np.all(picture == 0.0)
 
 
@@ -147,7 +158,8 @@ def test_neighbouring_triangles_leave_no_gap_and_share_no_pixel() -> None:
     for i in range(37):
         picture = np.empty((64, 64))
         # y points down in the picture: clockwise there is counter-clockwise for the eye.
-        draw(np.array([[[0, 0, 5.0], rim[i + 1], rim[i]]]), np.zeros(3), np.eye(3), 30.0, picture)
+        slice_of = np.array([[[0, 0, 5.0], rim[i + 1], rim[i]]])
+        draw_mesh(slice_of, np.zeros(3), np.eye(3), 30.0, picture)
         covered += picture > 0
     v, u = np.mgrid[0:64, 0:64] + 0.5 - 32
     assert np.all(covered[np.hypot(u, v) < 29.5] == 1)
@@ -206,7 +218,7 @@ def test_each_new_pixel_is_made_of_whole_shares(old: int, new: int) -> None:
 def test_a_plane_keeps_its_depth_when_shrunk() -> None:
     """Inverse depth is linear on the ground: each new row has its middle's value within 1 %."""
     picture = np.empty((144, 256))
-    draw(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, picture)
+    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, picture)
     small = shrunk(picture, (84, 84))
     middle_v = (np.arange(44, 84) + 0.5) * 144 / 84 - 72
     np.testing.assert_allclose(small[44:, 0], 1.4 * 128 / middle_v, rtol=0.01)
