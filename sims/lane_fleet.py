@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.arguments import check_name
 from mcaprl.sims.camera import level_axes
 from mcaprl.sims.depth import DepthCamera, encode_depth, encode_nearness
+from mcaprl.sims.draws import Draws
 from mcaprl.sims.fleet import GOING_ON, Fleet
 from mcaprl.sims.lane_camera import IMAGE_SHAPE, lane_camera
 from mcaprl.sims.lane_classic import (
@@ -77,6 +78,7 @@ class LaneFleet(Fleet):
         )
         self._cars = np.zeros((count, len(Car._fields)))
         self._started_at_m = np.zeros(count)
+        self._draws = Draws(count, 4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         self._has_pictures, self._has_rays = observation == "depth", observation == "rays"
@@ -94,12 +96,13 @@ class LaneFleet(Fleet):
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
         row, state = self._cars[i], self._states[i]
+        self._draws.belong_to(i, random)
         if options:
             car = car_from(options)
             store_car(car, row)
             observe(car, state)
         else:
-            start_car(random.random(4), self._on_line, self._classic, row, state)
+            start_car(self._draws.one(i), self._on_line, self._classic, row, state)
         self._started_at_m[i] = row[ALONG]
         self.rewards[i], self.ends[i] = 0.0, GOING_ON
         if self._has_rays:
@@ -108,7 +111,7 @@ class LaneFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start an episode of some cars."""
-        shares = np.array([randoms[i].random(4) for i in chosen.tolist()])
+        shares = self._draws.some(chosen)
         start_cars(chosen, shares, self._on_line, self._classic, self._cars, self._states)
         self._started_at_m[chosen] = self._cars[chosen, ALONG]
         self.rewards[chosen], self.ends[chosen] = 0.0, GOING_ON

@@ -1,0 +1,37 @@
+"""Numbers that are drawn ahead are those that the generators give."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaprl.sims.draws import Draws
+
+COUNT = 4
+
+
+@given(
+    st.lists(st.one_of(st.integers(0, COUNT - 1), st.sets(st.integers(0, COUNT - 1))), max_size=80)
+)
+def test_each_generator_gives_its_numbers_in_their_order(
+    asked: list[int | set[int]],
+) -> None:
+    draws, references = Draws(COUNT, 3), [np.random.default_rng(i) for i in range(COUNT)]
+    for i in range(COUNT):
+        draws.belong_to(i, np.random.default_rng(i))
+    for who in asked:
+        if isinstance(who, int):
+            assert draws.one(who).tolist() == references[who].random(3).tolist()
+        else:
+            chosen = np.array(sorted(who), dtype=np.int64)
+            expected = [references[i].random(3).tolist() for i in sorted(who)]
+            assert draws.some(chosen).tolist() == expected
+
+
+def test_another_generator_begins_anew() -> None:
+    draws = Draws(1, 2)
+    draws.belong_to(0, np.random.default_rng(1))
+    draws.some(np.array([0]))
+    draws.belong_to(0, np.random.default_rng(2))
+    assert draws.one(0).tolist() == np.random.default_rng(2).random(2).tolist()
