@@ -1,6 +1,6 @@
 """Six logs of each of our sims, five algorithms, four seeds: what is learned from which log.
 
-    python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos cql,bc]
+    python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
 
 The logs are those of `sim_data`; the settings of each sim are below and the same for all its logs.
 What counts are the networks after the last update: nothing is chosen by how it does in the sim. A
@@ -37,7 +37,15 @@ from mcaprl.sims.pilots import make_pilot
 from mcaprl.sims.rollout import Policy
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
-ALGOS = ("cql", "bc", "double-dqn", "bcq", "iql")
+ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
+    "cql": ("cql", {}),
+    "cql, alpha .1": ("cql", {"alpha": 0.1}),
+    "bc": ("bc", {}),
+    "double-dqn": ("double-dqn", {}),
+    "bcq": ("bcq", {}),
+    "iql": ("iql", {}),
+}
+"""CQL twice: with the default weight of its penalty, which is 1, and with a tenth of it."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 TARGET_INTERVAL = 150
 """Updates between two copies into the target: with the default, values would not get far ahead."""
@@ -56,7 +64,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sims", default=",".join(SETTINGS))
     parser.add_argument("--data", default=",".join(NAMES))
-    parser.add_argument("--algos", default=",".join(ALGOS))
+    parser.add_argument("--algos", default=";".join(ALGOS))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     for sim in arguments.sims.split(","):
@@ -64,7 +72,7 @@ def main() -> None:
         paths = make_logs(folder, sim)
         wanted = [
             (name, algo)
-            for algo in arguments.algos.split(",")
+            for algo in arguments.algos.split(";")
             for name in arguments.data.split(",")
         ]
         _fill(folder, sim, paths, wanted)
@@ -96,8 +104,9 @@ def learn(
     sim: str, data: mcaprl.Dataset, algo: str, out: Path, random: PolicyScore, pilot: PolicyScore
 ) -> Cell:
     """Train all seeds on a log and score them."""
-    config_type = ALGORITHMS[algo].config_type
-    given = {**SHARED, **SETTINGS[sim]}
+    name, special = ALGOS[algo]
+    config_type = ALGORITHMS[name].config_type
+    given = {**SHARED, **SETTINGS[sim], **special}
     if issubclass(config_type, DQNConfig):
         given["target_interval"] = TARGET_INTERVAL
     if not issubclass(config_type, BootstrapConfig):
