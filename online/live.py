@@ -219,13 +219,8 @@ class _Mirror:
         self._fleet, self._single = fleet, single
 
     def reflect(self) -> object:
-        """Take over the state: all arrays and dicts of a fleet that have an entry a vehicle."""
-        mine = vars(self._single.fleet)
-        for name, theirs in vars(self._fleet).items():
-            if isinstance(theirs, np.ndarray) and theirs.shape[:1] == (self._fleet.count,):
-                mine[name][0] = theirs[WATCHED]
-            elif isinstance(theirs, dict) and all(isinstance(key, int) for key in theirs):
-                mine[name] = {0: theirs[WATCHED]} if WATCHED in theirs else {}
+        """Take over the state."""
+        self._single.fleet.imitate(0, self._fleet, WATCHED)
         # Frames are far apart: there is no trail to draw.
         self._single._trail.clear()
         return self._single

@@ -84,6 +84,20 @@ class Fleet(ABC):
             actions: (N,) valid ones.
         """
 
+    def imitate(self, i: int, other: Fleet, j: int) -> None:
+        """Make vehicle i the same as vehicle j of another fleet of this kind.
+
+        What a fleet knows of its vehicles are arrays with a row for each, and dicts by number of
+        what was worked out for some.
+        """
+        for name, theirs in vars(other).items():
+            mine = getattr(self, name)
+            if isinstance(theirs, np.ndarray) and theirs.shape[:1] == (other.count,):
+                mine[i] = theirs[j]
+            elif isinstance(theirs, dict):
+                mine.pop(i, None)
+                mine |= {i: theirs[j]} if j in theirs else {}
+
     @abstractmethod
     def observation(self, i: int) -> Any:
         """Give what vehicle i observes, the caller's own."""
