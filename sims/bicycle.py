@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mcaprl.sims.compiled import compiled, inlined
+from mcaprl.sims.compiled import inlined
 from mcaprl.sims.geometry import Heading, heading_of, sine, turned
 
 
@@ -20,7 +20,7 @@ class Motion(NamedTuple):
     """Of the yaw, turned with it step by step; `moving` computes it anew."""
 
 
-@compiled
+@inlined
 def moving(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Motion:
     """Make a motion."""
     return Motion(x_m, y_m, yaw_rad, speed_m_s, heading_of(yaw_rad))
@@ -55,7 +55,7 @@ def roll(
     )
 
 
-@compiled
+@inlined
 def slip_of(steering_rad: float) -> float:
     """Give sin(beta) for an angle of the front wheels of at most 45 degrees.
 
@@ -65,13 +65,13 @@ def slip_of(steering_rad: float) -> float:
     return steering_sine / math.sqrt(4.0 - 3.0 * steering_sine * steering_sine)
 
 
-@compiled
+@inlined
 def steering_of(slip_sine: float) -> float:
     """Give the front wheels' angle, radians, for sin(beta): what `slip_of` turns back."""
     return math.atan2(2.0 * slip_sine, math.sqrt(1.0 - slip_sine * slip_sine))
 
 
-@compiled
+@inlined
 def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
     """Give sin(beta) of the turn that makes a sideways acceleration at a speed.
 

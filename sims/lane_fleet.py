@@ -15,6 +15,7 @@ from mcaprl.sims.camera import level_axes
 from mcaprl.sims.depth import DepthCamera, encode_depth, encode_nearness
 from mcaprl.sims.draws import Draws
 from mcaprl.sims.fleet import GOING_ON, Fleet
+from mcaprl.sims.lane_block import step_cars
 from mcaprl.sims.lane_camera import IMAGE_SHAPE, lane_camera
 from mcaprl.sims.lane_classic import (
     CLASSIC_DECISION_S,
@@ -34,7 +35,6 @@ from mcaprl.sims.lane_rules import (
     REASONS,
     Car,
     observe,
-    step_cars,
     store_car,
 )
 from mcaprl.sims.lane_start import car_from, start_car, start_cars

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.bicycle import Motion, moving, roll, slip_for_lateral, slip_of, steering_of
 from mcaprl.sims.compiled import compiled, inlined
-from mcaprl.sims.geometry import (
-    Heading,
-    further,
-    heading_of,
-    in_body_frame,
-    point_of,
-    project,
-    spot_at,
-    wrap_angle,
+from mcaprl.sims.geometry import Heading, heading_of, in_body_frame, wrap_angle
+from mcaprl.sims.lane_course import LANE_HALF_WIDTH_M
+from mcaprl.sims.lane_path import (
+    Leg,
+    course_leg,
+    course_next,
+    course_point_ahead,
+    course_project,
+    course_spot_at,
 )
-from mcaprl.sims.lane_course import COURSE, LANE_HALF_WIDTH_M
 
 ACTION_MEANINGS = ("brake", "straight", "right", "left", "slightly right", "slightly left")
 STEERING = (0.0, 0.0, -0.5, 0.5, -0.25, 0.25)
@@ -106,7 +105,7 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
         row[i] = value
 
 
-@compiled
+@inlined
 def slip(steering: float, speed_m_s: float) -> float:
     """Give the sine of the car's slip angle: that of the steering command, less at high speed.
 
@@ -131,10 +130,10 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
     return steering_of(slip(steering, speed_m_s))
 
 
-@compiled
+@inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
     """Make a car from its motion, looking for its place on the path around `near_m`."""
-    place = project(COURSE, motion.x_m, motion.y_m, near_m - BEHIND_M, near_m + AHEAD_M)
+    place = course_project(motion.x_m, motion.y_m, near_m - BEHIND_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
         motion.y_m,
@@ -161,7 +160,7 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
     return roll(motion, slip(steering, speed_m_s), acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
 
 
-@compiled
+@inlined
 def steering_for(action: int, last: float) -> float:
     """Give the steering command of an action: the brake keeps the last one."""
     return last if action == BRAKE else STEERING[action]
@@ -177,119 +176,77 @@ def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
     return arrived(car, motion, steering, substeps)
 
 
-@compiled
+@inlined
 def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
     """Make a car of where so many sub-steps led it."""
     slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, before.along_m, slow_s)
 
 
-@compiled
-def drive_all(cars: NDArray[np.float64], actions: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Carry out an action with each of N cars.
-
-    Args:
-        cars: (N, 9) rows of `Car`.
-        actions: (N,) 0 to 5.
-
-    Returns:
-        (7, N) columns, each car's x, y, yaw, speed, cosine and sine of its yaw, and steering. The
-        same bits as of `drive`, in a third of the time where N is large.
-    """
-    columns, braking = np.empty((7, len(cars))), np.empty(len(cars), dtype=np.bool_)
-    for i in range(len(cars)):
-        cos, sin = heading_of(cars[i, 2])
-        for k in range(4):
-            columns[k, i] = cars[i, k]
-        columns[4, i], columns[5, i] = cos, sin
-        columns[6, i] = steering_for(actions[i], cars[i, 4])
-        braking[i] = actions[i] == BRAKE
-    for _ in range(SUBSTEPS):
-        _drive_on(columns, braking)
-    return columns
-
-
-@compiled
-def motion_at(columns: NDArray[np.float64], i: int) -> Motion:
-    """Read the motion of car i from columns as `drive_all` makes them."""
-    heading = Heading(columns[4, i], columns[5, i])
-    return Motion(columns[0, i], columns[1, i], columns[2, i], columns[3, i], heading)
-
-
-@compiled
-def _drive_on(columns: NDArray[np.float64], braking: NDArray[np.bool_]) -> None:
-    """Drive all cars on for a sub-step, in place."""
-    # A name for each column lets the compiler see that they do not overlap.
-    x_m, y_m, yaw_rad, speed_m_s = columns[0], columns[1], columns[2], columns[3]
-    cos, sin, steering = columns[4], columns[5], columns[6]
-    for i in range(len(x_m)):
-        before = Motion(x_m[i], y_m[i], yaw_rad[i], speed_m_s[i], Heading(cos[i], sin[i]))
-        after = driven(before, steering[i], braking[i])
-        x_m[i], y_m[i], yaw_rad[i] = after.x_m, after.y_m, after.yaw_rad
-        speed_m_s[i], cos[i], sin[i] = after.speed_m_s, after.heading.cos, after.heading.sin
-
-
-@compiled
+@inlined
 def end_of(car: Car) -> int:
     """Say whether a car has failed: DRIVING, OFF_LANE or STALL."""
-    if abs(car.offset_m) > LANE_HALF_WIDTH_M:
-        return OFF_LANE
-    return STALL if car.slow_s >= STALL_TIME_S else DRIVING
+    stalled = STALL if car.slow_s >= STALL_TIME_S else DRIVING
+    return OFF_LANE if abs(car.offset_m) > LANE_HALF_WIDTH_M else stalled
 
 
-@compiled
+@inlined
 def reward_of(before: Car, after: Car) -> float:
     """Pay a decision: progress ds along the path, less for driving beside its middle.
 
     ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) at distance d from the path, and -5 for a failure.
     """
-    if end_of(after) != DRIVING:
-        return FAILURE_REWARD
     progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
-    return progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
+    paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
+    return paid if end_of(after) == DRIVING else FAILURE_REWARD
 
 
 @compiled
 def observe(car: Car, observation: NDArray[np.float32]) -> None:
     """Write the 12 observed numbers; see the table of `LaneKeepingEnv`."""
-    observation[0] = car.offset_m / LANE_HALF_WIDTH_M
-    observation[1] = car.heading_error_rad / (0.5 * math.pi)
-    observation[2] = car.speed_m_s / MAX_SPEED_M_S
-    observation[3] = 2.0 * car.steering
-    cos, sin = heading_of(car.yaw_rad)
-    here = spot_at(COURSE, car.along_m)
-    for i in range(len(LOOKAHEADS_M)):
-        x_m, y_m = point_of(COURSE, further(COURSE, here, LOOKAHEADS_M[i]))
-        forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, cos, sin)
-        observation[4 + 2 * i] = forward_m / LOOKAHEADS_M[i]
-        observation[5 + 2 * i] = left_m / LOOKAHEADS_M[i]
-    for i in range(len(observation)):
-        limit = OBSERVATION_LIMIT[i]
-        observation[i] = min(max(observation[i], -limit), limit)
+    for i, number in enumerate(seen_from(car)):
+        observation[i] = number
 
 
-@compiled
-def step_cars(
-    cars: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    rewards: NDArray[np.float64],
-    ends: NDArray[np.int64],
-    observations: NDArray[np.float32],
-) -> None:
-    """Advance N cars by one decision each, in place.
+Numbers = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
-    Args:
-        cars: (N, 9) rows of `Car`.
-        actions: (N,) 0 to 5.
-        rewards: (N,) to be filled.
-        ends: (N,) to be filled with DRIVING, OFF_LANE or STALL.
-        observations: (N, 12) to be filled.
-    """
-    moved = drive_all(cars, actions)
-    for i in range(len(cars)):
-        before = car_at(cars[i])
-        after = arrived(before, motion_at(moved, i), moved[6, i], SUBSTEPS)
-        rewards[i] = reward_of(before, after)
-        ends[i] = end_of(after)
-        observe(after, observations[i])
-        store_car(after, cars[i])
+
+@inlined
+def seen_from(car: Car) -> Numbers:
+    """Give the 12 observed numbers, each within its limit."""
+    here = course_spot_at(car.along_m)
+    leg, after = course_leg(here.leg), course_leg(course_next(here.leg))
+    heading = heading_of(car.yaw_rad)
+    near_x, near_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[0])
+    mid_x, mid_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[1])
+    far_x, far_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[2])
+    last_x, last_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[3])
+    return (
+        _within(car.offset_m / LANE_HALF_WIDTH_M, 4.0),
+        _within(car.heading_error_rad / (0.5 * math.pi), 2.0),
+        _within(car.speed_m_s / MAX_SPEED_M_S, 1.0),
+        _within(2.0 * car.steering, 1.0),
+        near_x,
+        near_y,
+        mid_x,
+        mid_y,
+        far_x,
+        far_y,
+        last_x,
+        last_y,
+    )
+
+
+@inlined
+def _ahead(
+    car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
+) -> tuple[float, float]:
+    """Where the path is so far ahead, seen from the car, in units of that."""
+    x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
+    forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
+    return _within(forward_m / lookahead_m, 4.0), _within(left_m / lookahead_m, 4.0)
+
+
+@inlined
+def _within(number: float, limit: float) -> float:
+    return min(max(number, -limit), limit)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mcaprl.sims.bicycle import moving, roll, slip_for_lateral, slip_of, steering_of
@@ -15,6 +15,7 @@ from mcaprl.sims.geometry import (
     Projection,
     Spot,
     closed_path,
+    cosine,
     further,
     heading_of,
     in_body_frame,
@@ -211,3 +212,19 @@ def test_a_slow_car_may_slip_freely() -> None:
 def test_slip_and_steering_belong_together(steering_rad: float) -> None:
     assert slip_of(steering_rad) == pytest.approx(math.sin(math.atan(math.tan(steering_rad) / 2)))
     assert steering_of(slip_of(steering_rad)) == pytest.approx(steering_rad)
+
+
+@given(st.floats(-7, 7))
+@example(math.pi)
+@example(-math.pi)
+@example(math.pi / 2)
+@example(math.pi / 4)
+@example(-math.pi / 4)
+def test_a_heading_is_the_librarys(yaw_rad: float) -> None:
+    expected = (math.cos(yaw_rad), math.sin(yaw_rad))
+    assert heading_of(yaw_rad) == pytest.approx(expected, rel=0, abs=4e-16)
+
+
+@given(st.floats(-math.pi / 4, math.pi / 4))
+def test_a_cosine_is_the_librarys(angle_rad: float) -> None:
+    assert cosine(angle_rad) == pytest.approx(math.cos(angle_rad), rel=3e-16)

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.sims.bicycle import moving
+from mcaprl.sims.lane_block import step_cars
 from mcaprl.sims.lane_rules import (
     BRAKE,
     DRIVING,
@@ -24,7 +25,6 @@ from mcaprl.sims.lane_rules import (
     located,
     observe,
     reward_of,
-    step_cars,
     wheel_angle,
 )
 
@@ -156,8 +156,13 @@ def test_observations_stay_inside_their_limits() -> None:
     assert np.all(np.abs(observed(far)) <= OBSERVATION_LIMIT)
 
 
-@given(st.lists(st.tuples(st.floats(5, 120), st.integers(0, 5)), min_size=1, max_size=6))
-def test_many_cars_drive_as_one_does(starts: list[tuple[float, int]]) -> None:
+@given(
+    st.lists(st.tuples(st.floats(5, 120), st.integers(0, 5)), min_size=1, max_size=6),
+    st.sampled_from([1, 12]),
+)
+def test_many_cars_drive_as_one_does(starts: list[tuple[float, int]], copies: int) -> None:
+    # So many copies fill a block and more.
+    starts = starts * copies
     cars = np.array([placed(x_m, 1.5, 0.1, 8.0, x_m) for x_m, _ in starts])
     actions = np.array([action for _, action in starts])
     rewards, ends = np.zeros(len(cars)), np.zeros(len(cars), dtype=np.int64)
