@@ -1,13 +1,16 @@
 """What recording and being watched cost beside learning: `python -m benchmarks.online`.
 
 The same training runs plainly, with a log, and shown to a viewer (Node, see tests/node), in turns,
-by CPU time of all its threads; the best of several counts.
+by CPU time of all its threads; the best of several counts. The training is the whole one that the
+lane sim is learnt with; `--steps` makes it shorter, and recording dearer: the first episodes last
+twenty steps, and each is written when it ends.
 """
 
 from __future__ import annotations
 
 import argparse
 import subprocess
+import sys
 import tempfile
 import time
 from contextlib import closing, nullcontext
@@ -18,8 +21,10 @@ import torch
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.live import LiveTraining
+from mcaprl.online.sim_settings import SIM_SETTINGS
 from mcaprl.online.task import Task
 from mcaprl.progress import TrainingProgress
+from mcaprl.sims import SIMS
 
 KINDS = ("plain", "recorded", "watched")
 _VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
@@ -56,8 +61,8 @@ def _silent(_: TrainingProgress) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=20_000)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=SIM_SETTINGS[SIMS["lane"]]["steps"])
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -72,6 +77,7 @@ def main() -> None:
             for kind in best:
                 taken_s, seen = training_s(task, Path(folder) / f"{turn}-{kind}", kind)
                 best[kind], frames = min(best[kind], taken_s), max(frames, seen)
+                print(f"{kind}: {taken_s:.1f} s", file=sys.stderr, flush=True)
     print(f"lane, {steps} steps of Double DQN, of the training's CPU time:")
     if "recorded" in best:
         print(f"  recording adds {best['recorded'] / best['plain'] - 1:.1%}")

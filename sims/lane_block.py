@@ -54,7 +54,9 @@ def step_cars(
         ends: (N,) to be filled with DRIVING, OFF_LANE or STALL.
         observations: (N, 12) to be filled.
     """
-    first = _step_blocks(cars, actions, rewards, ends, observations)
+    first = 0
+    if len(cars) >= LANES:
+        first = _step_blocks(cars, actions, rewards, ends, observations)
     for i in range(first, len(cars)):
         before = car_at(cars[i])
         after = drive(before, actions[i])
