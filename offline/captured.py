@@ -11,7 +11,6 @@ and told when `check` asks.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -115,9 +114,7 @@ class StaticUpdate:
         cuda: Any = torch.cuda  # Its streams have no types.
         stream = cuda.Stream()
         stream.wait_stream(cuda.current_stream())
-        with cuda.stream(stream), warnings.catch_warnings():
-            # Adam says that it could be captured, and is not.
-            warnings.simplefilter("ignore", UserWarning)
+        with cuda.stream(stream):
             for _ in range(_WARM_UPS):
                 self._update()
         cuda.current_stream().wait_stream(stream)
