@@ -185,9 +185,10 @@ def viewer_is_there() -> None:
     need(importlib.util.find_spec("foxglove") is not None, "foxglove-sdk is not installed")
 
 
-def _hear_ctrl_c() -> None:
-    """A shell that starts pytest in the background has it, and its children, ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def _hear_signals() -> None:
+    """A shell that starts pytest in the background, or nohup, has it and its children ignore some."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def look(
@@ -202,7 +203,7 @@ def look(
     """
     command = [sys.executable, "-m", "mcaprl.cli", "replay", *arguments, "--port", "0"]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, preexec_fn=_hear_ctrl_c
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=_hear_signals
     ) as server:
         assert server.stdout is not None
         lines = [server.stdout.readline() for _ in range(4)]
