@@ -186,7 +186,7 @@ def viewer_is_there() -> None:
 
 
 def _hear_signals() -> None:
-    """A shell that starts pytest in the background, or nohup, has it and its children ignore some."""
+    """A shell that starts pytest in the background, or nohup, has children ignore some."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
