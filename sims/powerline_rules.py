@@ -23,7 +23,8 @@ from mcaprl.sims.powerline_world import (
     tower_distance,
     wire_distance,
 )
-from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, fly_all, store
+from mcaprl.sims.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
+from mcaprl.sims.quadrotor_block import fly_all
 from mcaprl.sims.vectors import Vector, minus, norm, plus, times
 
 ACTION_MEANINGS = (
