@@ -20,7 +20,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -31,7 +31,7 @@ from mcaprl.online.task import Task
 from mcaprl.online.train import train as train_online
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sim
-from mcaprl.sims.lane_rules import Car
+from mcaprl.sims.lane import LaneKeepingEnv
 from mcaprl.sims.pilots import make_pilot
 from mcaprl.sims.rollout import EpsilonGreedy, rollout
 
@@ -72,8 +72,7 @@ class WeakPilot(EpsilonGreedy):
     def _is_weak_here(self) -> bool:
         if self._timid_above_m_s is None:
             return True
-        car: Car = self._sim.car  # type: ignore[attr-defined]
-        return car.speed_m_s > self._timid_above_m_s
+        return cast(LaneKeepingEnv, self._sim).car.speed_m_s > self._timid_above_m_s
 
 
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:

@@ -70,6 +70,8 @@ OBSERVATION_NAMES = (
     "ahead_40m_left",
 )
 OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
+# Of a tuple, the compiler knows the numbers.
+_LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
 
 class Car(NamedTuple):
@@ -222,10 +224,10 @@ def seen_from(car: Car) -> Numbers:
     far_x, far_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[2])
     last_x, last_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[3])
     return (
-        _within(car.offset_m / LANE_HALF_WIDTH_M, 4.0),
-        _within(car.heading_error_rad / (0.5 * math.pi), 2.0),
-        _within(car.speed_m_s / MAX_SPEED_M_S, 1.0),
-        _within(2.0 * car.steering, 1.0),
+        _within(car.offset_m / LANE_HALF_WIDTH_M, _LIMITS[0]),
+        _within(car.heading_error_rad / (0.5 * math.pi), _LIMITS[1]),
+        _within(car.speed_m_s / MAX_SPEED_M_S, _LIMITS[2]),
+        _within(2.0 * car.steering, _LIMITS[3]),
         near_x,
         near_y,
         mid_x,
@@ -244,7 +246,8 @@ def _ahead(
     """Where the path is so far ahead, seen from the car, in units of that."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
-    return _within(forward_m / lookahead_m, 4.0), _within(left_m / lookahead_m, 4.0)
+    forward, left = forward_m / lookahead_m, left_m / lookahead_m
+    return _within(forward, _LIMITS[4]), _within(left, _LIMITS[4])
 
 
 @inlined

@@ -198,22 +198,6 @@ def end_of(position_m: Vector, place: Place) -> int:
 
 
 @compiled
-def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
-    """Fly for half a second, or to the end of the flight; give it and how it ended."""
-    command = commanded(flight.command_m_s, action)
-    wind = plus(flight.wind_m_s, flight.gust_m_s)
-    drone, furthest_m, end = flight.drone, flight.furthest_m, FLYING
-    for _ in range(round(DECISION_S / CHECK_S)):
-        drone = fly(plant, drone, command, wind, CHECK_S)
-        place = nearest_on_line(drone.position_m)
-        furthest_m = max(furthest_m, place.along_m)
-        end = end_of(drone.position_m, place)
-        if end != FLYING:
-            break
-    return Flight(drone, command, flight.wind_m_s, flight.gust_m_s, furthest_m), end
-
-
-@compiled
 def reward_of(furthest_m: float, after: Flight, end: int) -> float:
     """Pay a decision: new progress ds along the line, less for flying beside it.
 
@@ -336,7 +320,10 @@ def decide_all(
     actions: NDArray[np.int64],
     ends: NDArray[np.int64],
 ) -> None:
-    """Do as `decide` with N drones, (N, 33) rows of `Flight`, and fill their ends (N,)."""
+    """Fly N drones, (N, 33) rows of `Flight`, for half a second or to the end of each's flight.
+
+    The ends (N,) are filled with FLYING, OFF_LINE, COLLISION or FINISHED.
+    """
     count = len(flights)
     commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
     for i in range(count):

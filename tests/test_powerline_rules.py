@@ -21,7 +21,7 @@ from mcaprl.sims.powerline_rules import (
     blown,
     collides,
     commanded,
-    decide,
+    decide_all,
     end_of,
     flight_at,
     observe,
@@ -45,6 +45,14 @@ from mcaprl.sims.vectors import Vector
 
 ZERO = Vector(0.0, 0.0, 0.0)
 UP, NOTHING = 5, 6
+
+
+def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
+    """Fly one drone for a decision; give it, and how its flight ended."""
+    row, ends = np.zeros((1, FLIGHT_SIZE)), np.zeros(1, dtype=np.int64)
+    store_flight(flight, row[0])
+    decide_all(plant, row, np.array([action]), ends)
+    return flight_at(row[0]), int(ends[0])
 
 
 def shifted(along_m: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Vector:
