@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError
-from mcaprl.offline.observations import ObservationEncoder, Observations
+from mcaprl.offline.observations import ImageInput, ObservationEncoder, Observations
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset import Dataset
@@ -32,7 +32,7 @@ class Packing:
     Attributes:
         frame_stack: observations in a row that are seen at once; before an episode's first one
             that one is repeated.
-        normalize: bring vectors to mean 0 and deviation 1.
+        normalize: bring what networks see to mean 0 and deviation 1.
         gamma: discount within n-step returns, and of what is behind them.
         n_steps: rewards that are added up; fewer at the end of an episode.
     """
@@ -214,10 +214,9 @@ class TransitionBuffer:
         return self.encoder.width * self.packing.frame_stack
 
     @property
-    def image_shapes(self) -> list[tuple[int, ...]]:
-        """(height, width, channels) of the pictures that a network sees."""
-        count = self.packing.frame_stack
-        return [(h, w, c * count) for h, w, c in self.encoder.image_shapes]
+    def image_inputs(self) -> list[ImageInput]:
+        """How a network takes the pictures that it sees."""
+        return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
 
 
 def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:

@@ -34,7 +34,7 @@ class TrainingConfig(Settings):
     layer_norm: bool = False
     """normalise the hidden layers"""
     normalize: bool = False
-    """shift and scale vector observations to mean 0 and deviation 1 over the data"""
+    """shift and scale what the network sees to mean 0 and deviation 1 over the data"""
     frame_stack: int = 1
     """how many successive observations the network sees at once"""
     held_out: float = 0.05

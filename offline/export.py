@@ -71,8 +71,8 @@ class ExportedPolicy(nn.Module):
         """What `ObservationEncoder.encode` does, in torch."""
         encoder, rows = self.encoder, inputs[0].shape[0]
         n_images = len(encoder.images)
-        shaped = zip(inputs[:n_images], encoder.image_shapes, strict=True)
-        images = tuple(image.reshape(-1, *shape) for image, shape in shaped)
+        shaped = zip(inputs[:n_images], encoder.image_inputs, strict=True)
+        images = tuple(image.reshape(-1, *wanted.shape) for image, wanted in shaped)
         numbers = inputs[n_images : n_images + len(encoder.numbers)]
         parts = [
             _numbers(part, space) for part, (_, space) in zip(numbers, encoder.numbers, strict=True)

@@ -244,7 +244,7 @@ class Learner(ABC):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return {
-                name: Network(buffer.vector_width, buffer.image_shapes, shape, architecture).to(
+                name: Network(buffer.vector_width, buffer.image_inputs, shape, architecture).to(
                     buffer.device
                 )
                 for name, shape in self.output_shapes().items()

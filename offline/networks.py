@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mcaprl.offline.observations import Observations
+from mcaprl.offline.observations import ImageInput, Observations
 
 
 @dataclass(frozen=True)
@@ -38,15 +39,15 @@ class Network(nn.Module):
     def __init__(
         self,
         vector_width: int,
-        image_shapes: Sequence[tuple[int, ...]],
+        images: Sequence[ImageInput],
         output_shape: tuple[int, ...],
         architecture: Architecture,
     ) -> None:
-        """Build for a vector of `vector_width` numbers and pictures of `image_shapes`.
+        """Build for a vector of `vector_width` numbers and pictures.
 
         Args:
             vector_width: 0 where there is no vector.
-            image_shapes: (height, width, channels) of each picture.
+            images: how each picture is taken.
             output_shape: the first axis counts actions, if there is more than one.
             architecture: what lies between.
         """
@@ -57,8 +58,8 @@ class Network(nn.Module):
         shared = hidden[:-1] if architecture.dueling else hidden
         self.stems = nn.ModuleList()
         width = 0
-        for shape in image_shapes:
-            convolutions = NatureConvolutions(shape)
+        for image in images:
+            convolutions = NatureConvolutions(image)
             layers, stem_width = _layers(convolutions.n_features, shared[:1], layer_norm)
             self.stems.append(nn.Sequential(convolutions, *layers))
             width += stem_width
@@ -90,11 +91,18 @@ class NatureConvolutions(nn.Module):
     https://doi.org/10.1038/nature14236.
     """
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        """Build for images of `shape`: (height, width, channels)."""
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, image: ImageInput) -> None:
+        """Build for images that are taken so."""
         super().__init__()
+        shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
+        # Of the data, not learned, and saved with the rest of what is known of observations.
+        self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
+        self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(
-            nn.Conv2d(shape[2], 32, kernel_size=8, stride=4),
+            nn.Conv2d(image.shape[2], 32, kernel_size=8, stride=4),
             nn.ReLU(),
             nn.Conv2d(32, 64, kernel_size=4, stride=2),
             nn.ReLU(),
@@ -103,11 +111,12 @@ class NatureConvolutions(nn.Module):
             nn.Flatten(),
         )
         with torch.no_grad():
-            self.n_features = self(torch.zeros(1, *shape, dtype=torch.uint8)).shape[1]
+            self.n_features = self(torch.zeros(1, *image.shape, dtype=torch.uint8)).shape[1]
 
     def forward(self, images: Tensor) -> Tensor:
         """Map uint8 images to features."""
-        return cast(Tensor, self.layers(images.permute(0, 3, 1, 2).float() / 255))
+        seen = (images.float() - self.shift) / self.scale
+        return cast(Tensor, self.layers(seen.permute(0, 3, 1, 2)))
 
 
 class DuelingHead(nn.Module):

@@ -9,8 +9,9 @@ which actions are allowed, as in PettingZoo. Since it is part of the observation
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,11 @@ from mcaprl.recorder.spaces import Leaf, observation_leaves
 MIN_IMAGE_EDGE = 36
 """The smallest image, in pixels, that the convolutions leave a pixel of."""
 MASK_KEY = "action_mask"
+_MOST_IMAGES = 10_000
+"""Pictures that a mean is taken over at most, evenly spaced."""
+_IMAGES_AT_ONCE = 256
+_SMALLEST_VARIANCE = 1e-6
+"""Codes squared: less is rounding in pictures that are all alike."""
 
 
 @dataclass(frozen=True)
@@ -85,13 +91,54 @@ class Observations:
         return self.like([part.to(device) for part in self.parts()])
 
 
+@dataclass(frozen=True, eq=False)
+class ImageInput:
+    """How a network takes the pictures of one camera: (codes - shift) / scale.
+
+    Attributes:
+        shape: (height, width, channels).
+        shift: (height, width, channels) float32, codes; None is 0 everywhere.
+        scale: codes.
+    """
+
+    shape: tuple[int, ...]
+    shift: NDArray[np.float32] | None = None
+    scale: float = 255.0
+
+    def stacked(self, count: int) -> ImageInput:
+        """The same for `count` pictures in a row as one, each with its own channels."""
+        height, width, channels = self.shape
+        shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
+        return replace(self, shape=(height, width, channels * count), shift=shift)
+
+    def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
+        """Take the mean picture off, and divide by the root mean square of what is left.
+
+        One scale for the whole picture: what hardly ever changes stays small.
+
+        Args:
+            images: (N, height, width) or (N, height, width, channels), N at least 1.
+        """
+        chosen = np.linspace(0, len(images) - 1, min(len(images), _MOST_IMAGES)).astype(np.int64)
+        total = np.zeros(self.shape)
+        squares = 0.0
+        for rows in np.split(chosen, range(_IMAGES_AT_ONCE, len(chosen), _IMAGES_AT_ONCE)):
+            codes = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
+            total += codes.sum(0)
+            squares += float(np.square(codes).sum())
+        mean = total / len(chosen)
+        variance = squares / (len(chosen) * mean.size) - float(np.square(mean).mean())
+        scale = math.sqrt(variance) if variance > _SMALLEST_VARIANCE else self.scale
+        return replace(self, shift=mean.astype(np.float32), scale=scale)
+
+
 class ObservationEncoder:
     """Turns observations of one space into tensors; saved with each policy.
 
     Attributes:
         space: of one observation.
         width: V, the numbers of its vector.
-        image_shapes: (height, width, channels) of each picture.
+        image_inputs: how networks take each picture.
         images: the leaves that are pictures.
         numbers: the leaves that make the vector, and their spaces.
         mask: the leaf that is the action mask, if there is one.
@@ -116,7 +163,7 @@ class ObservationEncoder:
         self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
         if not kinds:
             raise SpaceError(f"the observation holds nothing but {MASK_KEY}")
-        self.image_shapes = [(*leaf.shape, 1)[:3] for leaf in self.images]
+        self.image_inputs = [ImageInput((*leaf.shape, 1)[:3]) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
         bytes_ = [part.dtype == np.uint8 for _, part in self.numbers]
@@ -124,10 +171,15 @@ class ObservationEncoder:
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
     def normalize_to(self, observations: Any) -> None:
-        """Shift and scale the vector to mean 0 and standard deviation 1 over these observations.
+        """Shift and scale all inputs to mean 0 and standard deviation 1 over these observations.
 
-        What never changes keeps its scale: it only becomes 0.
+        Each number has its own scale, a picture one for all of its pixels. What never changes keeps
+        its scale: it only becomes 0.
         """
+        self.image_inputs = [
+            image.normalized_to(leaf.of(observations))
+            for image, leaf in zip(self.image_inputs, self.images, strict=True)
+        ]
         self.shift, scale = np.zeros_like(self.shift), self.scale
         self.scale = np.ones_like(scale)
         vector = self._vector(observations).astype(np.float64)
@@ -151,10 +203,10 @@ class ObservationEncoder:
             torch.from_numpy(np.require(leaf.of(observations), np.uint8, ["C", "W"]))
             for leaf in self.images
         ]
-        shaped = zip(images, self.image_shapes, strict=True)
+        shaped = zip(images, self.image_inputs, strict=True)
         return Observations(
             torch.from_numpy(np.require(self._vector(observations), np.float32, ["C", "W"])),
-            tuple(image.reshape(-1, *shape) for image, shape in shaped),
+            tuple(image.reshape(-1, *wanted.shape) for image, wanted in shaped),
             self._allowed(observations),
         )
 

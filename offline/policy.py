@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -29,13 +29,15 @@ from mcaprl.offline.buffer import discrete_actions
 from mcaprl.offline.learner import ActsBy, Learner
 from mcaprl.offline.losses import allowed_only, likely_actions, mean_values
 from mcaprl.offline.networks import Architecture, Network
-from mcaprl.offline.observations import ObservationEncoder, Observations
+from mcaprl.offline.observations import ImageInput, ObservationEncoder, Observations
 from mcaprl.recorder.spaces import space_from_json, space_to_json
 from mcaprl.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = 2
 POLICY_NAME = "policy.json"
 _WEIGHTS_NAME = "policy.safetensors"
+_IMAGE_SHIFT = "observation.image_{}.shift"
+_IMAGE_SCALE = "observation.image_{}.scale"
 _BROKEN_FILE_ERRORS = (
     OSError,
     ValueError,
@@ -210,6 +212,10 @@ def save_policy(
     }
     weights["observation.shift"] = torch.from_numpy(buffer.encoder.shift)
     weights["observation.scale"] = torch.from_numpy(buffer.encoder.scale)
+    for number, image in enumerate(buffer.encoder.image_inputs):
+        if image.shift is not None:
+            weights[_IMAGE_SHIFT.format(number)] = torch.from_numpy(image.shift)
+            weights[_IMAGE_SCALE.format(number)] = torch.tensor(image.scale)
     write_tensors(folder / _WEIGHTS_NAME, weights, {"updates": learner.step})
     description = {
         "format_version": FORMAT_VERSION,
@@ -285,7 +291,10 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]
     architecture = Architecture(**{**shape, "hidden": tuple(shape["hidden"])})
-    images = [(height, width, count * stack) for height, width, count in encoder.image_shapes]
+    encoder.image_inputs = [
+        _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
+    ]
+    images = [image.stacked(stack) for image in encoder.image_inputs]
     networks = {
         name: Network(encoder.width * stack, images, tuple(outputs), architecture)
         for name, outputs in description["outputs"].items()
@@ -303,6 +312,16 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         encoder=encoder,
         scores=scores.eval(),
     )
+
+
+def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
+    """How a policy takes a picture; moves what is written of it out of the weights."""
+    if _IMAGE_SHIFT.format(number) not in weights:
+        return image
+    shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()
+    if shift.shape != image.shape:
+        raise ValueError(f"the mean picture is {shift.shape}, pictures are {image.shape}")
+    return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
 
 
 def _flatten(observations: Any) -> Any:

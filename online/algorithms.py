@@ -14,6 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import SpaceError, UnknownNameError
+from mcaprl.online.centering import center_images
 from mcaprl.online.config import (
     A2CConfig,
     DoubleDQNConfig,
@@ -96,6 +97,8 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     if _has_images(env.observation_space):
         # A quarter less work for the same convolutions; files and results are the same.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
+        if config.center_images:
+            center_images(cast(Any, model.policy))
     if isinstance(config, DQNConfig) and config.exploration_decay:
         cast(DQN, model).exploration_schedule = ExponentialSchedule(
             config.exploration_initial_eps,

@@ -31,6 +31,8 @@ class OnlineConfig(Settings):
     """widths of the hidden layers; for images, of those behind the convolutions"""
     frame_stack: int = 1
     """how many successive observations the network sees at once"""
+    center_images: bool = False
+    """pictures reach the first convolution as -2 to 2, not as 0 to 1"""
     max_grad_norm: float = 10.0
     """longer gradients are scaled down to this length"""
     eval_interval: int = 5_000

@@ -14,6 +14,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from mcaprl.errors import PolicyError, SpaceError, UsageError
+from mcaprl.online.centering import take_plain_weights
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.frames import joined, parts_of, parts_of_space, stacked_space, whole_of
 from mcaprl.online.policy import channels_first
@@ -102,6 +103,7 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
         )
     for source, target in zip(given, taken, strict=True):
         target.load_state_dict(source.state_dict())
+    take_plain_weights(model.q_net)
     model.q_net_target.load_state_dict(model.q_net.state_dict())
     with torch.inference_mode():
         shown = model.policy.obs_to_tensor(joined(stacks, space))[0]

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from mcaprl.errors import PolicyError
 from mcaprl.files import write_atomically
+from mcaprl.online.centering import plain_weights
 
 OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
@@ -44,7 +45,8 @@ def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -
         description: JSON; what `read_model` is to find again.
     """
     content = io.BytesIO()
-    model.save(content, exclude=_LEFT_OUT)
+    with plain_weights(model.policy):
+        model.save(content, exclude=_LEFT_OUT)
     with zipfile.ZipFile(content, "a") as archive:
         archive.writestr(OWN_NAME, json.dumps(description, indent=2))
     write_atomically(path, content.getvalue())

@@ -146,7 +146,7 @@ def test_stacked_pictures_are_channels() -> None:
     )
     buffer = TransitionBuffer.from_dataset(dataset, Packing(frame_stack=2))
     batch = whole(buffer)
-    assert buffer.image_shapes == [(36, 36, 2)]
+    assert [image.shape for image in buffer.image_inputs] == [(36, 36, 2)]
     assert len(buffer.frames) == 4
     assert batch.observations.images[0].dtype == torch.uint8
     assert batch.observations.images[0][:, 0, 0].tolist() == [[0, 0], [0, 1], [1, 2]]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mcaprl.offline.models import AnyModel, Model, StackedMLP, build_model
 from mcaprl.offline.networks import Architecture, Network
-from mcaprl.offline.observations import Observations
+from mcaprl.offline.observations import ImageInput, Observations
 
 
 def vectors(rows: int, width: int, seed: int = 0) -> Observations:
@@ -41,19 +41,21 @@ def test_without_hidden_layers_the_network_is_linear() -> None:
 
 
 def test_the_nature_network_has_its_published_size() -> None:
-    network = Network(0, [(84, 84, 4)], (18,), Architecture((512,)))
+    network = Network(0, [ImageInput((84, 84, 4))], (18,), Architecture((512,)))
     convolutions = [(32, 4, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3)]
     assert weights_of(network) == [*convolutions, (512, 3136), (18, 512)]
 
 
 @pytest.mark.parametrize("shape", [(84, 84, 1), (36, 48, 3)])
 def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
-    network = Network(0, [shape], (4,), Architecture((16,)))
+    network = Network(0, [ImageInput(shape)], (4,), Architecture((16,)))
     assert network(pictures(2, shape)).shape == (2, 4)
 
 
 def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
-    network = Network(3, [(36, 36, 1), (40, 36, 2)], (4,), Architecture((8, 6)))
+    network = Network(
+        3, [ImageInput((36, 36, 1)), ImageInput((40, 36, 2))], (4,), Architecture((8, 6))
+    )
     assert weights_of(network.body) == [(6, 24)]
     both = pictures(2, (36, 36, 1), (40, 36, 2), width=3)
     assert network(both).shape == (2, 4)
@@ -65,7 +67,7 @@ def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
 
 def test_channels_are_kept_apart_from_rows() -> None:
     # Equal channels must give the same in any order of the weights.
-    network = Network(0, [(36, 36, 2)], (3,), Architecture((16,)))
+    network = Network(0, [ImageInput((36, 36, 2))], (3,), Architecture((16,)))
     image = torch.randint(0, 256, (1, 36, 36, 1), dtype=torch.uint8)
     twice = Observations(torch.empty(1, 0), (torch.cat([image, image], dim=3),))
     first = next(network.parameters())
@@ -178,7 +180,7 @@ def test_a_clone_has_weights_of_its_own() -> None:
         (Network(5, [], (4,), Architecture((8,), layer_norm=True)), AnyModel),
         (Network(5, [], (4,), Architecture((8,), dueling=True)), AnyModel),
         (Network(5, [], (1,), Architecture((8,))), AnyModel),
-        (Network(0, [(36, 36, 1)], (4,), Architecture((8,))), AnyModel),
+        (Network(0, [ImageInput((36, 36, 1))], (4,), Architecture((8,))), AnyModel),
     ],
 )
 def test_plain_networks_are_stacked(network: Network, kind: type[Model]) -> None:

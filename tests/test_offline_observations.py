@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.errors import SpaceError
-from mcaprl.offline.observations import ObservationEncoder, Observations
+from mcaprl.offline.observations import ImageInput, ObservationEncoder, Observations
 
 IMAGE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
 CAR = spaces.Dict(
@@ -67,7 +68,7 @@ def test_a_dict_becomes_a_vector_and_pictures() -> None:
     observations = batch(CAR, 4)
     seen = encoder.encode(observations)
     assert encoder.width == 5
-    assert encoder.image_shapes == [(36, 40, 1)]
+    assert [image.shape for image in encoder.image_inputs] == [(36, 40, 1)]
     # In the order of the space's keys: camera, gear (one-hot), speed.
     assert seen.vector[:, :3].argmax(1).tolist() == (observations["gear"] + 1).tolist()
     np.testing.assert_array_equal(
@@ -113,11 +114,38 @@ def test_a_constant_column_becomes_zero_and_a_new_value_is_no_catastrophe(consta
     assert encoder.encode(values + 1).vector.abs().max() == 1
 
 
-def test_pictures_are_not_normalised() -> None:
+def test_a_picture_loses_its_mean_and_keeps_one_scale() -> None:
     encoder = ObservationEncoder(CAR, 2)
-    observations = batch(CAR, 20)
+    pictures = np.zeros((4, 36, 40, 1), np.uint8)
+    pictures[:, 0, 0, 0] = [10, 10, 30, 30]
+    pictures[:, 1, 1] = 255
+    observations = {**batch(CAR, 4), "camera": pictures}
     encoder.normalize_to(observations)
-    assert encoder.encode(observations).images[0].dtype == torch.uint8
+    (image,) = encoder.image_inputs
+    assert image.shift is not None
+    assert image.shift[0, 0, 0] == 20
+    assert image.shift[1, 1, 0] == 255, "what never changes becomes 0, however bright"
+    assert np.count_nonzero(image.shift) == 2
+    # One pixel of 1,440 differs from its mean, by 10 each time: sqrt(100 / 1440).
+    assert image.scale == pytest.approx(math.sqrt(100 / 1440))
+    assert encoder.encode(observations).images[0].dtype == torch.uint8, "frames stay small"
+
+
+def test_pictures_that_are_all_alike_keep_their_scale() -> None:
+    alike = np.full((300, 36, 36, 3), 77, np.uint8)
+    image = ImageInput((36, 36, 3)).normalized_to(alike)
+    assert image.scale == 255
+    assert image.shift is not None
+    assert (image.shift == 77).all()
+
+
+def test_a_stack_of_pictures_is_shifted_frame_by_frame() -> None:
+    shift = np.arange(36 * 36 * 2, dtype=np.float32).reshape(36, 36, 2)
+    stacked = ImageInput((36, 36, 2), shift, 7.0).stacked(3)
+    assert (stacked.shape, stacked.scale) == ((36, 36, 6), 7)
+    assert stacked.shift is not None
+    for frame in range(3):
+        np.testing.assert_array_equal(stacked.shift[:, :, 2 * frame : 2 * frame + 2], shift)
 
 
 def test_a_mask_is_no_input() -> None:

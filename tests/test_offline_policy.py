@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from mcaprl.offline.cql import CQL, CQLConfig
 from mcaprl.offline.dqn import DQNConfig
 from mcaprl.offline.iql import IQL
 from mcaprl.offline.learner import Learner
+from mcaprl.offline.networks import NatureConvolutions
 from mcaprl.offline.observations import Observations
 from mcaprl.offline.policy import Policy, load_policies, load_policy, save_policy
 from mcaprl.offline.train import train
@@ -141,6 +142,32 @@ def test_every_kind_of_network_comes_back(tmp_path: Path, config: TrainingConfig
         outputs = learner.network("q", 0)(learner.buffer.encoder.encode(inner_observations()))
     expected = outputs.mean(2) if outputs.ndim == 3 else outputs
     np.testing.assert_allclose(policy.q_values(inner_observations()), expected, rtol=1e-6)
+
+
+def test_normalised_pictures_come_back(tmp_path: Path) -> None:
+    pictures = np.random.default_rng(0).integers(90, 110, (9, 36, 36, 1), dtype=np.uint8)
+    dataset = Dataset.from_arrays(
+        observations=pictures[:-1],
+        actions=np.arange(8) % 2,
+        rewards=np.ones(8),
+        terminated=np.arange(8) == 7,
+        truncated=np.zeros(8, bool),
+        next_observations=pictures[1:],
+    )
+    learner = learner_of(DQNConfig(**TINY, frame_stack=2, normalize=True), dataset)
+    policy = saved_and_loaded(tmp_path, learner)
+    stacks = np.stack([pictures[:-1], pictures[1:]], 1)
+    codes = stacks[..., 0].transpose(0, 2, 3, 1).astype(np.float32)
+    mean = pictures.astype(np.float64).mean(0)
+    centred = (codes - mean) / np.sqrt(np.square(pictures - mean).mean())
+    network = learner.network("q", 0)
+    convolutions, *layers = cast(torch.nn.Sequential, network.stems[0])
+    with torch.no_grad():
+        seen = cast(NatureConvolutions, convolutions).layers(
+            torch.from_numpy(centred).permute(0, 3, 1, 2).float()
+        )
+        expected = network.head(network.body(torch.nn.Sequential(*layers)(seen)))
+    np.testing.assert_allclose(policy.q_values(stacks), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_an_action_that_is_not_allowed_is_not_taken(tmp_path: Path) -> None:

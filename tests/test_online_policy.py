@@ -23,6 +23,7 @@ from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 
 from mcaprl.errors import PolicyError
+from mcaprl.online.centering import center_images
 from mcaprl.online.policy import (
     BEST_NAME,
     describe_run,
@@ -119,6 +120,27 @@ def test_dicts_are_understood(tmp_path: Path) -> None:
     model.save(tmp_path / "sb3.zip")
     with pytest.raises(PolicyError, match="observation space is no Box"):
         load_policy(tmp_path / "sb3.zip")
+
+
+@pytest.mark.parametrize("multi", [False, True])
+def test_centered_pictures_are_saved_as_plain_weights(tmp_path: Path, multi: bool) -> None:
+    image = FakeImageEnv(screen_height=36, screen_width=40, n_channels=1, channel_first=False)
+    env = SimpleMultiObsEnv(random_start=False) if multi else image
+    model = DQN("MultiInputPolicy" if multi else "CnnPolicy", env, buffer_size=10, **small())
+    center_images(model.policy)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    path = ours(tmp_path / "ours.zip", model, env)
+    after = model.policy.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    observations = observations_of(env.observation_space)
+    with torch.no_grad():
+        expected = model.q_net(model.policy.obs_to_tensor(observations)[0])
+        plain = DQN.load(path)
+        found = plain.q_net(plain.policy.obs_to_tensor(observations)[0])
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        load_policy(path).q_values(observations), expected, rtol=1e-4, atol=1e-5
+    )
 
 
 def test_networks_of_other_shapes_are_built_as_their_file_says(tmp_path: Path) -> None:

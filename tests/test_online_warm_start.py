@@ -204,6 +204,24 @@ def test_an_agent_goes_on_from_an_online_policy(tmp_path: Path) -> None:
     assert second.steps == 8
 
 
+def test_weights_of_plain_pictures_are_turned_for_centered_ones(tmp_path: Path) -> None:
+    short = {**SHORT, "envs": 1, "learning_starts": 40}
+    options = {"observation": "depth"}
+    (summary,) = train(Task.for_sim("lane", None, options, **short), tmp_path / "plain")
+    policy = load_policy(summary.folder / "best_model.zip")
+    task = Task.for_sim("lane", None, options, **short, center_images=True)
+    with closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
+        begun.start_from(None, policy)
+        model: Any = begun.model
+        seen = np.random.default_rng(0).integers(0, 256, (5, 84, 84, 1), dtype=np.uint8)
+        with torch.inference_mode():
+            values = model.q_net(model.policy.obs_to_tensor(seen)[0]).numpy()
+            first = model.q_net.features_extractor.cnn[0]
+            centered = first(torch.full((1, 1, 84, 84), 0.5))[0, :, 0, 0]
+        np.testing.assert_allclose(values, policy.q_values(seen), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(centered, first.bias)
+
+
 def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> None:
     config = CQLConfig(updates=10, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
