@@ -11,15 +11,14 @@ done
 export OMP_NUM_THREADS=1
 
 number=1
-for mix in "0.05 25" "0.1 25" "0.2 50" "0.3 50"; do
+for mix in "0.05 25" "0.1 50" "0.2 200" "0.3 200"; do
   mcaprl record lane --observation depth --no-scene --policy pilot \
     --epsilon "${mix% *}" --episodes "${mix#* }" --seed "$number" --out "$out/data/pilot-$number.mcap"
   number=$((number + 1))
 done
-mcaprl record lane --observation depth --no-scene --policy random \
-  --episodes 50 --seed "$number" --out "$out/data/random.mcap"
 
-# A single picture does not tell the speed; four in a row do.
-mcaprl train-offline "$out/data" --algo cql --seeds 4 --frame-stack 4 --hidden 256 \
-  --batch-size 32 --learning-rate 3e-4 --updates 4000 --out "$out/runs/cql"
+# A single picture does not tell the speed; four in a row do. What pictures have in common says
+# nothing, so it is taken off; half of the channels are learned in less than half the time.
+mcaprl train-offline "$out/data" --algo cql --seeds 4 --frame-stack 4 --normalize --hidden 256 \
+  --channels 16,32,32 --batch-size 32 --target-interval 100 --updates 12000 --out "$out/runs/cql"
 mcaprl evaluate "$out/runs/cql" pilot random --sim lane --observation depth --behavior "$out/data"

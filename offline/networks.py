@@ -23,12 +23,14 @@ class Architecture:
 
     Attributes:
         hidden: widths of the fully connected hidden layers; the first is one for each input.
+        channels: of the three convolutions over each picture.
         layer_norm: normalise before each ReLU of these layers (https://arxiv.org/abs/1607.06450).
         dueling: outputs are a value plus advantages of mean 0, each with a last hidden layer of
             its own (https://arxiv.org/abs/1511.06581).
     """
 
     hidden: tuple[int, ...]
+    channels: tuple[int, ...] = (32, 64, 64)
     layer_norm: bool = False
     dueling: bool = False
 
@@ -59,7 +61,7 @@ class Network(nn.Module):
         self.stems = nn.ModuleList()
         width = 0
         for image in images:
-            convolutions = NatureConvolutions(image)
+            convolutions = NatureConvolutions(image, architecture.channels)
             layers, stem_width = _layers(convolutions.n_features, shared[:1], layer_norm)
             self.stems.append(nn.Sequential(convolutions, *layers))
             width += stem_width
@@ -94,19 +96,20 @@ class NatureConvolutions(nn.Module):
     shift: Tensor
     scale: Tensor
 
-    def __init__(self, image: ImageInput) -> None:
-        """Build for images that are taken so."""
+    def __init__(self, image: ImageInput, channels: tuple[int, ...]) -> None:
+        """Build for images that are taken so, with so many channels behind each convolution."""
         super().__init__()
+        first, second, third = channels
         shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
         # Of the data, not learned, and saved with the rest of what is known of observations.
         self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(
-            nn.Conv2d(image.shape[2], 32, kernel_size=8, stride=4),
+            nn.Conv2d(image.shape[2], first, kernel_size=8, stride=4),
             nn.ReLU(),
-            nn.Conv2d(32, 64, kernel_size=4, stride=2),
+            nn.Conv2d(first, second, kernel_size=4, stride=2),
             nn.ReLU(),
-            nn.Conv2d(64, 64, kernel_size=3, stride=1),
+            nn.Conv2d(second, third, kernel_size=3, stride=1),
             nn.ReLU(),
             nn.Flatten(),
         )

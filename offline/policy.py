@@ -290,7 +290,8 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]
-    architecture = Architecture(**{**shape, "hidden": tuple(shape["hidden"])})
+    lists = {key: tuple(value) for key, value in shape.items() if isinstance(value, list)}
+    architecture = Architecture(**{**shape, **lists})
     encoder.image_inputs = [
         _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
     ]

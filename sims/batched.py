@@ -124,13 +124,13 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 autoreset is disabled, was not reset.
             ResetNeeded: there was no `reset`.
         """
-        numbers = check_actions(actions, self.num_envs, len(self.action_meanings))
+        self.fleet.actions[:] = check_actions(actions, self.num_envs, len(self.action_meanings))
         fresh = self._check_can_step()
         fleet = self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
-        fleet.advance(numbers)
+        fleet.advance()
         self._steps += 1
         # These were at their end already: their step is a reset.
         self._begin_all(np.flatnonzero(fresh))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, TypeVar, cast
 
 import numba
@@ -37,6 +38,20 @@ def inlined(function: AnyFunction) -> AnyFunction:
     functions only.
     """
     return _compiled(function, forceinline=True)
+
+
+def ready(function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
+    """Bind a compiled function to arguments that stay the same objects: arrays, and constants.
+
+    A call by name looks at the type of each argument first, which for a single vehicle takes as
+    long as the step itself. Here that is done once; the arrays' contents may change, and nothing
+    else of them.
+    """
+    if not isinstance(function, numba.core.dispatcher.Dispatcher):
+        return partial(function, *arguments)
+    kinds = tuple(numba.typeof(argument) for argument in arguments)
+    function.compile(kinds)
+    return partial(function.get_overload(kinds), *arguments)
 
 
 def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:

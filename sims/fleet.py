@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+
+from mcaprl.sims.compiled import ready
 
 GOING_ON = 0
 """In `Fleet.ends`: the episode is not over."""
@@ -23,6 +26,7 @@ class Fleet(ABC):
         observation_names: of the numbers in a vector that is observed; none for pictures.
         action_meanings: what each action does.
         step_duration_s: simulated time of one step.
+        actions: (N,) what each is to do in the next step; valid ones.
         rewards: (N,) of the last step; 0 at a start.
         ends: (N,) how the last step ended the episodes: `GOING_ON` or an index of `reasons`.
         noise: (N, K) standard normal numbers for the next step, which the environment draws before
@@ -49,6 +53,7 @@ class Fleet(ABC):
         self.observation_names = observation_names
         self.action_meanings = action_meanings
         self.step_duration_s = step_duration_s
+        self.actions = np.zeros(count, dtype=np.int64)
         self.rewards = np.zeros(count)
         self.ends = np.zeros(count, dtype=np.int64)
         self.noise = np.zeros((count, noise_size))
@@ -77,12 +82,26 @@ class Fleet(ABC):
             self.begin(i, randoms[i], None)
 
     @abstractmethod
-    def advance(self, actions: NDArray[np.int64]) -> None:
-        """Take one step with each vehicle.
+    def advance(self) -> None:
+        """Take one step with each vehicle, by its number in `actions`."""
 
-        Args:
-            actions: (N,) valid ones.
-        """
+    @abstractmethod
+    def _kernel(self) -> tuple[Any, ...]:
+        """Give the compiled function of a step, and its arguments, which are never replaced."""
+
+    @cached_property
+    def _step(self) -> Callable[[], None]:
+        """What `_kernel` gives, as machine code; compiled when it is first needed."""
+        return ready(*self._kernel())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies: all but what looks into this fleet's own arrays, and is made when needed."""
+        kind = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(kind, name, None), cached_property)
+        }
 
     def imitate(self, i: int, other: Fleet, j: int) -> None:
         """Make vehicle i the same as vehicle j of another fleet of this kind.

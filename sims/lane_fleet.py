@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -83,8 +84,6 @@ class LaneFleet(Fleet):
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         self._has_pictures, self._has_rays = observation == "depth", observation == "rays"
         self._seen = self._rays if self._has_rays else self._states
-        # Views of each row, made once: a single environment reads one of each in every step.
-        self._car_rows, self._seen_rows = list(self._cars), list(self._seen)
         self._encode = encode_nearness if self._classic else encode_depth
         self._camera: DepthCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
@@ -123,15 +122,27 @@ class LaneFleet(Fleet):
             for i in chosen.tolist():
                 self._depth_m.pop(i, None)
 
-    def advance(self, actions: NDArray[np.int64]) -> None:
+    def advance(self) -> None:
         """Drive on for a decision."""
-        if self._classic:
-            step_classic(self._cars, actions, self.rewards, self.ends, self._states, self._by_code)
-        else:
-            step_cars(self._cars, actions, self.rewards, self.ends, self._states)
+        self._step()
         if self._has_rays:
             observe_all_rays(self._cars, self._rays)
-        self._depth_m.clear()
+        if self._depth_m:
+            self._depth_m.clear()
+
+    def _kernel(self) -> tuple[Any, ...]:
+        arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
+        return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
+
+    # Views of each row, made once: a single environment reads one of each in every step.
+
+    @cached_property
+    def _car_rows(self) -> list[NDArray[np.float64]]:
+        return list(self._cars)
+
+    @cached_property
+    def _seen_rows(self) -> list[NDArray[np.float32]]:
+        return list(self._seen)
 
     def observation(self, i: int) -> NDArray[Any]:
         """Give the numbers or the picture that car i sees."""

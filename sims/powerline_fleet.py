@@ -89,7 +89,7 @@ class PowerlineFleet(Fleet):
         )
         self._plant = PLANTS.index(plant or ("point" if classic else "quad"))
         self._on_line = start == "line"
-        self._wind_m_s, self._gust_m_s = wind_m_s, gust_m_s
+        self._wind_m_s, self._gust_m_s = wind_m_s, float(gust_m_s)
         self._shows_state = observation == "state"
         self._camera_view = camera
         self._camera: DroneCamera | None = None
@@ -124,18 +124,18 @@ class PowerlineFleet(Fleet):
         take_bearings(self._flights[i : i + 1], self._bearings[i : i + 1])
         self._depth_m.pop(i, None)
 
-    def advance(self, actions: NDArray[np.int64]) -> None:
+    def advance(self) -> None:
         """Fly on for a decision."""
-        flights, seen = self._flights, self._seen
-        if self.classic:
-            step_classic(self._plant, flights, actions, self.rewards, self.ends, seen)
-        else:
-            noise, gust_m_s = self.noise, self._gust_m_s
-            step_flights(
-                self._plant, flights, actions, gust_m_s, noise, self.rewards, self.ends, seen
-            )
-        take_bearings(flights, self._bearings)
+        self._step()
+        take_bearings(self._flights, self._bearings)
         self._depth_m.clear()
+
+    def _kernel(self) -> tuple[Any, ...]:
+        before = (self._plant, self._flights, self.actions)
+        after = (self.rewards, self.ends, self._seen)
+        if self.classic:
+            return step_classic, *before, *after
+        return step_flights, *before, self._gust_m_s, self.noise, *after
 
     def observation(self, i: int) -> Any:
         """Give the numbers or the picture that drone i sees."""

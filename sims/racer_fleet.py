@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -59,12 +60,12 @@ class RacerFleet(Fleet):
         check_name("drift", drift, (False, True))
         self.classic = rules == "classic"
         self.track = _track_of(track_seed)
-        self.actions = np.array(ACTION_SETS[actions], dtype=np.int64)
+        self.action_set = np.array(ACTION_SETS[actions], dtype=np.int64)
         super().__init__(
             count,
             spaces.Box(-1.0, 1.0, (len(OBSERVATION_NAMES),), np.float32),
             OBSERVATION_NAMES,
-            tuple(ACTION_MEANINGS[action] for action in self.actions),
+            tuple(ACTION_MEANINGS[action] for action in self.action_set),
             STEP_S,
         )
         self.last_actions = np.zeros(count, dtype=np.int64)
@@ -73,8 +74,6 @@ class RacerFleet(Fleet):
         self._cars = np.zeros((count, len(Racer._fields)))
         self._started_at_m = np.zeros(count)
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
-        # Views of each row, made once: a single environment reads one of each in every step.
-        self._car_rows, self._seen_rows = list(self._cars), list(self._seen)
 
     def car(self, i: int) -> Racer:
         """Give the whole state of a car."""
@@ -95,10 +94,14 @@ class RacerFleet(Fleet):
         self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
         observe(self.track, car, self.classic, self._seen[i])
 
-    def advance(self, actions: NDArray[np.int64]) -> None:
+    def advance(self) -> None:
         """Drive on for one step."""
-        self.last_actions = self.actions[actions]
-        step_racers(
+        self.action_set.take(self.actions, out=self.last_actions, mode="clip")
+        self._step()
+
+    def _kernel(self) -> tuple[Any, ...]:
+        return (
+            step_racers,
             self.track,
             self._cars,
             self.last_actions,
@@ -108,6 +111,16 @@ class RacerFleet(Fleet):
             self.classic,
             self._drift,
         )
+
+    # Views of each row, made once: a single environment reads one of each in every step.
+
+    @cached_property
+    def _car_rows(self) -> list[NDArray[np.float64]]:
+        return list(self._cars)
+
+    @cached_property
+    def _seen_rows(self) -> list[NDArray[np.float32]]:
+        return list(self._seen)
 
     def observation(self, i: int) -> NDArray[np.float32]:
         """Give the numbers that car i sees."""

@@ -71,5 +71,5 @@ class RacerPilot:
         if len(observations) != 1:
             raise ValueError(f"one pilot drives one environment, not {len(observations)}")
         fleet = self._sim.fleet
-        chosen = choose(fleet.track, self._sim.car, fleet.actions, fleet.classic)
-        return np.flatnonzero(fleet.actions == chosen)
+        chosen = choose(fleet.track, self._sim.car, fleet.action_set, fleet.classic)
+        return np.flatnonzero(fleet.action_set == chosen)

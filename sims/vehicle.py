@@ -51,7 +51,7 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        self._actions = np.zeros(1, dtype=np.int64)
+        self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
         self._view: AnyView | None = None
@@ -78,10 +78,10 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
             UsageError: there is no such action.
         """
         fleet = self.fleet
-        self._actions[0] = check_action(action, len(fleet.action_meanings))
+        fleet.actions[0] = check_action(action, self._n_actions)
         if self._noise_size:
             fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
-        fleet.advance(self._actions)
+        fleet.advance()
         end, info = fleet.ends.item(), fleet.info(0)
         if self._is_watched:
             self._watch()

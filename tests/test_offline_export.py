@@ -43,7 +43,7 @@ CASES = [
     (DQNConfig(**TINY, n_quantiles=3, dueling=True), VECTOR),
     (BCQConfig(**TINY), VECTOR),
     (BCConfig(**TINY, frame_stack=2), PICTURE),
-    (BCConfig(**TINY, frame_stack=2, normalize=True), PICTURE),
+    (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), PICTURE),
     (DQNConfig(**TINY), MIXED),
 ]
 

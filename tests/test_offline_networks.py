@@ -46,6 +46,13 @@ def test_the_nature_network_has_its_published_size() -> None:
     assert weights_of(network) == [*convolutions, (512, 3136), (18, 512)]
 
 
+def test_channels_are_as_many_as_asked_for() -> None:
+    architecture = Architecture((256,), channels=(16, 32, 24))
+    network = Network(0, [ImageInput((84, 84, 1))], (6,), architecture)
+    convolutions = [(16, 1, 8, 8), (32, 16, 4, 4), (24, 32, 3, 3)]
+    assert weights_of(network) == [*convolutions, (256, 24 * 49), (6, 256)]
+
+
 @pytest.mark.parametrize("shape", [(84, 84, 1), (36, 48, 3)])
 def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
     network = Network(0, [ImageInput(shape)], (4,), Architecture((16,)))

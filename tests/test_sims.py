@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -95,6 +98,21 @@ def test_seed_and_actions_decide_every_bit(
     actions = actions_of(first, chosen)
     assert trace(first, seed, actions) == trace(second, seed, actions)
     assert trace(first, seed, actions) == trace(second, seed, actions), "an episode later"
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("name", BATCHED)
+def test_a_copy_goes_on_by_itself(name: str, copied: Callable[[Any], Any]) -> None:
+    first = bare(name, {})
+    first.reset(seed=1)
+    for action in (1, 2, 1):
+        first.step(action)
+    second = copied(first)
+    ahead = [second.step(action) for action in (1, 1, 1)]
+    after = [first.step(action) for action in (1, 1, 1)]
+    for one, other in zip(ahead, after, strict=True):
+        assert as_bytes(one[0]) == as_bytes(other[0])
+        assert one[1:] == other[1:]
 
 
 @every_sim
