@@ -75,6 +75,18 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
     return numbers.astype(np.int64)
 
 
+def check_one(observations: Any) -> None:
+    """Refuse a pilot's observations, which may be a dict of arrays, unless there is just one.
+
+    Raises:
+        ValueError: there are more.
+    """
+    rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
+    count = len(rows)
+    if count != 1:
+        raise ValueError(f"one pilot has one environment, not {count}")
+
+
 def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:
     """Read the one option of `reset`, `pose`.
 

@@ -68,7 +68,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self._take_spaces(self.fleet)
         self._truncates = np.array(self.fleet.truncates)
-        self._reasons = np.array(self.fleet.reasons, dtype=object)
+        # Whoever goes on has none.
+        self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
@@ -190,9 +191,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             infos[key] = values if are_all else np.where(chosen, values, 0)
             infos[f"_{key}"] = chosen.copy()
         if ended_itself.any():
-            reasons = np.full(self.num_envs, None, dtype=object)
-            reasons[ended_itself] = self._reasons[self.fleet.ends[ended_itself]]
-            infos["reason"], infos["_reason"] = reasons, ended_itself.copy()
+            infos["reason"] = self._reasons[self.fleet.ends]
+            infos["_reason"] = ended_itself.copy()
         return infos
 
 

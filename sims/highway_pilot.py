@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.arguments import check_one
 from mcaprl.sims.highway_course import Course
 from mcaprl.sims.highway_lane import STEERING_RAD, HighwayLaneEnv
 
@@ -37,8 +38,7 @@ class HighwayPilot:
         Raises:
             ValueError: there are observations of more than one environment.
         """
-        if len(observations) != 1:
-            raise ValueError(f"one pilot drives one environment, not {len(observations)}")
+        check_one(observations)
         car, course = self._sim.car, self._free_course()
         along_m = course.nearest(car.x_m, car.y_m).along_m
         forward_m, left_m = car.sees(course.point(along_m + PURSUIT_M))

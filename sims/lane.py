@@ -66,6 +66,10 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
     `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth in the log code of
     `mcaprl.sims.depth.encode_depth`; 255 where there is nothing.
 
+    `observation="dashboard"`: a `Dict` of `depth`, the same picture, and `motion`, 3 float32: rows
+    2 and 3 of the table, and which way the course turns at the next corner, 1 left or -1 right. One
+    picture alone tells neither the speed nor, where a street ends, where to go.
+
     `observation="rays"`: `Box` of 20 float32.
 
     | Index | Observation | Unit | Limit |
@@ -129,7 +133,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
     ## Arguments
 
     - `rules`: `"default"`, `"classic"` or `"classic-code"`.
-    - `observation`: `"state"`, `"depth"` or `"rays"`.
+    - `observation`: `"state"`, `"depth"`, `"dashboard"` or `"rays"`.
     - `start`: `"anywhere"` or `"line"`; None is `"anywhere"`, in the classic rules `"line"`.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 

@@ -30,6 +30,8 @@ CORNERS_M = (
     (0.0, 1.0),
 )
 COURSE = closed_path(CORNERS_M)
+NEXT_TURN: NDArray[np.float64] = np.sign(np.sin(np.roll(COURSE.yaw_rad, -1) - COURSE.yaw_rad))
+"""(N,) which way the course turns at the end of each leg: 1 left, -1 right."""
 
 LANE_HALF_WIDTH_M = 3.5
 RAIL_OFFSET_M = 4.0

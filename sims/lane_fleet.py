@@ -22,7 +22,7 @@ from mcaprl.sims.lane_classic import (
     CLASSIC_DECISION_S,
     step_classic,
 )
-from mcaprl.sims.lane_course import CAMERA_FORWARD_M, CAMERA_HEIGHT_M
+from mcaprl.sims.lane_course import CAMERA_FORWARD_M, CAMERA_HEIGHT_M, COURSE, NEXT_TURN
 from mcaprl.sims.lane_rays import (
     RAY_OBSERVATION_LIMIT,
     RAY_OBSERVATION_NAMES,
@@ -42,9 +42,11 @@ from mcaprl.sims.lane_start import car_from, start_car, start_cars
 
 RULES = ("default", "classic", "classic-code")
 STARTS = ("anywhere", "line")
-OBSERVATIONS = ("state", "depth", "rays")
+OBSERVATIONS = ("state", "depth", "dashboard", "rays")
 ALONG = Car._fields.index("along_m")
-_NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES, "depth": ()}
+_NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
+MOTION = slice(2, 4)
+"""Speed and steering in a state."""
 
 
 class LaneFleet(Fleet):
@@ -73,7 +75,7 @@ class LaneFleet(Fleet):
         super().__init__(
             count,
             _space(observation),
-            _NAMES[observation],
+            _NAMES.get(observation, ()),
             ACTION_MEANINGS,
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
@@ -82,7 +84,8 @@ class LaneFleet(Fleet):
         self._draws = Draws(count, 4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
-        self._has_pictures, self._has_rays = observation == "depth", observation == "rays"
+        self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
+        self._has_pictures = observation == "depth" or self._has_dashboard
         self._seen = self._rays if self._has_rays else self._states
         self._encode = encode_nearness if self._classic else encode_depth
         self._camera: DepthCamera | None = None
@@ -144,17 +147,27 @@ class LaneFleet(Fleet):
     def _seen_rows(self) -> list[NDArray[np.float32]]:
         return list(self._seen)
 
-    def observation(self, i: int) -> NDArray[Any]:
+    def observation(self, i: int) -> Any:
         """Give the numbers or the picture that car i sees."""
-        if self._has_pictures:
-            return self._encode(self.depth_image_m(i))[:, :, np.newaxis]
-        return self._seen_rows[i].copy()
+        if not self._has_pictures:
+            return self._seen_rows[i].copy()
+        depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]
+        return {"depth": depth, "motion": self._motions()[i]} if self._has_dashboard else depth
 
-    def observations(self) -> NDArray[Any]:
+    def observations(self) -> Any:
         """Give what all cars see."""
-        if self._has_pictures:
-            return np.stack([self.observation(i) for i in range(self.count)])
-        return self._seen.copy()
+        if not self._has_pictures:
+            return self._seen.copy()
+        images_m = np.stack([self.depth_image_m(i) for i in range(self.count)])
+        depth = self._encode(images_m)[..., np.newaxis]
+        return {"depth": depth, "motion": self._motions()} if self._has_dashboard else depth
+
+    def _motions(self) -> NDArray[np.float32]:
+        """Give (N, 3) speed, last steering and next turn of all cars."""
+        along_m = self._cars[:, ALONG] % COURSE.length_m
+        legs = np.searchsorted(COURSE.along_m, along_m, side="right") - 1
+        turns = NEXT_TURN[np.minimum(legs, len(NEXT_TURN) - 1)]
+        return np.column_stack([self._states[:, MOTION], turns]).astype(np.float32)
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
         """Give car i's (84, 84) distances along each ray, metres; inf is nothing."""
@@ -192,9 +205,13 @@ def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
     }
 
 
-def _space(observation: str) -> spaces.Box:
+def _space(observation: str) -> spaces.Space[Any]:
+    depth = spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
     if observation == "depth":
-        return spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
+        return depth
+    if observation == "dashboard":
+        ends = np.array([[0, -1, -1], [1, 1, 1]], dtype=np.float32)
+        return spaces.Dict({"depth": depth, "motion": spaces.Box(*ends)})
     if observation == "state":
         return spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
     low = -RAY_OBSERVATION_LIMIT

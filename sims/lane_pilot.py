@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.arguments import check_one
 from mcaprl.sims.bicycle import steering_of
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import in_body_frame, leg_at, point_at
@@ -118,6 +119,5 @@ class LanePilot:
         Raises:
             ValueError: there are observations of more than one environment.
         """
-        if len(observations) != 1:
-            raise ValueError(f"one pilot drives one environment, not {len(observations)}")
+        check_one(observations)
         return np.array([choose(self._sim.car, self._substeps)], dtype=np.int64)

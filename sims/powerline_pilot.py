@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.arguments import check_one
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.powerline import PowerlineEnv
 from mcaprl.sims.powerline_rules import ACTION_MEANINGS, DIRECTIONS, Flight
@@ -89,10 +90,7 @@ class PowerlinePilot:
         Raises:
             ValueError: there are observations of more than one environment.
         """
-        seen = observations
-        count = len(next(iter(seen.values())) if isinstance(seen, dict) else seen)
-        if count != 1:
-            raise ValueError(f"one pilot flies one environment, not {count}")
+        check_one(observations)
         sim = self._sim
         action = choose(sim.flight, sim.fleet.velocity_step_m_s, sim.fleet.classic)
         return np.array([action], dtype=np.int64)

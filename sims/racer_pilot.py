@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.arguments import check_one
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.racer import RacerEnv
 from mcaprl.sims.racer_car import Racer
@@ -68,8 +69,7 @@ class RacerPilot:
         Raises:
             ValueError: there are observations of more than one environment.
         """
-        if len(observations) != 1:
-            raise ValueError(f"one pilot drives one environment, not {len(observations)}")
+        check_one(observations)
         fleet = self._sim.fleet
         chosen = choose(fleet.track, self._sim.car, fleet.action_set, fleet.classic)
         return np.flatnonzero(fleet.action_set == chosen)

@@ -13,6 +13,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import make_sim
 from mcaprl.sims.depth import encode_depth
 from mcaprl.sims.lane import LaneKeepingEnv
+from mcaprl.sims.lane_course import COURSE
 
 
 def lane(**kwargs: Any) -> LaneKeepingEnv:
@@ -129,6 +130,25 @@ def test_what_the_camera_sees_is_what_is_observed() -> None:
     np.testing.assert_array_equal(seen[:, :, 0], encode_depth(depth_m))
     moved, *_ = sim.step(1)
     np.testing.assert_array_equal(moved[:, :, 0], encode_depth(sim.depth_image_m()))
+
+
+@pytest.mark.parametrize(
+    ("along_m", "turn"),
+    [(10.0, -1), (129.9, -1), (130.1, -1), (511.0, -1), (513.0, 1), (1025.9, 1)],
+)
+def test_a_dashboard_tells_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
+    # The shared street comes before the fifth corner: its first passage ends in a right turn, the
+    # second, 512 m on, in a left one.
+    sim = lane(observation="dashboard")
+    sim.reset(seed=4)
+    sim.fleet._cars[0, 5] = along_m + 3 * COURSE.length_m
+    sim.fleet._cars[0, 3] = 15.0
+    seen = sim.fleet.observation(0)
+    assert seen["depth"].tobytes() == encode_depth(sim.depth_image_m()).tobytes()
+    assert seen["motion"][2] == turn
+    moved, *_ = sim.step(3)
+    assert moved["motion"][1] == 1.0, "50 % to the left"
+    assert moved["motion"][0] == pytest.approx(sim.car.speed_m_s / 30)
 
 
 def test_names_fit_what_they_name() -> None:

@@ -29,6 +29,7 @@ Trace = list[tuple[bytes, float, bool, bool, dict[str, Any]]]
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("lane", {}),
     ("lane", {"observation": "depth"}),
+    ("lane", {"observation": "dashboard"}),
     ("lane", {"observation": "rays"}),
     ("lane", {"rules": "classic", "start": "anywhere"}),
     ("lane", {"rules": "classic-code", "observation": "depth"}),
