@@ -39,9 +39,11 @@ class Draws:
 
     def some(self, chosen: NDArray[np.int64]) -> NDArray[np.float64]:
         """Give the next (K, size) numbers of K generators."""
-        for i in chosen[self._next[chosen] == _AHEAD].tolist():
+        places = self._next[chosen]
+        used_up = places == _AHEAD
+        for i in chosen[used_up].tolist():
             self._generators[i].random(out=self._numbers[i])
-            self._next[i] = 0
-        self._next[chosen] += 1
-        found: NDArray[np.float64] = self._numbers[chosen, self._next[chosen] - 1]
+        places[used_up] = 0
+        self._next[chosen] = places + 1
+        found: NDArray[np.float64] = self._numbers[chosen, places]
         return found
