@@ -46,7 +46,7 @@ class IQLConfig(BootstrapConfig):
     expectile: float = 0.8
     """which part of what was done in a state its value follows; 0.5 the mean, near 1 the best"""
     beta: float = 3.0
-    """how much more the policy clones actions that were better than expected; 0 clones all"""
+    """how much more what beat the expected return by a reward of 1 is cloned; 0 clones all alike"""
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be meant."""
