@@ -271,7 +271,7 @@ def test_a_step_needs_a_reset() -> None:
 
 
 def test_an_unknown_value_names_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match="known: depth, rays, state"):
+    with pytest.raises(UnknownNameError, match="known: dashboard, depth, rays, state"):
         make_sims("lane", 2, observation="smell")
 
 
@@ -279,6 +279,7 @@ def test_the_cases_cover_all_that_can_be_batched() -> None:
     assert set(BATCHED) == {"lane", "powerline", "racer"}
     assert {kwargs.get("observation") for name, kwargs in CASES if name == "lane"} == {
         None,
+        "dashboard",
         "depth",
         "rays",
     }
