@@ -22,12 +22,13 @@ from mcaprl.sims.racer_rules import (
     observe,
     step_racers,
 )
-from mcaprl.sims.racer_start import racer_from, start_anywhere, start_exactly, start_on_line
+from mcaprl.sims.racer_start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_racer
 from mcaprl.sims.racer_track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track, make_track
 
 RULES = ("default", "classic")
 OBSERVATIONS = ("rays",)
 STARTS = ("anywhere", "line")
+ALONG = Racer._fields.index("along_m")
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 
 
@@ -69,7 +70,8 @@ class RacerFleet(Fleet):
             STEP_S,
         )
         self.last_actions = np.zeros(count, dtype=np.int64)
-        self._on_line = start == "line" or (self.classic and start is None)
+        on_line = start == "line" or (self.classic and start is None)
+        self._start = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
         self._drift = bool(drift)
         self._cars = np.zeros((count, len(Racer._fields)))
         self._started_at_m = np.zeros(count)
@@ -81,18 +83,15 @@ class RacerFleet(Fleet):
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `RacerEnv`."""
+        row, seen = self._cars[i], self._seen[i]
         if options:
             car = racer_from(self.track, options)
-        elif not self._on_line:
-            car = start_anywhere(self.track, random.random(4))
-        elif self.classic:
-            car = start_exactly(self.track)
+            store_racer(car, row)
+            observe(self.track, car, self.classic, seen)
         else:
-            car = start_on_line(self.track, random.random(2))
-        store_racer(car, self._cars[i])
-        self._started_at_m[i] = car.along_m
+            start_racer(self.track, random.random(self._start), self.classic, row, seen)
+        self._started_at_m[i] = row[ALONG]
         self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
-        observe(self.track, car, self.classic, self._seen[i])
 
     def advance(self) -> None:
         """Drive on for one step."""

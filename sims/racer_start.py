@@ -12,9 +12,12 @@ from mcaprl.errors import UsageError
 from mcaprl.sims.arguments import pose_from
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import leg_at, point_at
-from mcaprl.sims.racer_car import Racer, placed
-from mcaprl.sims.racer_rules import MAX_SPEED_M_S, STEP_S, walls_hit
+from mcaprl.sims.racer_car import Racer, placed, store_racer
+from mcaprl.sims.racer_rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
 from mcaprl.sims.racer_track import HALF_WIDTH_PX, METRES_PER_PX, PICTURE_HEIGHT_PX, Track
+
+ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
+"""How many numbers a start is drawn by."""
 
 
 @compiled
@@ -44,6 +47,33 @@ def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Racer:
     x_px = x_m / METRES_PER_PX + left_px * math.sin(heading_rad)
     y_px = PICTURE_HEIGHT_PX - y_m / METRES_PER_PX - left_px * math.cos(heading_rad)
     return placed(track, x_px, y_px, heading_rad - left_rad, speed_px, along_m)
+
+
+@compiled
+def start_racer(
+    track: Track,
+    shares: NDArray[np.float64],
+    classic: bool,
+    row: NDArray[np.float64],
+    observation: NDArray[np.float32],
+) -> None:
+    """Start a car, and write it and what it sees.
+
+    Args:
+        track: to start on.
+        shares: numbers from 0 to 1: (4,) for anywhere, (2,) for the line, (0,) for exactly there.
+        classic: see by the classic rules.
+        row: (12,) of a `Racer`, to be filled.
+        observation: (19,) to be filled.
+    """
+    if len(shares) == ANYWHERE:
+        car = start_anywhere(track, shares)
+    elif len(shares) == ON_LINE:
+        car = start_on_line(track, shares)
+    else:
+        car = start_exactly(track)
+    store_racer(car, row)
+    observe(track, car, classic, observation)
 
 
 @compiled
