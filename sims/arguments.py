@@ -69,10 +69,13 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
             f"actions are an array of {vehicles} whole numbers,"
             f" not {numbers.dtype} of shape {numbers.shape}"
         )
-    if numbers.min() < 0 or numbers.max() >= count:
-        wrong = numbers[(numbers < 0) | (numbers >= count)][0]
+    numbers = numbers.astype(np.int64, copy=False)
+    # Without a sign, those below 0 are the largest.
+    does_not_exist = numbers.view(np.uint64) >= count
+    if does_not_exist.any():
+        wrong = numbers[does_not_exist][0]
         raise UsageError(f"action {wrong} does not exist: 0 to {count - 1} do")
-    return numbers.astype(np.int64)
+    return numbers
 
 
 def check_one(observations: Any) -> None:

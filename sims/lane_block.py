@@ -48,7 +48,7 @@ def step_cars(
     """Advance N cars by one decision each, in place.
 
     Args:
-        cars: (N, 9) rows of `Car`.
+        cars: (N, 10) rows that begin with `Car`.
         actions: (N,) 0 to 5.
         rewards: (N,) to be filled.
         ends: (N,) to be filled with DRIVING, OFF_LANE or STALL.

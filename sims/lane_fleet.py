@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.arguments import check_name
 from mcaprl.sims.camera import level_axes
+from mcaprl.sims.compiled import ready
 from mcaprl.sims.depth import DepthCamera, encode_depth, encode_nearness
 from mcaprl.sims.draws import Draws
 from mcaprl.sims.fleet import GOING_ON, Fleet
@@ -38,12 +39,11 @@ from mcaprl.sims.lane_rules import (
     observe,
     store_car,
 )
-from mcaprl.sims.lane_start import car_from, start_car, start_cars
+from mcaprl.sims.lane_start import ALONG, STARTED_AT, car_from, start_cars, start_one_of
 
 RULES = ("default", "classic", "classic-code")
 STARTS = ("anywhere", "line")
 OBSERVATIONS = ("state", "depth", "dashboard", "rays")
-ALONG = Car._fields.index("along_m")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 MOTION = slice(2, 4)
 """Speed and steering in a state."""
@@ -79,9 +79,10 @@ class LaneFleet(Fleet):
             ACTION_MEANINGS,
             CLASSIC_DECISION_S if self._classic else DECISION_S,
         )
-        self._cars = np.zeros((count, len(Car._fields)))
-        self._started_at_m = np.zeros(count)
+        self._cars = np.zeros((count, STARTED_AT + 1))
         self._draws = Draws(count, 4)
+        # Which car is to be started by itself, and by what chance.
+        self._chosen, self._shares = np.zeros(1, dtype=np.int64), np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
@@ -93,19 +94,20 @@ class LaneFleet(Fleet):
 
     def car(self, i: int) -> Car:
         """Give the whole state of a car."""
-        return Car._make(self._cars[i].tolist())
+        return Car._make(self._cars[i, :STARTED_AT].tolist())
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
-        row, state = self._cars[i], self._states[i]
         self._draws.belong_to(i, random)
         if options:
-            car = car_from(options)
+            car, row = car_from(options), self._cars[i]
             store_car(car, row)
-            observe(car, state)
+            row[STARTED_AT] = row[ALONG]
+            observe(car, self._states[i])
         else:
-            start_car(self._draws.one(i), self._on_line, self._classic, row, state)
-        self._started_at_m[i] = row[ALONG]
+            self._chosen[0] = i
+            self._draws.one(i, self._shares)
+            self._start_chosen()
         self.rewards[i], self.ends[i] = 0.0, GOING_ON
         if self._has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
@@ -113,9 +115,9 @@ class LaneFleet(Fleet):
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start an episode of some cars."""
-        shares = self._draws.some(chosen)
-        start_cars(chosen, shares, self._on_line, self._classic, self._cars, self._states)
-        self._started_at_m[chosen] = self._cars[chosen, ALONG]
+        draws, kind = self._draws, (self._on_line, self._classic)
+        draws.draw_ahead(chosen)
+        start_cars(chosen, draws.numbers, draws.used, *kind, self._cars, self._states)
         self.rewards[chosen], self.ends[chosen] = 0.0, GOING_ON
         if self._has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
@@ -138,6 +140,11 @@ class LaneFleet(Fleet):
         return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
 
     # Views of each row, made once: a single environment reads one of each in every step.
+
+    @cached_property
+    def _start_chosen(self) -> Callable[[], None]:
+        which, kind = (self._chosen, self._shares), (self._on_line, self._classic)
+        return ready(start_one_of, *which, *kind, self._cars, self._states)
 
     @cached_property
     def _car_rows(self) -> list[NDArray[np.float64]]:
@@ -187,16 +194,16 @@ class LaneFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
-        return _described(self._car_rows[i].tolist(), self._started_at_m.item(i))
+        return _described(self._car_rows[i].tolist())
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Give the `info` of all cars."""
-        return _described(self._cars.T.copy(), self._started_at_m)
+        return {name: column.copy() for name, column in _described(self._cars.T).items()}
 
 
-def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
-    """Name what is told of a car, or of all: 9 numbers, or as many columns."""
-    _, _, _, speed_m_s, _, along_m, offset_m, heading_error_rad, _ = car
+def _described(car: Any) -> dict[str, Any]:
+    """Name what is told of a car, or of all: 10 numbers, or as many columns."""
+    _, _, _, speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
     return {
         "lateral_offset_m": offset_m,
         "heading_error_rad": heading_error_rad,

@@ -55,7 +55,7 @@ def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
 
 @compiled
 def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
-    """Write what N cars, (N, 9) rows of `Car`, observe: (N, 20)."""
+    """Write what N cars, (N, 10) rows that begin with `Car`, observe: (N, 20)."""
     for i in range(len(cars)):
         observe_rays(car_at(cars[i]), observations[i])
 

@@ -11,11 +11,14 @@ from mcaprl.errors import UsageError
 from mcaprl.sims.arguments import pose_from
 from mcaprl.sims.bicycle import moving
 from mcaprl.sims.compiled import compiled
+from mcaprl.sims.draws import take
 from mcaprl.sims.geometry import leg_at, project
 from mcaprl.sims.lane_classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane_course import COURSE, LANE_HALF_WIDTH_M
 from mcaprl.sims.lane_rules import MAX_SPEED_M_S, Car, drive, located, observe, store_car
 
+ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
+"""Where a row has how far a car is along the path, and, behind what `Car` has, how far it was."""
 LINE_M = 2.0
 """Of the start line, along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
@@ -78,20 +81,35 @@ def start_car(
         shares: (4,) numbers from 0 to 1.
         on_line: start on the line, not anywhere.
         classic: if on the line, drive straight ahead for a second.
-        row: (9,) of a `Car`, to be filled.
+        row: (10,) of a `Car`, and where it starts along the path, to be filled.
         observation: (12,) to be filled.
     """
     car = start_on_line(shares) if on_line else start_anywhere(shares)
     if on_line and classic:
         car = drive(car, STRAIGHT, CLASSIC_SUBSTEPS)
     store_car(car, row)
+    row[STARTED_AT] = car.along_m
     observe(car, observation)
+
+
+@compiled
+def start_one_of(
+    chosen: NDArray[np.int64],
+    shares: NDArray[np.float64],
+    on_line: bool,
+    classic: bool,
+    cars: NDArray[np.float64],
+    observations: NDArray[np.float32],
+) -> None:
+    """Start one of N cars as `start_car` does: the number that `chosen`, (1,), holds."""
+    start_car(shares, on_line, classic, cars[chosen[0]], observations[chosen[0]])
 
 
 @compiled
 def start_cars(
     chosen: NDArray[np.int64],
-    shares: NDArray[np.float64],
+    numbers: NDArray[np.float64],
+    used: NDArray[np.int64],
     on_line: bool,
     classic: bool,
     cars: NDArray[np.float64],
@@ -101,15 +119,15 @@ def start_cars(
 
     Args:
         chosen: (K,) which.
-        shares: (K, 4) numbers from 0 to 1.
+        numbers: of `Draws`, 4 for each.
+        used: of `Draws`.
         on_line: as of `start_car`.
         classic: as of `start_car`.
-        cars: (N, 9) rows of `Car`.
+        cars: (N, 10) rows, as of `start_car`.
         observations: (N, 12).
     """
-    for k in range(len(chosen)):
-        i = chosen[k]
-        start_car(shares[k], on_line, classic, cars[i], observations[i])
+    for i in chosen:
+        start_car(take(numbers, used, i), on_line, classic, cars[i], observations[i])
 
 
 def car_from(options: dict[str, Any]) -> Car:

@@ -142,9 +142,9 @@ class RacerFleet(Fleet):
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Give the `info` of all cars."""
-        described = _described(self._cars.T.copy(), self._started_at_m)
+        described = _described(self._cars.T, self._started_at_m)
         described["gates_passed"] = described["gates_passed"].astype(np.int64)
-        return described
+        return {name: column.copy() for name, column in described.items()}
 
 
 def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
