@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -287,7 +288,7 @@ def compressed_chunks(
     return found
 
 
-def plain_zstd(chunks: list[memoryview]) -> None:
+def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
     """Decompress chunks, and nothing else: what no reader can do without."""
     import zstandard
 
@@ -302,13 +303,12 @@ def raw_chunks(path: Path, topic: str) -> list[bytes]:
     return [zstandard.decompress(data) for data in compressed_chunks(path, (topic,))]
 
 
-def plain_compression(chunks: list[bytes]) -> None:
-    """Compress chunks with zstd 1, and nothing else: what no writer can do without."""
+def level_1_chunks(chunks: list[bytes]) -> list[bytes]:
+    """Chunks as zstd's level 1 packs them."""
     import zstandard
 
     compressor = zstandard.ZstdCompressor(level=1)
-    for records in chunks:
-        compressor.compress(records)
+    return [compressor.compress(records) for records in chunks]
 
 
 def record_bare(episodes: int) -> None:

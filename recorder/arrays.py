@@ -68,11 +68,7 @@ def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Trans
     times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
     first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
     episodes = tuple(
-        dataclasses.replace(
-            episode,
-            start_time_ns=int(times[start]),
-            end_time_ns=int(times[start + length]),
-        )
+        episode._replace(start_time_ns=int(times[start]), end_time_ns=int(times[start + length]))
         for episode, start, length in zip(columns.episodes, first, lengths, strict=True)
     )
     return dataclasses.replace(columns, log_time_ns=times, episodes=episodes)

@@ -93,6 +93,10 @@ class MessageType:
         except Exception as error:
             raise CorruptLogError(f"{len(data)} bytes are no {self.name}: {error}") from error
 
+    def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
+        """The form of the last example of that length; None if there was none."""
+        return self._layouts.get((length, *wanted))
+
     def layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
         """The form of an example; None if it has none that could be told."""
         # Making one takes as long as decoding a few messages.

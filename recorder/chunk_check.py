@@ -62,7 +62,7 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
         Contradiction("the summary does not tell what the chunk is", where)
     ]  # fmt: skip
     indexes = {
-        channel_id: message_index(view, offset, channel_id)
+        channel_id: np.frombuffer(message_index(view, offset, channel_id), INDEX_ENTRY)
         for channel_id, offset in chunk.message_index_offsets.items()
     }
     if not _is_complete(records, indexes):
@@ -85,7 +85,7 @@ def check_statistics(reader: McapReader) -> list[Contradiction]:
             continue
         told: Statistics = parse_record(opcode, content)
         counts = {
-            channel_id: sum(len(span.index) for span in reader.spans(channel))
+            channel_id: sum(len(span) for span in reader.spans(channel))
             for channel_id, channel in reader.channels.items()
         }
         pairs = [

@@ -27,7 +27,8 @@ from mcaprl.recorder.chunks import (
     record_dtype,
 )
 from mcaprl.recorder.joined import Chosen, Rows, join, neighbors
-from mcaprl.recorder.mcap_reader import McapReader, Span
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import RECORD_HEADER, Span
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
 _MAX_LENGTHS = 16
@@ -62,7 +63,7 @@ class Topic:
             if spans:
                 type_ = _type_of(reader, channel)
                 self.parts += [Part(reader, channel, type_, span) for span in spans]
-        self._counts = [len(part.span.index) for part in self.parts]
+        self._counts = [len(part.span) for part in self.parts]
         self._stops = np.cumsum(self._counts, dtype=np.int64)
 
     def __len__(self) -> int:
@@ -88,7 +89,7 @@ class Topic:
         ids = np.array([part.channel.id for part in self.parts], np.uint16)
         return np.repeat(ids, self._counts)
 
-    @property
+    @cached_property
     def chunks_rise(self) -> bool:
         """Whether it is one channel, and no chunk begins before the one before it has ended."""
         chunks = [part.span.chunk for part in self.parts]
@@ -129,8 +130,10 @@ class Topic:
         parts = list(self._all() if order is None else self._chosen(order))
         if not parts:
             return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
-        columns = parts[0].part.empty_columns(wanted, len(self) if order is None else len(order))
         local = threading.local()
+        local.scratch = Scratch()
+        count = len(self) if order is None else len(order)
+        columns = parts[0].part.empty_columns(wanted, count, local.scratch)
 
         def fill(together: list[Chosen]) -> None:
             if not hasattr(local, "scratch"):
@@ -193,9 +196,12 @@ class Part:
             )
         return times
 
-    def empty_columns(self, wanted: Collection[str], count: int) -> Columns:
+    def empty_columns(
+        self, wanted: Collection[str], count: int, scratch: Scratch | None = None
+    ) -> Columns:
         """Columns with the dtypes and shapes of the first message."""
-        example = self._values(self._reader.records_of(self.span), self.span.index[0], wanted)
+        records = self._reader.records_of(self.span, scratch)
+        example = self._values(records, self.span.index[0], wanted)
         return {
             name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
         }
@@ -247,8 +253,23 @@ class Part:
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
     ) -> NDArray[Any] | None:
         """The messages as one structured array; None if they have not one form."""
+        # Mostly they have the form of those before them.
+        known = self.type.known_layout(self._length(records, index), wanted)
+        found = None if known is None else self._laid_out(records, index, known)
+        if found is not None:
+            return found
         layout = self.type.layout(self._message(records, index[0]), wanted)
-        return None if layout is None else self._laid_out(records, index, layout)
+        if layout is None or layout is known:
+            return None
+        return self._laid_out(records, index, layout)
+
+    def _length(self, records: memoryview, index: NDArray[Any]) -> int:
+        """Bytes of the first message, as its record tells; -1 if there is none."""
+        offset = int(index["offset"][0])
+        if offset + MESSAGE_HEADER.itemsize > len(records):
+            return -1
+        _, length = RECORD_HEADER.unpack_from(records, offset)
+        return int(length) + RECORD_HEADER.size - MESSAGE_HEADER.itemsize
 
     def _laid_out(
         self, records: memoryview, index: NDArray[Any], layout: Layout

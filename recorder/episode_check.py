@@ -15,7 +15,7 @@ from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
 from mcaprl.recorder.chunk_check import Contradiction
 from mcaprl.recorder.columns import LOG_TIME, Columns, Part, Topic
 from mcaprl.recorder.episode import Episode
-from mcaprl.recorder.episodes import COUNTERS, episode_lengths, summaries, told_episodes
+from mcaprl.recorder.episodes import COUNTERS, Told, episode_lengths, summaries
 from mcaprl.recorder.log_reader import LogReader, described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
@@ -117,7 +117,7 @@ class EpisodeCheck:
         """Note which messages of which chunk belong to what."""
         start = 0
         for part in self._steps.parts:
-            stop = start + len(part.span.index)
+            stop = start + len(part.span)
             self._place(part, slice(start, stop))
             start = stop
         for leaf, topic in self._images:
@@ -147,9 +147,9 @@ class EpisodeCheck:
 
     def _check_told(self, lengths: NDArray[np.int64]) -> Iterator[Contradiction]:
         """What `/rl/episode` tells, against the records."""
-        columns, topic = self._columns, Topic(self._reader, EPISODE_TOPIC)
+        columns = self._columns
         finals = np.cumsum(lengths + 1) - 1
-        told = told_episodes(topic, columns[LOG_TIME][finals])
+        told = Told(Topic(self._reader, EPISODE_TOPIC)).summaries(columns[LOG_TIME][finals])
         if len(told) not in (0, len(lengths)):
             yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
         whole = summaries(self._reader.path, columns, lengths, told)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import MISSING, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,18 @@ from mcaprl.recorder.rows import add_up
 
 COUNTERS = ("episode", "step", "final")
 """The fields that say which episode a record belongs to, where in it, and whether it is the end."""
+# So many rows of a column stay in a processor's cache while they are looked at.
+_BLOCK_ROWS = 2**15
 
 
 def time_order(topic: Topic) -> NDArray[np.int64] | None:
     """The order of log_time; None if that is the order they are in."""
-    if (topic.times[1:] >= topic.times[:-1]).all():
-        return None
-    return np.argsort(topic.times, kind="stable")
+    times = topic.times
+    for start in range(0, len(times), _BLOCK_ROWS):
+        block = times[start : start + _BLOCK_ROWS + 1]
+        if (block[1:] < block[:-1]).any():
+            return np.argsort(times, kind="stable")
+    return None
 
 
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
@@ -55,19 +61,17 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     read = int(finals[-1]) + 1
     steps, episodes = columns["step"][:read], columns["episode"][:read]
-    in_order = np.empty(read, bool)
-    in_order[0] = steps[0] == 0
     # Behind a final record an episode begins; any other is followed by the next of its episode.
-    ended = final[: read - 1]
-    in_order[1:] = np.where(
-        ended, steps[1:] == 0, (steps[1:] == steps[:-1] + 1) & (episodes[1:] == episodes[:-1])
-    )
+    begins = np.concatenate([[0], finals[:-1] + 1])
+    breaks = np.concatenate([_breaks(steps, 1), _breaks(episodes, 0)])
+    wrong = [begins[steps[begins] != 0], breaks[~final[breaks]] + 1]
     if "terminated" in columns:
         # An end is the last transition's, which stands before the final record.
-        ends = (columns["terminated"][:read] | columns["truncated"][:read]).astype(bool)
-        in_order[:-1] &= ~ends[:-1] | final[1:read]
-    if not in_order.all():
-        row = int(np.argmin(in_order))
+        ends = np.flatnonzero(columns["terminated"][: read - 1] | columns["truncated"][: read - 1])
+        wrong.append(ends[~final[ends + 1]])
+    rows = np.concatenate(wrong)
+    if len(rows):
+        row = int(rows.min())
         raise CorruptLogError(
             f"{where}: record {row} of {STEP_TOPIC} (episode {episodes[row]}, step {steps[row]}) is"
             " out of order: records are missing or doubled, or an episode goes on after its end"
@@ -75,36 +79,58 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
     return np.diff(finals, prepend=-1) - 1
 
 
-def told_lengths(topic: Topic) -> NDArray[np.int64]:
-    """(E,) transitions of each episode by `/rl/episode`; none if it tells them out of order."""
-    names = ("length", "end_time_ns")
-    if not set(names) <= set(topic.fields):
-        return np.empty(0, np.int64)
-    columns = topic.read(names)
-    in_order = (np.diff(columns["end_time_ns"]) > 0).all()
-    return columns["length"].astype(np.int64) if in_order else np.empty(0, np.int64)
+def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
+    """The rows that the next one is not higher than by so much."""
+    found = []
+    for start in range(0, len(column) - 1, _BLOCK_ROWS):
+        block = column[start : start + _BLOCK_ROWS + 1]
+        found.append(start + np.flatnonzero(block[1:] - block[:-1] != by))
+    return np.concatenate(found) if found else np.empty(0, np.int64)
 
 
-def told_episodes(topic: Topic, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-    """What `/rl/episode` tells of the episodes with these last log_times.
+class Told:
+    """What `/rl/episode` tells of episodes: nothing, if it is of another type than ours."""
 
-    Nothing if it is of another type.
-    """
-    known = fields(EpisodeSummary)
-    if any(field.default is MISSING and field.name not in topic.fields for field in known):
-        return []
-    names = [field.name for field in known if field.name in topic.fields]
-    rows = None
-    if len(ends) < len(topic) // 2:
-        rows = np.flatnonzero(np.isin(topic.read(["end_time_ns"])["end_time_ns"], ends))
-    columns = topic.read(names, rows)
-    columns["terminated"] = columns["terminated"].astype(bool)
-    columns["truncated"] = columns["truncated"].astype(bool)
-    values = {name: columns[name].tolist() for name in names}
-    if "seed" in values:
-        values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
-    rows_ = zip(*values.values(), strict=True)
-    return [EpisodeSummary(**dict(zip(names, row, strict=True))) for row in rows_]
+    def __init__(self, topic: Topic) -> None:
+        """Point at it; nothing is read."""
+        self._topic = topic
+
+    @cached_property
+    def lengths(self) -> NDArray[np.int64]:
+        """(E,) transitions of each; none if they are told of out of order."""
+        if not self._is_ours or not (np.diff(self._columns["end_time_ns"]) > 0).all():
+            return np.empty(0, np.int64)
+        return self._columns["length"].astype(np.int64)
+
+    def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
+        """Of those with these last log_times, and maybe others."""
+        if not self._is_ours:
+            return []
+        names = [name for name in EpisodeSummary._fields if name in self._topic.fields]
+        rows = None
+        if len(ends) < len(self._topic) // 2:
+            rows = np.flatnonzero(np.isin(self._columns["end_time_ns"], ends))
+        columns = self._topic.read(names, rows)
+        columns["terminated"] = columns["terminated"].astype(bool)
+        columns["truncated"] = columns["truncated"].astype(bool)
+        values = {name: columns[name].tolist() for name in names}
+        if "seed" in values:
+            values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
+        defaults, told = EpisodeSummary._field_defaults, len(values["length"])
+        every = [
+            values[name] if name in values else [defaults[name]] * told
+            for name in EpisodeSummary._fields
+        ]
+        return list(map(EpisodeSummary._make, zip(*every, strict=True)))
+
+    @property
+    def _is_ours(self) -> bool:
+        required = set(EpisodeSummary._fields) - set(EpisodeSummary._field_defaults)
+        return required <= set(self._topic.fields)
+
+    @cached_property
+    def _columns(self) -> Columns:
+        return self._topic.read(("length", "end_time_ns"))
 
 
 def summaries(

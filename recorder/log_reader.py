@@ -17,11 +17,10 @@ from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.episodes import (
     COUNTERS,
+    Told,
     episode_lengths,
     step_order,
     summaries,
-    told_episodes,
-    told_lengths,
 )
 from mcaprl.recorder.foreign import inferred_metadata, observation_fields
 from mcaprl.recorder.images import read_images
@@ -62,7 +61,7 @@ class LogReader:
         self._reader = McapReader(path)
         self._steps = _steps_of(self._reader)
         self._metadata = described(self._reader)
-        self._told = Topic(self._reader, EPISODE_TOPIC)
+        self._told = Told(Topic(self._reader, EPISODE_TOPIC))
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
@@ -73,7 +72,7 @@ class LogReader:
             NoEpisodesError: there is no finished episode.
         """
         # What is told is believed only as far as it agrees with what is read then.
-        told = told_lengths(self._told) if self._reader.complete else np.empty(0, np.int64)
+        told = self._told.lengths if self._reader.complete else np.empty(0, np.int64)
         if self._steps.chunks_rise and int(told.sum()) + len(told) == len(self._steps):
             return told
         self._check_fields(COUNTERS)
@@ -172,10 +171,12 @@ class LogReader:
     ) -> Dataset:
         leaves = self._leaves(metadata)
         finals = np.cumsum(lengths + 1) - 1
-        told = told_episodes(self._told, columns[LOG_TIME][finals])
+        told = self._told.summaries(columns[LOG_TIME][finals])
         episodes = summaries(self.path, columns, lengths, told)
         action = action_leaf(metadata.action_space)
-        probs = columns.get("behavior_prob", np.full(len(columns["final"]), np.nan, np.float32))
+        probs = columns.get("behavior_prob")
+        if probs is None:
+            probs = np.full(len(columns["final"]), np.nan, np.float32)
         transitions = Transitions(
             frames=tuple(self._frames(leaf, columns) for leaf in leaves),
             log_time_ns=columns[LOG_TIME],

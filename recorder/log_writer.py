@@ -40,9 +40,8 @@ whole episodes, and episodes and times go on from one to the next.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +76,7 @@ MIN_ROWS = 3
 IMAGE_FRAME = "camera"
 
 
-@dataclass(frozen=True)
-class EpisodeSummary:
+class EpisodeSummary(NamedTuple):
     """What `/rl/episode` tells of one episode.
 
     Attributes:
@@ -111,7 +109,7 @@ class EpisodeSummary:
 
     def to_message(self) -> Any:
         """As `mcaprl_msgs/msg/Episode`."""
-        fields = {**vars(self), "seed": -1 if self.seed is None else self.seed}
+        fields = {**self._asdict(), "seed": -1 if self.seed is None else self.seed}
         return messages.new(messages.EPISODE_TYPE, **fields)
 
 

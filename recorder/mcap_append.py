@@ -72,7 +72,7 @@ def _take_topics(reader: McapReader, written: Written) -> None:
         spans = reader.spans(channel)
         if any(span.chunk is None for span in spans):
             raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
-        written.summary.counts[channel.id] = sum(len(span.index) for span in spans)
+        written.summary.counts[channel.id] = sum(len(span) for span in spans)
 
 
 def _take_other_records(reader: McapReader, written: Written) -> None:

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.checksum import crc32
@@ -36,6 +34,7 @@ from mcaprl.recorder.mcap_records import (
     RECORD_HEADER,
     ChunkContents,
     LooseMessages,
+    Span,
     contents_of,
     map_file,
     parse_record,
@@ -45,19 +44,6 @@ from mcaprl.recorder.mcap_records import (
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.STATISTICS)
 _STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
-
-
-@dataclass(frozen=True)
-class Span:
-    """Messages of one channel that stand together.
-
-    Attributes:
-        chunk: in which they are; None for messages outside of all chunks.
-        index: their log_time and offset: `chunks.INDEX_ENTRY`, one for each.
-    """
-
-    chunk: ChunkIndex | None
-    index: NDArray[Any]
 
 
 class McapReader:
@@ -143,15 +129,15 @@ class McapReader:
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
-        spans = []
-        for number, chunk in enumerate(self.chunks):
-            index = self._index(chunk, channel, is_last=number == len(self.chunks) - 1)
-            if index is not None and len(index):
-                spans.append(Span(chunk, index))
+        # A writer that was killed may have written some of the last chunk's indexes only.
+        indexed = self.chunks if self.complete else self.chunks[:-1]
+        spans = [span for chunk in indexed if (span := self._span(chunk, channel.id))]
+        rest = self.chunks[len(indexed) :]
+        spans += [span for chunk in rest if (span := self._unindexed_span(chunk, channel.id))]
         loose = self._loose_indexes.get(channel.id)
         if loose is not None:
             spans.append(Span(None, loose))
-        found, told = sum(len(span.index) for span in spans), self._counts.get(channel.id)
+        found, told = sum(map(len, spans)), self._counts.get(channel.id)
         if told not in (None, found):
             raise CorruptLogError(
                 f"{self.path}: the summary tells of {told} messages of {channel.topic}, its indexes"
@@ -173,20 +159,23 @@ class McapReader:
         Args:
             chunk: one of `chunks`.
             scratch: where they may be decompressed to; then they are there until it is used again.
+                It is for chunks of this file alone.
 
         Raises:
             CorruptLogError: the chunk is damaged.
         """
         start = chunk.chunk_start_offset
-        last, records = self._last_chunk
+        last, kept = self._last_chunk if scratch is None else scratch.kept
         if last == start:
-            return records
+            return kept
         try:
             records = chunk_records(self.view, start, scratch)
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error}") from error
         if scratch is None:
             self._last_chunk = start, records
+        else:
+            scratch.kept = start, records
         return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
@@ -245,18 +234,20 @@ class McapReader:
         """
         return records_of(self.view, start)
 
-    def _index(self, chunk: ChunkIndex, channel: Channel, *, is_last: bool) -> NDArray[Any] | None:
-        """Where a channel's messages are in a chunk; None if it has none."""
-        # A writer that was killed may have written some of the last chunk's indexes only.
-        if not chunk.message_index_offsets or (is_last and not self.complete):
-            return self._contents_of(chunk).indexes.get(channel.id)
-        offset = chunk.message_index_offsets.get(channel.id)
-        if offset is None:
-            return None
+    def _span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
+        """A channel's messages in a chunk, by the index that the file has of them."""
+        offsets = chunk.message_index_offsets
+        if channel_id not in offsets:
+            return None if offsets else self._unindexed_span(chunk, channel_id)
         try:
-            return message_index(self.view, offset, channel.id)
+            return Span(chunk, message_index(self.view, offsets[channel_id], channel_id))
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error}") from error
+
+    def _unindexed_span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
+        """Likewise, by going through the chunk."""
+        index = self._contents_of(chunk).indexes.get(channel_id)
+        return None if index is None else Span(chunk, index)
 
     def _contents_of(self, chunk: ChunkIndex) -> ChunkContents:
         start = chunk.chunk_start_offset

@@ -32,7 +32,10 @@ from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import (
     INDEX_ENTRY,
+    LONG_RECORDS,
     MAX_CHUNK_BYTES,
+    MIXED_RECORDS,
+    SHORT_RECORDS,
     ChunkHeader,
     compressor,
     message_index_head,
@@ -44,9 +47,8 @@ from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
-# Rows are written while a simulator waits. Messages one by one are mostly for viewers: they repeat
-# themselves so much that a slower search halves them.
-_ROWS_LEVEL, _MESSAGES_LEVEL = 1, 9
+# Messages of more bytes than this are pictures rather than numbers.
+_LONG_MESSAGE_BYTES = 2**11
 # So few bytes are sooner copied than handed to the operating system piece by piece.
 _JOINED_BYTES = 2**16
 
@@ -85,8 +87,9 @@ class McapWriter:
         if compression not in COMPRESSIONS:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self._compression, self._profile = compression, profile
-        self._compress_rows = compressor(compression, _ROWS_LEVEL)
-        self._compress_messages = compressor(compression, _MESSAGES_LEVEL)
+        self._compress_short = compressor(compression, SHORT_RECORDS)
+        self._compress_long = compressor(compression, LONG_RECORDS)
+        self._compress_mixed = compressor(compression, MIXED_RECORDS)
         # What every file begins with, in this order.
         self._standing: list[Standing] = []
         if append and Path(path).exists():
@@ -189,7 +192,7 @@ class McapWriter:
         index = np.empty(len(rows), INDEX_ENTRY)
         index["log_time"] = rows["log_time"]
         index["offset"] = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
-        self._write_chunk(rows.view(np.uint8).data, {channel_id: index}, self._compress_rows)
+        self._write_chunk(rows.view(np.uint8).data, {channel_id: index})
 
     def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
         """Write messages of any channels and lengths as one chunk.
@@ -205,7 +208,7 @@ class McapWriter:
             entries.setdefault(channel_id, []).append((time_ns, len(records)))
             records += message_record(channel_id, self._next_sequence(channel_id), time_ns, data)
         indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
-        self._write_chunk(memoryview(records), indexes, self._compress_messages)
+        self._write_chunk(memoryview(records), indexes, self._compress_mixed)
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
         """Write a chunk's records as they are.
@@ -216,7 +219,7 @@ class McapWriter:
         """
         for channel_id, index in indexes.items():
             self._summary.counts[channel_id] += len(index)
-        self._write_chunk(records, dict(indexes), self._compress_rows)
+        self._write_chunk(records, dict(indexes))
 
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
@@ -260,11 +263,15 @@ class McapWriter:
         self,
         records: memoryview,
         indexes: dict[int, NDArray[Any]],
-        compress: Callable[[Any], bytes],
+        compress: Callable[[Any], bytes] | None = None,
     ) -> None:
         assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
         start_time = min(int(index["log_time"].min()) for index in indexes.values())
         end_time = max(int(index["log_time"].max()) for index in indexes.values())
+        if compress is None:
+            mean_bytes = len(records) / sum(map(len, indexes.values()))
+            is_long = mean_bytes > _LONG_MESSAGE_BYTES
+            compress = self._compress_long if is_long else self._compress_short
         data = compress(records)
         name = "" if self._compression == "none" else self._compression
         header = ChunkHeader(

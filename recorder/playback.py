@@ -16,7 +16,8 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from mcaprl.recorder.mcap_reader import McapReader, Span
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import Span
 
 _CHUNKS_KEPT = 24
 

@@ -147,7 +147,7 @@ def _check_paths(source: Path, target: Path, overwrite: bool) -> None:
 
 def _count_messages(reader: McapReader) -> int:
     spans = [span for channel in reader.channels.values() for span in reader.spans(channel)]
-    return sum(len(span.index) for span in spans)
+    return sum(len(span) for span in spans)
 
 
 def _note(plan: EpisodePlan, source: Path, recovery: Recovery) -> None:

@@ -150,6 +150,7 @@ class StepColumns:
         That one stays behind, for its episode may end there and be marked so.
         """
         count = step - self._first_step - 1
+        self._total_reward = self.total_reward(step - 1)
         self._fill(count, count)
         self._write(count)
         self._forget(count)
@@ -191,7 +192,6 @@ class StepColumns:
         rows["log_time"] = self._start_ns + steps * self._step_ns
         self._fields["episode"][:count] = self._episode
         self._fields["step"][:count] = steps
-        self._total_reward = self.total_reward(self._first_step + count)
         self._log.write_steps(rows)
         self._first_step += count
 

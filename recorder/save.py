@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import time
 from pathlib import Path
@@ -53,7 +52,7 @@ def save_log(
         _write_images(log, columns)
         log.write_episodes(
             [
-                episode if episode.episode == k else dataclasses.replace(episode, episode=k)
+                episode if episode.episode == k else episode._replace(episode=k)
                 for k, episode in enumerate(columns.episodes)
             ]
         )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: 
 def episode_table(columns: Transitions) -> Any:
     """One row per episode: what `/rl/episode` tells, numbered in this dataset's order."""
     pyarrow = import_extra("pyarrow", "tables")
-    rows = [asdict(episode) | {"episode": k} for k, episode in enumerate(columns.episodes)]
+    rows = [episode._asdict() | {"episode": k} for k, episode in enumerate(columns.episodes)]
     return pyarrow.Table.from_pylist(rows)
 
 

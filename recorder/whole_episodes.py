@@ -280,7 +280,7 @@ def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
 def _by_place(steps: Topic, fates: NDArray[np.uint8]) -> Iterator[tuple[Place, NDArray[np.uint8]]]:
     start = 0
     for part in steps.parts:
-        stop = start + len(part.span.index)
+        stop = start + len(part.span)
         assert part.span.chunk is not None, "all messages are in chunks"
         yield (part.span.chunk.chunk_start_offset, part.channel.id), fates[start:stop]
         start = stop

@@ -68,10 +68,9 @@ def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
     for leaf in leaves:
         if leaf.encoding:
             topics[leaf.topic] = {"data": np.array(images[leaf.name])}
-    summaries = [vars(episode.summary) for episode in dataset.episodes]
+    summaries = [episode.summary._asdict() for episode in dataset.episodes]
     topics["/rl/episode"] = {
-        name: np.array([summary[name] for summary in summaries])
-        for name in EpisodeSummary.__dataclass_fields__
+        name: np.array([summary[name] for summary in summaries]) for name in EpisodeSummary._fields
     }
     return topics
 

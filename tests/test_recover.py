@@ -96,7 +96,7 @@ def test_whole_file_loses_nothing(log_path: Path, truth: tuple[bytes, Truth]) ->
     assert {c.topic for c in new.channels.values()} == {c.topic for c in old.channels.values()}
     assert new.attachment("foxglove-layout.json") == old.attachment("foxglove-layout.json")
     assert recovery.messages == sum(
-        len(span.index) for channel in old.channels.values() for span in old.spans(channel)
+        len(span) for channel in old.channels.values() for span in old.spans(channel)
     )
 
 
