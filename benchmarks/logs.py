@@ -37,6 +37,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
         _recording(folder, encoded, minari),
         _writing(folder, log, data, part, encoded, minari),
         _reading(folder, log, data, part, minari),
+        _space(folder, log, data),
         _threads(log),
         _short_episodes(folder),
         _episode(log),
@@ -172,6 +173,36 @@ def _reading(
         goal="70 % of plain zstd's speed at level 1, 100 times mcap + mcap-ros2-support, 5 times"
         " Minari",
     )
+
+
+def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
+    """What files of the same transitions take; a log has times and counters besides."""
+    table = Table("Space that the transitions take", unit="bytes, ours = 1")
+    ours = log.stat().st_size
+    for compression in ("lz4", "none"):
+        other = folder / f"{compression}.mcap"
+        data.save(other, compression=compression)
+        table.ratios[f"{OURS}, {compression}"] = other.stat().st_size / ours
+        other.unlink()
+    chunks = rivals.raw_chunks(log, STEP_TOPIC)
+    rest = ours - sum(map(len, rivals.compressed_chunks(log, (STEP_TOPIC,))))
+    by_level_1 = rest + sum(map(len, rivals.level_1_chunks(chunks)))
+    table.ratios[f"{OURS}, if packed by zstd's level 1"] = by_level_1 / ours
+    for name, write, path in (
+        ("h5py, gzip 1", rivals.write_h5py, folder / "table.h5"),
+        ("Parquet, zstd 1", rivals.write_parquet, folder / "table.parquet"),
+        ("npz, compressed", rivals.write_npz, folder / "table.npz"),
+    ):
+        try:
+            write(data, path)
+        except ImportError as error:
+            table.missing[name] = str(error)
+            continue
+        table.ratios[name] = path.stat().st_size / ours
+    columns = sum(column.nbytes for column in rivals.columns_of(data).values())
+    table.ratios = {OURS: 1.0, **table.ratios, "the columns in memory": columns / ours}
+    print(table.to_markdown(), flush=True)
+    return table
 
 
 def _threads(log: Path) -> Table:
