@@ -40,16 +40,23 @@ def inlined(function: AnyFunction) -> AnyFunction:
     return _compiled(function, forceinline=True)
 
 
-def ready(function: Callable[..., None], *arguments: Any) -> Callable[[], None]:
+def ready(
+    function: Callable[..., None], *arguments: Any, examples: tuple[Any, ...] = ()
+) -> Callable[..., None]:
     """Bind a compiled function to arguments that stay the same objects: arrays, and constants.
 
     A call by name looks at the type of each argument first, which for a single vehicle takes as
     long as the step itself. Here that is done once; the arrays' contents may change, and nothing
     else of them.
+
+    Args:
+        function: to be called.
+        *arguments: its first ones.
+        examples: of the types of the others, which are given in each call.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)
-    kinds = tuple(numba.typeof(argument) for argument in arguments)
+    kinds = tuple(numba.typeof(argument) for argument in (*arguments, *examples))
     function.compile(kinds)
     return partial(function.get_overload(kinds), *arguments)
 

@@ -85,6 +85,19 @@ class Fleet(ABC):
     def advance(self) -> None:
         """Take one step with each vehicle, by its number in `actions`."""
 
+    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+        """Take a step with the only vehicle of a fleet of one.
+
+        Args:
+            action: a valid one.
+
+        Returns:
+            What it observes, its reward, how its episode ended as in `ends`, and its `info`.
+        """
+        self.actions[0] = action
+        self.advance()
+        return self.observation(0), self.rewards.item(), self.ends.item(), self.info(0)
+
     @abstractmethod
     def _kernel(self) -> tuple[Any, ...]:
         """Give the compiled function of a step, and its arguments, which are never replaced."""

@@ -60,10 +60,38 @@ def step_cars(
     for i in range(first, len(cars)):
         before = car_at(cars[i])
         after = drive(before, actions[i])
-        rewards[i] = reward_of(before, after)
-        ends[i] = end_of(after)
+        rewards[i], ends[i] = reward_of(before, after), end_of(after)
         observe(after, observations[i])
         store_car(after, cars[i])
+
+
+@compiled
+def step_only_car(
+    cars: NDArray[np.float64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+    told: NDArray[np.float64],
+    action: int,
+) -> None:
+    """Do as `step_cars` with a single car, and put together all that is told of it.
+
+    Args:
+        cars: (1, 10) a row that begins with `Car`, and ends with where the car started.
+        rewards: (1,) to be filled.
+        ends: (1,) to be filled.
+        observations: (1, 12) to be filled.
+        told: (6,) to be filled with reward, end, offset, heading error, speed and progress.
+        action: 0 to 5.
+    """
+    before = car_at(cars[0])
+    after = drive(before, action)
+    rewards[0], ends[0] = reward_of(before, after), end_of(after)
+    observe(after, observations[0])
+    store_car(after, cars[0])
+    told[0], told[1] = rewards[0], ends[0]
+    told[2], told[3], told[4] = after.offset_m, after.heading_error_rad, after.speed_m_s
+    told[5] = after.along_m - cars[0, -1]
 
 
 @compiled

@@ -17,7 +17,7 @@ from mcaprl.sims.compiled import ready
 from mcaprl.sims.depth import DepthCamera, encode_depth, encode_nearness
 from mcaprl.sims.draws import Draws
 from mcaprl.sims.fleet import GOING_ON, Fleet
-from mcaprl.sims.lane_block import step_cars
+from mcaprl.sims.lane_block import step_cars, step_only_car
 from mcaprl.sims.lane_camera import IMAGE_SHAPE, lane_camera
 from mcaprl.sims.lane_classic import (
     CLASSIC_DECISION_S,
@@ -81,6 +81,8 @@ class LaneFleet(Fleet):
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._draws = Draws(count, 4)
+        # Of a single car: see `step_only_car`.
+        self._told = np.zeros(6)
         # Which car is to be started by itself, and by what chance.
         self._chosen, self._shares = np.zeros(1, dtype=np.int64), np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
@@ -88,6 +90,7 @@ class LaneFleet(Fleet):
         self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
         self._has_pictures = observation == "depth" or self._has_dashboard
         self._seen = self._rays if self._has_rays else self._states
+        self._is_told_at_once = observation == "state" and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
         self._camera: DepthCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
@@ -135,9 +138,41 @@ class LaneFleet(Fleet):
         if self._depth_m:
             self._depth_m.clear()
 
+    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+        """Drive on with the only car: all that is told of its state comes in one call."""
+        if not self._is_told_at_once:
+            return super().step_one(action)
+        self._drive_only(action)
+        if self._depth_m:
+            self._depth_m.clear()
+        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._tell_only()
+        info = {
+            "lateral_offset_m": offset_m,
+            "heading_error_rad": heading_error_rad,
+            "speed_m_s": speed_m_s,
+            "progress_m": progress_m,
+        }
+        return self._observe_only(), reward, int(end), info
+
     def _kernel(self) -> tuple[Any, ...]:
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
         return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
+
+    # Of a fleet of one, what its steps call.
+
+    @cached_property
+    def _drive_only(self) -> Callable[[int], None]:
+        arrays = (self._cars, self.rewards, self.ends, self._states, self._told)
+        return ready(step_only_car, *arrays, examples=(0,))
+
+    @cached_property
+    def _tell_only(self) -> Callable[[], list[float]]:
+        return self._told.tolist
+
+    @cached_property
+    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
+        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
+        return copy
 
     # Views of each row, made once: a single environment reads one of each in every step.
 

@@ -77,19 +77,19 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         Raises:
             UsageError: there is no such action.
         """
-        fleet = self.fleet
-        fleet.actions[0] = check_action(action, self._n_actions)
+        # Most are plain numbers, which are looked at here to save a call.
+        if type(action) is not int or not 0 <= action < self._n_actions:
+            action = check_action(action, self._n_actions)
         if self._noise_size:
-            fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
-        fleet.advance()
-        end, info = fleet.ends.item(), fleet.info(0)
+            self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
+        observation, reward, end, info = self.fleet.step_one(action)
         if self._is_watched:
             self._watch()
         if end == GOING_ON:
-            return fleet.observation(0), fleet.rewards.item(), False, False, info
-        info["reason"] = fleet.reasons[end]
-        truncated = fleet.truncates[end]
-        return fleet.observation(0), fleet.rewards.item(), not truncated, truncated, info
+            return observation, reward, False, False, info
+        info["reason"] = self.fleet.reasons[end]
+        truncated = self.fleet.truncates[end]
+        return observation, reward, not truncated, truncated, info
 
     @property
     @abstractmethod
