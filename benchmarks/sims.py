@@ -14,6 +14,7 @@ import numpy as np
 
 from benchmarks.measure import Side, Table, compare
 from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims.depth import encode_depth
 
 CARS, DRONES, RACERS = 1024, 64, 256
 QUADROTOR_STEPS = 5
@@ -27,11 +28,11 @@ STEPS = 1_000_000
 GOALS = {
     "car": 500_000,
     f"car, {CARS} in a batch": 5_000_000,
-    "car with a depth image": 4_000,
+    "depth image of 84x84": 4_000,
     f"quadrotor, 0.1 s of flight, {DRONES} in a batch": 200_000,
     f"racer with 18 rays, {RACERS} in a batch": 200_000,
 }
-"""Steps per CPU second."""
+"""Steps or frames per CPU second."""
 
 
 def ours() -> list[Side]:
@@ -43,6 +44,7 @@ def ours() -> list[Side]:
         _single("car", make_sim("lane"), 10_000),
         _batch(f"car, {CARS} in a batch", make_sims("lane", CARS), 200),
         _single("car with 16 rays", make_sim("lane", observation="rays"), 2_000),
+        _pictures("depth image of 84x84", make_sim("lane"), 100),
         _single("car with a depth image", make_sim("lane", observation="depth"), 100),
         _batch(
             f"quadrotor, 0.1 s of flight, {DRONES} in a batch",
@@ -107,6 +109,23 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
                 sim.reset()
 
     return Side(name, run, share=steps / STEPS)
+
+
+def _pictures(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
+    """A frame for each step, and none for a reset."""
+    sim: Any = env.unwrapped
+    sim.action_space.seed(0)
+    actions = [sim.action_space.sample() for _ in range(frames)]
+    sim.reset(seed=0)
+
+    def run() -> None:
+        for action in actions:
+            _, _, terminated, truncated, _ = sim.step(action)
+            encode_depth(sim.depth_image_m())
+            if terminated or truncated:
+                sim.reset()
+
+    return Side(name, run, share=frames / STEPS)
 
 
 def _batch(name: str, env: gym.vector.VectorEnv[Any, Any, Any], steps: int, each: int = 1) -> Side:

@@ -93,14 +93,17 @@ def shrink(
         sums[:], hits[:] = 0.0, 0.0
         for k in range(rows.weights.shape[1]):
             line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
-            for column in range(width):
-                sums[column] += weight * line[column]
-                hits[column] += weight * (line[column] > 0.0)
+            # Many rows overlap with fewer others than there is room for.
+            if weight > 0.0:
+                for column in range(width):
+                    sums[column] += weight * line[column]
+                    hits[column] += weight if line[column] > 0.0 else 0.0
         for j in range(len(columns.first)):
             total, hit = 0.0, 0.0
-            for k in range(columns.weights.shape[1]):
-                total += columns.weights[j, k] * sums[columns.first[j] + k]
-                hit += columns.weights[j, k] * hits[columns.first[j] + k]
+            first, weights = columns.first[j], columns.weights[j]
+            for k in range(len(weights)):
+                total += weights[k] * sums[first + k]
+                hit += weights[k] * hits[first + k]
             depth_m[i, j] = hit / total if hit >= 0.5 else math.inf
 
 

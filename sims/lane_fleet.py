@@ -83,8 +83,8 @@ class LaneFleet(Fleet):
         self._draws = Draws(count, 4)
         # Of a single car: see `step_only_car`.
         self._told = np.zeros(6)
-        # Which car is to be started by itself, and by what chance.
-        self._chosen, self._shares = np.zeros(1, dtype=np.int64), np.zeros(4)
+        # By what chance a car is started by itself.
+        self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
@@ -107,11 +107,10 @@ class LaneFleet(Fleet):
             store_car(car, row)
             row[STARTED_AT] = row[ALONG]
             observe(car, self._states[i])
+            self.rewards[i], self.ends[i] = 0.0, GOING_ON
         else:
-            self._chosen[0] = i
             self._draws.one(i, self._shares)
-            self._start_chosen()
-        self.rewards[i], self.ends[i] = 0.0, GOING_ON
+            self._start_one(i)
         if self._has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
         self._depth_m.pop(i, None)
@@ -120,8 +119,8 @@ class LaneFleet(Fleet):
         """Start an episode of some cars."""
         draws, kind = self._draws, (self._on_line, self._classic)
         draws.draw_ahead(chosen)
-        start_cars(chosen, draws.numbers, draws.used, *kind, self._cars, self._states)
-        self.rewards[chosen], self.ends[chosen] = 0.0, GOING_ON
+        chances = (draws.numbers, draws.used, *kind)
+        start_cars(chosen, *chances, self._cars, self.rewards, self.ends, self._states)
         if self._has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
             observe_all_rays(self._cars[chosen], seen)
@@ -138,7 +137,7 @@ class LaneFleet(Fleet):
         if self._depth_m:
             self._depth_m.clear()
 
-    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+    def step_one(self, action: int) -> tuple[Any, float, float, dict[str, Any]]:
         """Drive on with the only car: all that is told of its state comes in one call."""
         if not self._is_told_at_once:
             return super().step_one(action)
@@ -152,7 +151,7 @@ class LaneFleet(Fleet):
             "speed_m_s": speed_m_s,
             "progress_m": progress_m,
         }
-        return self._observe_only(), reward, int(end), info
+        return self._observe_only(), reward, end, info
 
     def _kernel(self) -> tuple[Any, ...]:
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
@@ -177,9 +176,9 @@ class LaneFleet(Fleet):
     # Views of each row, made once: a single environment reads one of each in every step.
 
     @cached_property
-    def _start_chosen(self) -> Callable[[], None]:
-        which, kind = (self._chosen, self._shares), (self._on_line, self._classic)
-        return ready(start_one_of, *which, *kind, self._cars, self._states)
+    def _start_one(self) -> Callable[[int], None]:
+        kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
+        return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
     @cached_property
     def _car_rows(self) -> list[NDArray[np.float64]]:

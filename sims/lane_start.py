@@ -15,7 +15,15 @@ from mcaprl.sims.draws import take
 from mcaprl.sims.geometry import leg_at, project
 from mcaprl.sims.lane_classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane_course import COURSE, LANE_HALF_WIDTH_M
-from mcaprl.sims.lane_rules import MAX_SPEED_M_S, Car, drive, located, observe, store_car
+from mcaprl.sims.lane_rules import (
+    DRIVING,
+    MAX_SPEED_M_S,
+    Car,
+    drive,
+    located,
+    observe,
+    store_car,
+)
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
 """Where a row has how far a car is along the path, and, behind what `Car` has, how far it was."""
@@ -94,15 +102,18 @@ def start_car(
 
 @compiled
 def start_one_of(
-    chosen: NDArray[np.int64],
     shares: NDArray[np.float64],
     on_line: bool,
     classic: bool,
     cars: NDArray[np.float64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
     observations: NDArray[np.float32],
+    i: int,
 ) -> None:
-    """Start one of N cars as `start_car` does: the number that `chosen`, (1,), holds."""
-    start_car(shares, on_line, classic, cars[chosen[0]], observations[chosen[0]])
+    """Start car i of N; the other arguments are as of `start_car` and `start_cars`."""
+    start_car(shares, on_line, classic, cars[i], observations[i])
+    rewards[i], ends[i] = 0.0, DRIVING
 
 
 @compiled
@@ -113,6 +124,8 @@ def start_cars(
     on_line: bool,
     classic: bool,
     cars: NDArray[np.float64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
     """Start K of N cars as `start_car` does.
@@ -124,10 +137,13 @@ def start_cars(
         on_line: as of `start_car`.
         classic: as of `start_car`.
         cars: (N, 10) rows, as of `start_car`.
+        rewards: (N,) to be set to none.
+        ends: (N,) to be set to DRIVING.
         observations: (N, 12).
     """
     for i in chosen:
         start_car(take(numbers, used, i), on_line, classic, cars[i], observations[i])
+        rewards[i], ends[i] = 0.0, DRIVING
 
 
 def car_from(options: dict[str, Any]) -> Car:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
+from operator import index
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import gymnasium as gym
@@ -51,6 +52,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
+        # Looked up in each step.
+        self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
@@ -64,7 +67,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         Raises:
             UsageError: `options` has an unknown key, or a pose that cannot be started from.
         """
-        super().reset(seed=seed)
+        if seed is not None:
+            super().reset(seed=seed)
         self.fleet.begin(0, self.np_random, options)
         self._trail.clear()
         if self._is_watched:
@@ -77,18 +81,23 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         Raises:
             UsageError: there is no such action.
         """
-        # Most are plain numbers, which are looked at here to save a call.
-        if type(action) is not int or not 0 <= action < self._n_actions:
-            action = check_action(action, self._n_actions)
+        try:
+            number = index(action)
+        except TypeError:
+            number = -1
+        if not 0 <= number < self._n_actions:
+            # It says what is wrong; a call in each step would take longer than this.
+            number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
-        observation, reward, end, info = self.fleet.step_one(action)
+        observation, reward, end, info = self._step_one(number)
         if self._is_watched:
             self._watch()
         if end == GOING_ON:
             return observation, reward, False, False, info
-        info["reason"] = self.fleet.reasons[end]
-        truncated = self.fleet.truncates[end]
+        code = int(end)
+        info["reason"] = self.fleet.reasons[code]
+        truncated = self.fleet.truncates[code]
         return observation, reward, not truncated, truncated, info
 
     @property
