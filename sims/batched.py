@@ -68,6 +68,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self._take_spaces(self.fleet)
         self._truncates = np.array(self.fleet.truncates)
+        self._some_truncate = bool(self._truncates.any())
         # Whoever goes on has none.
         self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
@@ -136,9 +137,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         # These were at their end already: their step is a reset.
         self._begin_all(np.flatnonzero(fresh))
         ended_itself = fleet.ends != GOING_ON
-        cut = self._truncates[fleet.ends]
-        terminated = ended_itself & ~cut
-        truncated = cut | (self._steps >= self._max_steps)
+        terminated, truncated = ended_itself, self._steps >= self._max_steps
+        if self._some_truncate:
+            cut = self._truncates[fleet.ends]
+            terminated, truncated = ended_itself & ~cut, cut | truncated
         rewards = fleet.rewards.copy()
         self._ended = terminated | truncated
         infos = self._infos(ended_itself)

@@ -89,6 +89,9 @@ def draw(
     """
     inverse_z[:] = 0.0
     corners, polygon = np.empty((3, 3)), np.empty((4, 3))
+    middles, left_u, right_u = np.empty((3, inverse_z.shape[0]))
+    for row in range(len(middles)):
+        middles[row] = row + 0.5
     # How far the picture reaches to each side where z is 1; a corner on its border counts as in it.
     wide, high = 0.5 * inverse_z.shape[1] / focal_px, 0.5 * inverse_z.shape[0] / focal_px
     for face in range(len(mesh)):
@@ -116,7 +119,9 @@ def draw(
         plane = _plane(corners)
         if plane.offset < 0.0:
             count = _clip_near(corners, polygon)
-            _fill(polygon, count, plane, focal_px, inverse_z)
+            _project(polygon, count, focal_px, inverse_z)
+            rows = _spans(polygon, count, middles, left_u, right_u)
+            _fill(rows, left_u, right_u, plane, focal_px, inverse_z)
 
 
 class _Plane(NamedTuple):
@@ -167,50 +172,88 @@ def _clip_near(corners: Floats, polygon: Floats) -> int:
 
 
 @compiled
-def _fill(polygon: Floats, count: int, plane: _Plane, focal_px: float, inverse_z: Floats) -> None:
-    """Draw a convex polygon of camera coordinates that lies in a plane.
+def _project(polygon: Floats, count: int, focal_px: float, inverse_z: Floats) -> None:
+    """Turn the x and y of a polygon's corners into the picture's u and v, pixels."""
+    height, width = inverse_z.shape
+    for i in range(count):
+        scale = focal_px / polygon[i, 2]
+        polygon[i, 0] = 0.5 * width + scale * polygon[i, 0]
+        polygon[i, 1] = 0.5 * height + scale * polygon[i, 1]
+
+
+@compiled
+def _spans(
+    polygon: Floats, count: int, middles: Floats, left_u: Floats, right_u: Floats
+) -> tuple[int, int]:
+    """Find the leftmost and rightmost u of a convex polygon on each row of the picture.
+
+    Neighbours walk their common edge in opposite directions. Taken from above, it has the same u
+    for both to the last bit. Edge by edge, the compiler can do several rows at once.
+
+    Args:
+        polygon: (4, 3) its corners' u and v.
+        count: of them.
+        middles: (height,) v of each row's middle.
+        left_u: (height,) to be filled for the rows that it is on.
+        right_u: likewise.
+
+    Returns:
+        The first row that it is on, and the first one that it is no longer on.
+    """
+    top, bottom = math.inf, -math.inf
+    for i in range(count):
+        top, bottom = min(top, polygon[i, 1]), max(bottom, polygon[i, 1])
+    first = max(0, math.ceil(max(top, 0.0) - 0.5))
+    stop = math.ceil(min(float(len(middles)), bottom - 0.5))
+    for row in range(first, stop):
+        left_u[row], right_u[row] = math.inf, -math.inf
+    for i in range(count):
+        j = (i + 1) % count
+        above, below = (i, j) if polygon[i, 1] <= polygon[j, 1] else (j, i)
+        above_u, above_v = polygon[above, 0], polygon[above, 1]
+        width, height = polygon[below, 0] - above_u, polygon[below, 1] - above_v
+        start = max(first, math.ceil(max(above_v, 0.0) - 0.5))
+        end = min(stop, math.ceil(min(float(len(middles)), polygon[below, 1] - 0.5)))
+        for row in range(start, end):
+            u = above_u + (middles[row] - above_v) / height * width
+            left_u[row], right_u[row] = min(left_u[row], u), max(right_u[row], u)
+    return first, stop
+
+
+@compiled
+def _fill(
+    rows: tuple[int, int],
+    left_u: Floats,
+    right_u: Floats,
+    plane: _Plane,
+    focal_px: float,
+    inverse_z: Floats,
+) -> None:
+    """Draw a convex polygon that lies in a plane.
 
     A pixel belongs to it if its middle does; a middle on a border belongs to the side at the right
     or below, so that neighbours leave no gap. The points p = z (u/f, v/f, 1) of the plane have
     1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the picture.
+
+    Args:
+        rows: the first that it is on, and the first that it is no longer on.
+        left_u: (height,) where it begins on each of them.
+        right_u: (height,) where it ends.
+        plane: of camera coordinates.
+        focal_px: of the lens.
+        inverse_z: the picture.
     """
     height, width = inverse_z.shape
     middle_u, middle_v = 0.5 * width, 0.5 * height
-    top, bottom = float(height), 0.0
-    for i in range(count):
-        scale = focal_px / polygon[i, 2]
-        polygon[i, 0] = middle_u + scale * polygon[i, 0]
-        polygon[i, 1] = middle_v + scale * polygon[i, 1]
-        top, bottom = min(top, polygon[i, 1]), max(bottom, polygon[i, 1])
     step = plane.x / (plane.offset * focal_px)
-    for row in range(max(0, math.ceil(top - 0.5)), math.ceil(min(float(height), bottom - 0.5))):
-        left_u, right_u = _span(polygon, count, row + 0.5)
-        start = math.ceil(max(0.0, left_u - 0.5))
-        end = math.ceil(min(float(width), right_u - 0.5))
+    for row in range(rows[0], rows[1]):
+        start = math.ceil(max(0.0, left_u[row] - 0.5))
+        end = math.ceil(min(float(width), right_u[row] - 0.5))
         at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
         at_zero = at_v / plane.offset + step * (0.5 - middle_u)
         for column in range(start, end):
             # Without a branch, so that the compiler can do several pixels at once.
             inverse_z[row, column] = max(inverse_z[row, column], at_zero + step * column)
-
-
-@compiled
-def _span(polygon: Floats, count: int, v: float) -> tuple[float, float]:
-    """Give the leftmost and rightmost u of a convex polygon on one row of the picture.
-
-    Neighbours walk their common edge in opposite directions. Taken from above, it has the same u
-    for both to the last bit.
-    """
-    left_u, right_u = math.inf, -math.inf
-    for i in range(count):
-        j = (i + 1) % count
-        above, below = (i, j) if polygon[i, 1] <= polygon[j, 1] else (j, i)
-        if polygon[above, 1] <= v < polygon[below, 1]:
-            height = polygon[below, 1] - polygon[above, 1]
-            share = (v - polygon[above, 1]) / height
-            u = polygon[above, 0] + share * (polygon[below, 0] - polygon[above, 0])
-            left_u, right_u = min(left_u, u), max(right_u, u)
-    return left_u, right_u
 
 
 @compiled

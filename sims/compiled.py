@@ -11,6 +11,7 @@ import numba
 from numba.core import event
 
 AnyFunction = TypeVar("AnyFunction", bound=Callable[..., object])
+Result = TypeVar("Result")
 
 
 def compiled(function: AnyFunction) -> AnyFunction:
@@ -41,8 +42,8 @@ def inlined(function: AnyFunction) -> AnyFunction:
 
 
 def ready(
-    function: Callable[..., None], *arguments: Any, examples: tuple[Any, ...] = ()
-) -> Callable[..., None]:
+    function: Callable[..., Result], *arguments: Any, examples: tuple[Any, ...] = ()
+) -> Callable[..., Result]:
     """Bind a compiled function to arguments that stay the same objects: arrays, and constants.
 
     A call by name looks at the type of each argument first, which for a single vehicle takes as

@@ -26,11 +26,12 @@ def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 
     One code is a step of 2.1 % at any distance. Infinity is 255.
     """
-    clipped_m = np.clip(depth_m, NEAREST_M, FARTHEST_M)
-    codes: NDArray[np.uint8] = np.rint(_CODES_PER_E * np.log(clipped_m / NEAREST_M)).astype(
-        np.uint8
-    )
-    return codes
+    codes = np.asarray(np.clip(depth_m, NEAREST_M, FARTHEST_M))
+    codes /= NEAREST_M
+    np.log(codes, out=codes)
+    codes *= _CODES_PER_E
+    np.rint(codes, out=codes)
+    return codes.astype(np.uint8)
 
 
 def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -85,7 +85,7 @@ class Fleet(ABC):
     def advance(self) -> None:
         """Take one step with each vehicle, by its number in `actions`."""
 
-    def step_one(self, action: int) -> tuple[Any, float, float, dict[str, Any]]:
+    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
         """Take a step with the only vehicle of a fleet of one.
 
         Args:

@@ -71,27 +71,42 @@ def step_only_car(
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
-    told: NDArray[np.float64],
     action: int,
-) -> None:
-    """Do as `step_cars` with a single car, and put together all that is told of it.
+) -> tuple[float, int, float, float, float, float]:
+    """Do as `step_cars` with a single car, and give back all that is told of it.
 
     Args:
         cars: (1, 10) a row that begins with `Car`, and ends with where the car started.
         rewards: (1,) to be filled.
         ends: (1,) to be filled.
         observations: (1, 12) to be filled.
-        told: (6,) to be filled with reward, end, offset, heading error, speed and progress.
         action: 0 to 5.
+
+    Returns:
+        Reward, end, offset, heading error, speed and progress.
     """
     before = car_at(cars[0])
     after = drive(before, action)
-    rewards[0], ends[0] = reward_of(before, after), end_of(after)
+    reward, end = reward_of(before, after), end_of(after)
+    rewards[0], ends[0] = reward, end
     observe(after, observations[0])
     store_car(after, cars[0])
-    told[0], told[1] = rewards[0], ends[0]
-    told[2], told[3], told[4] = after.offset_m, after.heading_error_rad, after.speed_m_s
-    told[5] = after.along_m - cars[0, -1]
+    progress_m = after.along_m - cars[0, -1]
+    return reward, end, after.offset_m, after.heading_error_rad, after.speed_m_s, progress_m
+
+
+@compiled
+def tell_cars(cars: NDArray[np.float64], told: NDArray[np.float64]) -> None:
+    """Put together what is told of N cars.
+
+    Args:
+        cars: (N, 10) rows that begin with `Car`, and end with where the car started.
+        told: (4, N) to be filled with offsets, heading errors, speeds and progress.
+    """
+    for i in range(len(cars)):
+        car = car_at(cars[i])
+        told[0, i], told[1, i], told[2, i] = car.offset_m, car.heading_error_rad, car.speed_m_s
+        told[3, i] = car.along_m - cars[i, -1]
 
 
 @compiled

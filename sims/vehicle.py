@@ -95,9 +95,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
             self._watch()
         if end == GOING_ON:
             return observation, reward, False, False, info
-        code = int(end)
-        info["reason"] = self.fleet.reasons[code]
-        truncated = self.fleet.truncates[code]
+        info["reason"] = self.fleet.reasons[end]
+        truncated = self.fleet.truncates[end]
         return observation, reward, not truncated, truncated, info
 
     @property
