@@ -44,6 +44,10 @@ class Racer(NamedTuple):
     """Of the heading from the path's direction, counter-clockwise, in [-pi, pi)."""
 
 
+STARTED_AT = len(Racer._fields)
+"""Where a row has, behind all that, how far along the path the car was at its start."""
+
+
 @compiled
 def racer_at(row: NDArray[np.float64]) -> Racer:
     """Read a car from a row of 12 floats."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -11,24 +12,27 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.sims.arguments import check_name
+from mcaprl.sims.compiled import ready
 from mcaprl.sims.fleet import GOING_ON, Fleet
-from mcaprl.sims.racer_car import Racer, store_racer
+from mcaprl.sims.racer_car import STARTED_AT, Racer, store_racer
 from mcaprl.sims.racer_rules import (
     ACTION_MEANINGS,
     OBSERVATION_NAMES,
     REASONS,
     STEP_S,
     TRUNCATES,
+    Told,
     observe,
+    step_only_racer,
     step_racers,
+    tell_racers,
 )
-from mcaprl.sims.racer_start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_racer
+from mcaprl.sims.racer_start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_one_of
 from mcaprl.sims.racer_track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track, make_track
 
 RULES = ("default", "classic")
 OBSERVATIONS = ("rays",)
 STARTS = ("anywhere", "line")
-ALONG = Racer._fields.index("along_m")
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 
 
@@ -69,28 +73,29 @@ class RacerFleet(Fleet):
             tuple(ACTION_MEANINGS[action] for action in self.action_set),
             STEP_S,
         )
+        self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        self._start = ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE
+        # By what chance a car is started.
+        self._shares = np.zeros(ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE)
         self._drift = bool(drift)
-        self._cars = np.zeros((count, len(Racer._fields)))
-        self._started_at_m = np.zeros(count)
+        self._cars = np.zeros((count, STARTED_AT + 1))
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
 
     def car(self, i: int) -> Racer:
         """Give the whole state of a car."""
-        return Racer._make(self._cars[i].tolist())
+        return Racer._make(self._cars[i, :STARTED_AT].tolist())
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `RacerEnv`."""
-        row, seen = self._cars[i], self._seen[i]
         if options:
-            car = racer_from(self.track, options)
+            car, row = racer_from(self.track, options), self._cars[i]
             store_racer(car, row)
-            observe(self.track, car, self.classic, seen)
+            row[STARTED_AT] = car.along_m
+            observe(self.track, car, self.classic, self._seen[i])
         else:
-            start_racer(self.track, random.random(self._start), self.classic, row, seen)
-        self._started_at_m[i] = row[ALONG]
+            random.random(out=self._shares)
+            self._start_one(i)
         self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
 
     def advance(self) -> None:
@@ -98,32 +103,49 @@ class RacerFleet(Fleet):
         self.action_set.take(self.actions, out=self.last_actions, mode="clip")
         self._step()
 
-    def _kernel(self) -> tuple[Any, ...]:
-        return (
-            step_racers,
-            self.track,
-            self._cars,
-            self.last_actions,
-            self.rewards,
-            self.ends,
-            self._seen,
-            self.classic,
-            self._drift,
+    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+        """Drive on with the only car: all that is told of its state comes in one call."""
+        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
+            self._numbers[action]
         )
+        # As `_named`, which would be one more call.
+        info = {
+            "lateral_offset_m": offset_m,
+            "heading_error_rad": heading_error_rad,
+            "speed_m_s": speed_m_s,
+            "progress_m": progress_m,
+            "gates_passed": gates,
+        }
+        return self._observe_only(), reward, end, info
 
-    # Views of each row, made once: a single environment reads one of each in every step.
+    def _kernel(self) -> tuple[Any, ...]:
+        return step_racers, *self._arguments
+
+    @property
+    def _arguments(self) -> tuple[Any, ...]:
+        outcome = (self.rewards, self.ends, self._seen)
+        return (self.track, self._cars, self.last_actions, *outcome, self.classic, self._drift)
 
     @cached_property
-    def _car_rows(self) -> list[NDArray[np.float64]]:
-        return list(self._cars)
+    def _start_one(self) -> Callable[[int], None]:
+        arrays = (self._shares, self._cars, self._seen)
+        return ready(start_one_of, self.track, self.classic, *arrays, examples=(0,))
+
+    # Of a fleet of one, what its steps call.
 
     @cached_property
-    def _seen_rows(self) -> list[NDArray[np.float32]]:
-        return list(self._seen)
+    def _drive_only(self) -> Callable[[int], Told]:
+        return ready(step_only_racer, *self._arguments, examples=(0,))
+
+    @cached_property
+    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
+        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
+        return copy
 
     def observation(self, i: int) -> NDArray[np.float32]:
         """Give the numbers that car i sees."""
-        return self._seen_rows[i].copy()
+        seen: NDArray[np.float32] = self._seen[i].copy()
+        return seen
 
     def observations(self) -> NDArray[np.float32]:
         """Give what all cars see."""
@@ -136,25 +158,28 @@ class RacerFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
-        described = _described(self._car_rows[i].tolist(), self._started_at_m.item(i))
-        described["gates_passed"] = int(described["gates_passed"])
-        return described
+        told = np.empty((5, 1))
+        tell_racers(self._cars[i : i + 1], told)
+        offset_m, heading_error_rad, speed_m_s, progress_m, gates = told[:, 0].tolist()
+        return _named(offset_m, heading_error_rad, speed_m_s, progress_m, int(gates))
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Give the `info` of all cars."""
-        described = _described(self._cars.T, self._started_at_m)
-        described["gates_passed"] = described["gates_passed"].astype(np.int64)
-        return {name: column.copy() for name, column in described.items()}
+        told = np.empty((5, self.count))
+        tell_racers(self._cars, told)
+        offset_m, heading_error_rad, speed_m_s, progress_m, gates = told
+        return _named(offset_m, heading_error_rad, speed_m_s, progress_m, gates.astype(np.int64))
 
 
-def _described(car: Any, started_at_m: Any) -> dict[str, Any]:
-    """Name what is told of a car, or of all: 12 numbers, or as many columns."""
-    _, _, _, _, speed_px, _, gates, _, _, along_m, offset_m, heading_error_rad = car
+def _named(
+    offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any, gates: Any
+) -> dict[str, Any]:
+    """Name what is told of a car, or of all."""
     return {
         "lateral_offset_m": offset_m,
         "heading_error_rad": heading_error_rad,
-        "speed_m_s": speed_px * METRES_PER_PX / STEP_S,
-        "progress_m": along_m - started_at_m,
+        "speed_m_s": speed_m_s,
+        "progress_m": progress_m,
         "gates_passed": gates,
     }
 

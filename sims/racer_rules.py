@@ -217,7 +217,7 @@ def step_racers(
 
     Args:
         track: that all drive on.
-        cars: (N, 12) rows of `Racer`.
+        cars: (N, 13) rows that begin with `Racer`.
         actions: (N,) 0 to 8.
         rewards: (N,) to be filled.
         ends: (N,) to be filled with DRIVING, CRASH, NO_GATE or TIME_LIMIT.
@@ -231,3 +231,50 @@ def step_racers(
         rewards[i], ends[i] = judge(track, before, after, classic)
         observe(track, after, classic, observations[i])
         store_racer(after, cars[i])
+
+
+Told = tuple[float, int, float, float, float, float, int]
+
+
+@compiled
+def step_only_racer(
+    track: Track,
+    cars: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+    classic: bool,
+    drift: bool,
+    action: int,
+) -> Told:
+    """Do as `step_racers` with a single car, and give back all that is told of it.
+
+    Returns:
+        Reward, end, offset, heading error, speed, progress, and gates passed.
+    """
+    actions[0] = action
+    step_racers(track, cars, actions, rewards, ends, observations, classic, drift)
+    car = racer_at(cars[0])
+    told = (car.offset_m, car.heading_error_rad, speed_of(car), car.along_m - cars[0, -1])
+    return rewards[0], ends[0], *told, int(car.gates)
+
+
+@compiled
+def tell_racers(cars: NDArray[np.float64], told: NDArray[np.float64]) -> None:
+    """Put together what is told of N cars.
+
+    Args:
+        cars: (N, 13) rows that begin with `Racer`, and end with where the car started.
+        told: (5, N) to be filled with offsets, heading errors, speeds, progress and gates.
+    """
+    for i in range(len(cars)):
+        car = racer_at(cars[i])
+        told[0, i], told[1, i], told[2, i] = car.offset_m, car.heading_error_rad, speed_of(car)
+        told[3, i], told[4, i] = car.along_m - cars[i, -1], car.gates
+
+
+@compiled
+def speed_of(car: Racer) -> float:
+    """Give a car's speed, m/s; negative backwards."""
+    return car.speed_px * METRES_PER_PX / STEP_S

@@ -12,7 +12,7 @@ from mcaprl.errors import UsageError
 from mcaprl.sims.arguments import pose_from
 from mcaprl.sims.compiled import compiled
 from mcaprl.sims.geometry import leg_at, point_at
-from mcaprl.sims.racer_car import Racer, placed, store_racer
+from mcaprl.sims.racer_car import STARTED_AT, Racer, placed, store_racer
 from mcaprl.sims.racer_rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
 from mcaprl.sims.racer_track import HALF_WIDTH_PX, METRES_PER_PX, PICTURE_HEIGHT_PX, Track
 
@@ -63,7 +63,7 @@ def start_racer(
         track: to start on.
         shares: numbers from 0 to 1: (4,) for anywhere, (2,) for the line, (0,) for exactly there.
         classic: see by the classic rules.
-        row: (12,) of a `Racer`, to be filled.
+        row: (13,) of a `Racer`, and where it starts along the path, to be filled.
         observation: (19,) to be filled.
     """
     if len(shares) == ANYWHERE:
@@ -73,7 +73,21 @@ def start_racer(
     else:
         car = start_exactly(track)
     store_racer(car, row)
+    row[STARTED_AT] = car.along_m
     observe(track, car, classic, observation)
+
+
+@compiled
+def start_one_of(
+    track: Track,
+    classic: bool,
+    shares: NDArray[np.float64],
+    cars: NDArray[np.float64],
+    observations: NDArray[np.float32],
+    i: int,
+) -> None:
+    """Start car i of N as `start_racer` does."""
+    start_racer(track, shares, classic, cars[i], observations[i])
 
 
 @compiled
