@@ -20,7 +20,7 @@ from mcaprl.recorder.chunks import (
     message_index,
 )
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import contents_of, parse_record
+from mcaprl.recorder.mcap_records import contents_of, parse_record, uniform_indexes
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,12 @@ def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     """Whether the indexes tell of every byte of a chunk: messages that touch each other."""
     if not indexes or not len(records):
         return False
+    uniform = uniform_indexes(records)
+    if uniform is not None:
+        return uniform.keys() == indexes.keys() and all(
+            np.array_equal(index.view("<u8"), uniform[channel_id].view("<u8"))
+            for channel_id, index in indexes.items()
+        )
     entries = np.concatenate(list(indexes.values()))
     ids = np.repeat(np.array(list(indexes), np.uint16), [len(index) for index in indexes.values()])
     if len(indexes) > 1 or (np.diff(entries["offset"].astype(np.int64)) < 0).any():

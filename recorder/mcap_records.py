@@ -167,7 +167,7 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     Raises:
         CorruptLogError: a record is damaged, or reaches beyond the chunk.
     """
-    uniform = _uniform_indexes(chunk)
+    uniform = uniform_indexes(chunk)
     if uniform is not None:
         return ChunkContents([], uniform)
     topics, loose, end = [], LooseMessages(), 0
@@ -182,7 +182,7 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     return ChunkContents(topics, loose.indexes())
 
 
-def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
+def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
     """Indexes of a chunk of nothing but messages of one length; None if it is another."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None

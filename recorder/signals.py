@@ -8,6 +8,15 @@ import threading
 from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
+try:
+    # What `signal` wraps, to make enums of numbers and handlers: that takes ten times as long, and
+    # an episode's end holds signals twice.
+    from _signal import getsignal  # type: ignore[import-not-found]
+    from _signal import signal as set_handler
+except ImportError:
+    from signal import getsignal
+    from signal import signal as set_handler
+
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 # Windows has no SIGHUP.
 _HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
@@ -32,11 +41,11 @@ class HoldSignals:
         try:
             HoldSignals._is_held = True
             for number in _HELD:
-                handler = signal.getsignal(number)
+                handler = getsignal(number)
                 # None: not installed from Python, so it cannot be put back.
                 if handler is not None:
                     self._handlers[number] = handler
-                    signal.signal(number, self._note)
+                    set_handler(number, self._note)
         except BaseException:
             self._restore()
             raise
@@ -53,7 +62,7 @@ class HoldSignals:
             handler = self._handlers[number]
             if callable(handler):
                 handler(number, inspect.currentframe())
-            elif handler is signal.SIG_DFL:
+            elif handler == signal.SIG_DFL:
                 signal.raise_signal(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
@@ -64,4 +73,4 @@ class HoldSignals:
         if self._holds:
             HoldSignals._is_held = False
         for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+            set_handler(number, handler)
