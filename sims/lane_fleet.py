@@ -46,6 +46,7 @@ STARTS = ("anywhere", "line")
 OBSERVATIONS = ("state", "depth", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
+"""Where in a car's row begins what is told of it."""
 MOTION = slice(2, 4)
 """Speed and steering in a state."""
 
@@ -156,6 +157,11 @@ class LaneFleet(Fleet):
         arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
         return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
 
+    @cached_property
+    def _start_one(self) -> Callable[[int], None]:
+        kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
+        return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
+
     # Of a fleet of one, what its steps call.
 
     @cached_property
@@ -168,25 +174,10 @@ class LaneFleet(Fleet):
         copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
         return copy
 
-    # Views of each row, made once: a single environment reads one of each in every step.
-
-    @cached_property
-    def _start_one(self) -> Callable[[int], None]:
-        kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
-        return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
-
-    @cached_property
-    def _told_rows(self) -> list[NDArray[np.float64]]:
-        return list(self._cars[:, SPEED:])
-
-    @cached_property
-    def _seen_rows(self) -> list[NDArray[np.float32]]:
-        return list(self._seen)
-
     def observation(self, i: int) -> Any:
         """Give the numbers or the picture that car i sees."""
         if not self._has_pictures:
-            return self._seen_rows[i].copy()
+            return self._seen[i].copy()
         depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]
         return {"depth": depth, "motion": self._motions()[i]} if self._has_dashboard else depth
 
@@ -223,9 +214,8 @@ class LaneFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Give the `info` of car i."""
-        speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = self._told_rows[
-            i
-        ].tolist()
+        car = self._cars[i, SPEED:].tolist()
+        speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
         return _named(offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
 
     def infos(self) -> dict[str, NDArray[Any]]:
