@@ -183,8 +183,8 @@ class LogReader:
             episodes=episodes,
             actions=_without(_as_leaf(self.path, columns, action), finals),
             rewards=_without(columns["reward"].astype(np.float64, copy=False), finals),
-            terminated=_without(columns["terminated"].astype(bool), finals),
-            truncated=_without(columns["truncated"].astype(bool), finals),
+            terminated=_without(_flags(columns["terminated"]), finals),
+            truncated=_without(_flags(columns["truncated"]), finals),
             behavior_probs=_without(probs.astype(np.float32, copy=False), finals),
         )
         if self._selection.columns is not None:
@@ -275,6 +275,13 @@ def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
         f"{path}: {STEP_TOPIC} does not fit the spaces in the metadata: {leaf.name} is"
         f" {column.dtype} {column.shape[1:]}, its space {leaf.dtype} {leaf.shape}"
     )
+
+
+def _flags(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """A column of bytes as bools; anything but 0 is true."""
+    if column.dtype == np.uint8 and column.max(initial=0) <= 1:
+        return column.view(np.bool_)
+    return column.astype(np.bool_)
 
 
 def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
