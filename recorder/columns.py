@@ -29,7 +29,6 @@ from mcaprl.recorder.chunks import (
 from mcaprl.recorder.joined import Chosen, Rows, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, Span
-from mcaprl.recorder.memory import empty
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
 _MAX_LENGTHS = 16
@@ -74,7 +73,7 @@ class Topic:
     @cached_property
     def times(self) -> NDArray[np.int64]:
         """(N,) log_time of each message in the order of its channels and of the file."""
-        times: NDArray[np.int64] = empty((len(self),), np.int64)
+        times = np.empty(len(self), np.int64)
         for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
             times[stop - count : stop] = part.times
         return times
@@ -203,7 +202,7 @@ class Part:
         """Columns with the dtypes and shapes of the first message."""
         records = self._reader.records_of(self.span, scratch)
         example = self._values(records, self.span.index[0], wanted)
-        return {name: empty((count, *value.shape), value.dtype) for name, value in example.items()}
+        return {name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()}
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
         """Put copies of the messages that an index points at into rows of the columns."""
@@ -324,7 +323,7 @@ class Part:
 
 
 def _times_of(parts: list[Chosen], count: int) -> NDArray[np.int64]:
-    times: NDArray[np.int64] = empty((count,), np.int64)
+    times = np.empty(count, np.int64)
     for chosen in parts:
         times[chosen.rows] = chosen.index["log_time"]
     return times
