@@ -202,7 +202,9 @@ class Part:
         """Columns with the dtypes and shapes of the first message."""
         records = self._reader.records_of(self.span, scratch)
         example = self._values(records, self.span.index[0], wanted)
-        return {name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()}
+        return {
+            name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
+        }
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
         """Put copies of the messages that an index points at into rows of the columns."""
