@@ -27,7 +27,7 @@ from mcaprl.sims.racer_rules import (
     step_racers,
     tell_racers,
 )
-from mcaprl.sims.racer_start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_one_of
+from mcaprl.sims.racer_start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_racer
 from mcaprl.sims.racer_track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track, make_track
 
 RULES = ("default", "classic")
@@ -129,7 +129,7 @@ class RacerFleet(Fleet):
     @cached_property
     def _start_one(self) -> Callable[[int], None]:
         arrays = (self._shares, self._cars, self._seen)
-        return ready(start_one_of, self.track, self.classic, *arrays, examples=(0,))
+        return ready(start_racer, self.track, self.classic, *arrays, examples=(0,))
 
     # Of a fleet of one, what its steps call.
 

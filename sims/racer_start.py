@@ -52,19 +52,21 @@ def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Racer:
 @compiled
 def start_racer(
     track: Track,
-    shares: NDArray[np.float64],
     classic: bool,
-    row: NDArray[np.float64],
-    observation: NDArray[np.float32],
+    shares: NDArray[np.float64],
+    cars: NDArray[np.float64],
+    observations: NDArray[np.float32],
+    i: int,
 ) -> None:
-    """Start a car, and write it and what it sees.
+    """Start car i of N, and write it and what it sees.
 
     Args:
         track: to start on.
-        shares: numbers from 0 to 1: (4,) for anywhere, (2,) for the line, (0,) for exactly there.
         classic: see by the classic rules.
-        row: (13,) of a `Racer`, and where it starts along the path, to be filled.
-        observation: (19,) to be filled.
+        shares: numbers from 0 to 1: (4,) for anywhere, (2,) for the line, (0,) for exactly there.
+        cars: (N, 13) rows of a `Racer`, and of where it starts along the path.
+        observations: (N, 19).
+        i: which row is to be filled.
     """
     if len(shares) == ANYWHERE:
         car = start_anywhere(track, shares)
@@ -72,22 +74,9 @@ def start_racer(
         car = start_on_line(track, shares)
     else:
         car = start_exactly(track)
-    store_racer(car, row)
-    row[STARTED_AT] = car.along_m
-    observe(track, car, classic, observation)
-
-
-@compiled
-def start_one_of(
-    track: Track,
-    classic: bool,
-    shares: NDArray[np.float64],
-    cars: NDArray[np.float64],
-    observations: NDArray[np.float32],
-    i: int,
-) -> None:
-    """Start car i of N as `start_racer` does."""
-    start_racer(track, shares, classic, cars[i], observations[i])
+    store_racer(car, cars[i])
+    cars[i, STARTED_AT] = car.along_m
+    observe(track, car, classic, observations[i])
 
 
 @compiled
