@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.chunks import message_rows
 from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.display import ROSOUT, SCENE, Display
+from mcaprl.recorder.display import SCENE, Display
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.layout import LAYOUT_NAME, VALUES_TOPIC
 from mcaprl.recorder.log_layout import layout_of_log
 from mcaprl.recorder.log_reader import describe
-from mcaprl.recorder.log_writer import LogWriter
+from mcaprl.recorder.log_writer import LOG_TOPIC, LogWriter
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.schema import ENCAPSULATION, message_dtype, values_schema
 from mcaprl.recorder.verify import Verification, verify
@@ -109,24 +109,17 @@ class AnnotatedCopy:
                 through it since there are no seeds.
         """
         self._refuse(SCENE)
-        display = Display(
-            self._log,
-            env.unwrapped,
-            scene=True,
-            camera=camera,
-            log_lines=ROSOUT not in self._topics,
-        )
+        display = Display(self._log, env.unwrapped, scene=True, camera=camera)
         if not display.shows_steps:
             raise UsageError(f"{dataset.env_id} describes no scene; nothing can be added")
         step_ns = self._metadata.step_duration_ns
 
         def show(episode: Episode, step: int) -> None:
             if step == 0:
-                summary = episode.summary
-                display.begin(summary.start_time_ns, step_ns, summary.episode, summary.policy)
+                display.begin(episode.summary.start_time_ns, step_ns)
             display.observe(step, float(episode.rewards[step - 1]) if step else 0.0)
             if step == episode.length:
-                display.end(episode.summary)
+                display.end(episode.length)
 
         found = verify(dataset, env, on_frame=show)
         if found.difference is not None:
@@ -136,6 +129,8 @@ class AnnotatedCopy:
                 f"no scene was added, for the log has no seed of {len(found.unseeded)} episodes"
                 f" (the first: {found.unseeded[0]})"
             )
+        if LOG_TOPIC not in self._topics:
+            self._log.write_log_lines([episode.summary for episode in dataset.episodes])
         return found
 
     def _refuse(self, topic: str) -> None:

@@ -306,10 +306,10 @@ def _inflate_zstd(data: memoryview, scratch: Scratch | _Rest, limit: int) -> mem
     return memory[:count]
 
 
-def message_index_head(channel_id: int, index: NDArray[Any]) -> bytes:
+def message_index_head(channel_id: int, entries_bytes: int) -> bytes:
     """The MessageIndex record of a channel up to its entries, which follow it."""
-    length = _INDEX_START.size - RECORD_HEADER_BYTES + index.nbytes
-    head: bytes = _INDEX_START.pack(Opcode.MESSAGE_INDEX, length, channel_id, index.nbytes)
+    length = _INDEX_START.size - RECORD_HEADER_BYTES + entries_bytes
+    head: bytes = _INDEX_START.pack(Opcode.MESSAGE_INDEX, length, channel_id, entries_bytes)
     return head
 
 
@@ -366,10 +366,10 @@ def _touch_each_other(offsets: NDArray[Any], size: int, end: int) -> bool:
     if last - first != size * (len(offsets) - 1) or last + size > end:
         return False
     # The ends are right, so only what is between them is looked at.
-    return bool((offsets == _evenly(first, last, size)).all())
+    return bool((offsets == touching_offsets(first, last, size)).all())
 
 
 @lru_cache(maxsize=2)
-def _evenly(first: int, last: int, size: int) -> NDArray[np.uint64]:
+def touching_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
     """The offsets of messages that touch each other; all full chunks of a topic have the same."""
     return np.arange(first, last + 1, size, dtype=np.uint64)

@@ -1,6 +1,5 @@
 """Writes the topics that only viewers read, beside the transitions and under the same times.
 
-/rosout                 each episode's start and end, for any environment
 /scene, /scene/static   shapes: those that move, at most five times a second and at each episode's
                         start and end; those that do not, when an episode's differ from the one's
                         before. A viewer that jumps into the file fetches the last message of each
@@ -17,9 +16,8 @@ import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
-from mcaprl.recorder import messages
 from mcaprl.recorder.layout import RETURN_SO_FAR
-from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
+from mcaprl.recorder.log_writer import LogWriter
 from mcaprl.recorder.rows import ImageColumn
 from mcaprl.recorder.scene import (
     DepthSource,
@@ -33,9 +31,8 @@ from mcaprl.recorder.scene import (
 from mcaprl.recorder.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.signals import HoldSignals
 
-ROSOUT, SCENE, SCENE_STATIC = "/rosout", "/scene", "/scene/static"
+SCENE, SCENE_STATIC = "/scene", "/scene/static"
 TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
-_INFO = 20
 # Display messages are written when this much has gathered, or the episode ends.
 _CHUNK_BYTES = 2**20
 # Bodies move with their frames at each step; what else moves is drawn anew no sooner than this.
@@ -52,7 +49,6 @@ class Display:
         *,
         scene: bool,
         camera: bool,
-        log_lines: bool = True,
     ) -> None:
         """Prepare for `source`, an unwrapped environment, with methods of the protocols or without.
 
@@ -61,9 +57,7 @@ class Display:
             source: what is to be shown.
             scene: whether to record shapes, frames and telemetry.
             camera: whether to record the depth camera; it is anyway if observations are images.
-            log_lines: whether to tell of episodes' starts and ends.
         """
-        self._log_lines = log_lines
         self._log = log
         self._messages: list[tuple[int, int, bytes]] = []
         self._bytes = 0
@@ -76,6 +70,7 @@ class Display:
         self._depth_images: ImageColumn | None = None
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._channels: dict[str, int] = {}
+        self._is_announced = False
         self._static: dict[str, bytes] = {}
         # Shapes that were not drawn, for the next ones may be due: those at an episode's end are.
         self._held: tuple[int, Sequence[Shape]] | None = None
@@ -87,31 +82,24 @@ class Display:
         """The topics that are written; known once the first episode has begun."""
         return (*self._channels, *((DEPTH,) if self._depth_images else ()))
 
-    def begin(self, start_ns: int, step_ns: int, episode: int, policy: str) -> bool:
+    def begin(self, start_ns: int, step_ns: int) -> None:
         """Show an episode's start; the environment has just been reset.
 
         Args:
             start_ns: log_time of the first observation.
             step_ns: from one to the next.
-            episode: its number.
-            policy: who acts.
-
-        Returns:
-            Whether the topics were announced just now.
         """
         self._start_ns, self._step_ns = start_ns, step_ns
         self._return_so_far = 0.0
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
-        is_first = not self._channels
-        if is_first:
+        if not self._is_announced:
             self._announce()
-        self._say(start_ns, f"episode {episode} begins" + (f", {policy} acts" if policy else ""))
+            self._is_announced = True
         if self._scene is not None:
             self._emit_changed(SCENE_STATIC, start_ns, marker_array(self._scene.static_scene()))
             self._emit_changed(TF_STATIC, start_ns, transforms(self._scene.static_frames(), 0))
         if self._depth_images is not None:
             self._depth_images.begin(start_ns, step_ns)
-        return is_first
 
     def observe(self, step: int, reward: float) -> None:
         """Show the environment as it is after `step` steps, if anything of it can be shown.
@@ -138,17 +126,12 @@ class Display:
             millimetres = depth_millimetres(self._depth.depth_image_m())
             self._depth_images.keep(millimetres)
 
-    def end(self, summary: EpisodeSummary) -> None:
-        """Tell how an episode ended, and write what has gathered."""
+    def end(self, steps: int) -> None:
+        """Write what has gathered in an episode of so many steps."""
         self._draw_held()
-        self._say(
-            summary.end_time_ns,
-            f"episode {summary.episode} ends after {summary.length} steps:"
-            f" {summary.reason}, return {summary.total_reward:.4g}",
-        )
         self._flush_messages()
         if self._depth_images is not None:
-            self._depth_images.flush(summary.length + 1)
+            self._depth_images.flush(steps + 1)
 
     def clear(self) -> None:
         """Forget what has gathered."""
@@ -162,7 +145,7 @@ class Display:
         self._static = {}
 
     def _announce(self) -> None:
-        types = {ROSOUT: "rcl_interfaces/msg/Log"} if self._log_lines else {}
+        types: dict[str, str] = {}
         if self._scene is not None:
             self.follow_frame = next((frame.name for frame in self._scene.frames()), "")
             types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
@@ -177,21 +160,6 @@ class Display:
         if self._depth is not None:
             shape = self._depth.depth_image_m().shape
             self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
-
-    def _say(self, time_ns: int, text: str) -> None:
-        if not self._log_lines:
-            return
-        line = messages.new(
-            "rcl_interfaces/msg/Log",
-            stamp=messages.stamp(time_ns),
-            level=_INFO,
-            name="mcaprl",
-            msg=text,
-            file="",
-            function="",
-            line=0,
-        )
-        self._emit(ROSOUT, time_ns, messages.encode(line))
 
     def _draw_held(self) -> None:
         if self._held is not None:

@@ -6,6 +6,7 @@ A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, al
     /rl/step               mcaprl_msgs/msg/Step...   observation: what `schema` says
     /rl/observation/<key>  sensor_msgs/msg/Image     picture that is observed: mono8, rgb8 or rgba8
     /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end: what `messages` says
+                           and, of a recording, its start and end in words: /rosout
     /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy told its version
     all others                                       what only viewers show: see `display`
 
@@ -65,6 +66,7 @@ from mcaprl.recorder.spaces import action_leaf, observation_leaves
 STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
 LEARNER_TOPIC = "/rl/learner"
+LOG_TOPIC = "/rosout"
 INTERRUPTED = "interrupted"
 """Why an episode ended that the recorder, not the environment, broke off."""
 # Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
@@ -107,10 +109,21 @@ class EpisodeSummary(NamedTuple):
     seed: int | None = None
     options: str = ""
 
-    def to_message(self) -> Any:
-        """As `mcaprl_msgs/msg/Episode`."""
-        fields = {**self._asdict(), "seed": -1 if self.seed is None else self.seed}
-        return messages.new(messages.EPISODE_TYPE, **fields)
+    def to_message(self) -> bytes:
+        """As `mcaprl_msgs/msg/Episode`, in CDR."""
+        return messages.episode_message(**self._asdict())
+
+    def log_lines(self) -> list[tuple[int, str]]:
+        """Its start and its end in words, each with its log_time."""
+        acting = f", {self.policy} acts" if self.policy else ""
+        return [
+            (self.start_time_ns, f"episode {self.episode} begins{acting}"),
+            (
+                self.end_time_ns,
+                f"episode {self.episode} ends after {self.length} steps: {self.reason},"
+                f" return {self.total_reward:.4g}",
+            ),
+        ]
 
 
 class LogWriter:
@@ -155,6 +168,7 @@ class LogWriter:
         self.mcap.add_metadata(METADATA_NAME, strings)
         self._step_channel = self.mcap.add_channel(STEP_TOPIC, *self._step_type, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
+        self._log_channel: int | None = None
 
     def _check_same(self, strings: dict[str, str]) -> None:
         """Make sure that a file that is appended to was recorded from such an environment."""
@@ -218,14 +232,31 @@ class LogWriter:
         rows["payload"]["sec"], rows["payload"]["nanosec"] = sec, nanosec
         self.mcap.write_rows(rows)
 
-    def write_episodes(self, summaries: list[EpisodeSummary]) -> None:
-        """Write episodes to `/rl/episode`, each at its end's time."""
-        self.mcap.write_messages(
-            [
-                (self._episode_channel, summary.end_time_ns, messages.encode(summary.to_message()))
-                for summary in summaries
-            ]
-        )
+    def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
+        """Write episodes to `/rl/episode`, each at its end's time.
+
+        Args:
+            summaries: of the episodes.
+            log_lines: whether to tell of their starts and ends on `/rosout`, too.
+        """
+        told = [
+            (self._episode_channel, summary.end_time_ns, summary.to_message())
+            for summary in summaries
+        ]
+        self.mcap.write_messages(told + (self._lines(summaries) if log_lines else []))
+
+    def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
+        """Tell of episodes' starts and ends on `/rosout` alone."""
+        self.mcap.write_messages(self._lines(summaries))
+
+    def _lines(self, summaries: list[EpisodeSummary]) -> list[tuple[int, int, bytes]]:
+        if self._log_channel is None:
+            self._log_channel = self.add_channel(LOG_TOPIC, messages.LOG_TYPE)
+        return [
+            (self._log_channel, time_ns, messages.log_message(time_ns, text))
+            for summary in summaries
+            for time_ns, text in summary.log_lines()
+        ]
 
     def close(self) -> None:
         """Write the summary section and close the file. Closing twice is harmless."""

@@ -8,6 +8,7 @@ stand outside the chunks, before what needs them, so that a cut file is still re
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from mcaprl.recorder.chunks import (
     compressor,
     message_index_head,
     message_record,
+    touching_offsets,
 )
 from mcaprl.recorder.log_file import create, release, reopen
 from mcaprl.recorder.mcap_append import Standing, what_is_written
@@ -186,13 +188,19 @@ class McapWriter:
         """
         if len(rows) == 0:
             return
-        channel_id = int(rows["channel_id"][0])
+        channel_id, size = int(rows["channel_id"][0]), rows.itemsize
+        times = rows["log_time"].copy()
         rows["sequence"] = self._next_sequences(channel_id, len(rows))
-        rows["publish_time"] = rows["log_time"]
+        rows["publish_time"] = times
         index = np.empty(len(rows), INDEX_ENTRY)
-        index["log_time"] = rows["log_time"]
-        index["offset"] = np.arange(len(rows), dtype=np.uint64) * np.uint64(rows.itemsize)
-        self._write_chunk(rows.view(np.uint8).data, {channel_id: index})
+        index["log_time"] = times
+        index["offset"] = touching_offsets(0, size * (len(rows) - 1), size)
+        self._write_chunk(
+            rows.view(np.uint8).data,
+            {channel_id: index.view(np.uint8).data},
+            (int(times.min()), int(times.max())),
+            self._compress_long if size > _LONG_MESSAGE_BYTES else self._compress_short,
+        )
 
     def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
         """Write messages of any channels and lengths as one chunk.
@@ -203,12 +211,18 @@ class McapWriter:
         if not messages:
             return
         records = bytearray()
-        entries: dict[int, list[tuple[int, int]]] = {}
+        entries: dict[int, list[int]] = {}
         for channel_id, time_ns, data in messages:
-            entries.setdefault(channel_id, []).append((time_ns, len(records)))
+            entries.setdefault(channel_id, []).extend((time_ns, len(records)))
             records += message_record(channel_id, self._next_sequence(channel_id), time_ns, data)
-        indexes = {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
-        self._write_chunk(memoryview(records), indexes, self._compress_mixed)
+        times = [time_ns for _, time_ns, _ in messages]
+        self._write_chunk(
+            memoryview(records),
+            # Of so few, sooner packed by themselves than as an array.
+            {id_: struct.pack(f"<{len(pairs)}Q", *pairs) for id_, pairs in entries.items()},
+            (min(times), max(times)),
+            self._compress_mixed,
+        )
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:
         """Write a chunk's records as they are.
@@ -219,7 +233,15 @@ class McapWriter:
         """
         for channel_id, index in indexes.items():
             self._summary.counts[channel_id] += len(index)
-        self._write_chunk(records, dict(indexes))
+        starts = [int(index["log_time"].min()) for index in indexes.values()]
+        ends = [int(index["log_time"].max()) for index in indexes.values()]
+        is_long = len(records) > _LONG_MESSAGE_BYTES * sum(map(len, indexes.values()))
+        self._write_chunk(
+            records,
+            {channel_id: index.view(np.uint8).data for channel_id, index in indexes.items()},
+            (min(starts), max(ends)),
+            self._compress_long if is_long else self._compress_short,
+        )
 
     def close(self) -> None:
         """Write the summary and close the file. Closing twice is harmless."""
@@ -262,17 +284,13 @@ class McapWriter:
     def _write_chunk(
         self,
         records: memoryview,
-        indexes: dict[int, NDArray[Any]],
-        compress: Callable[[Any], bytes] | None = None,
+        indexes: Mapping[int, bytes | memoryview],
+        span: tuple[int, int],
+        compress: Callable[[Any], bytes],
     ) -> None:
+        """Write a chunk, and the entries of its indexes; `span` has the first and last log_time."""
         assert len(records) <= MAX_CHUNK_BYTES, "no reader of ours would take it"
-        start_time = min(int(index["log_time"].min()) for index in indexes.values())
-        end_time = max(int(index["log_time"].max()) for index in indexes.values())
-        if compress is None:
-            mean_bytes = len(records) / sum(map(len, indexes.values()))
-            is_long = mean_bytes > _LONG_MESSAGE_BYTES
-            compress = self._compress_long if is_long else self._compress_short
-        data = compress(records)
+        (start_time, end_time), data = span, compress(records)
         name = "" if self._compression == "none" else self._compression
         header = ChunkHeader(
             start_time=start_time,
@@ -287,10 +305,10 @@ class McapWriter:
         offset, chunk_bytes = self.position, len(head) + len(data)
         index_offsets, index_bytes = {}, 0
         index_parts: list[bytes | memoryview] = []
-        for channel_id, index in indexes.items():
+        for channel_id, entries in indexes.items():
             index_offsets[channel_id] = offset + chunk_bytes + index_bytes
-            index_parts += [message_index_head(channel_id, index), index.view(np.uint8).data]
-            index_bytes += len(index_parts[-2]) + len(index_parts[-1])
+            index_parts += [message_index_head(channel_id, len(entries)), entries]
+            index_bytes += len(index_parts[-2]) + len(entries)
         with HoldSignals():
             self._write(head, data, *index_parts)
             self._summary.chunks.append(

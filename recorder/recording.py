@@ -17,7 +17,7 @@ from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.display import Display
 from mcaprl.recorder.layout import LAYOUT_NAME, layout_of
 from mcaprl.recorder.log_file import refuse_if_taken
-from mcaprl.recorder.log_writer import STEP_TOPIC, EpisodeSummary, LogWriter
+from mcaprl.recorder.log_writer import LOG_TOPIC, STEP_TOPIC, EpisodeSummary, LogWriter
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import LogMetadata
 
@@ -95,6 +95,7 @@ class Recording:
         except BaseException:
             self.log.mcap.abandon()
             raise
+        self._has_layout = False
         # Number of the first episode in the file; any that it had before are its own.
         self._first_in_file = 0
         follows = start_time_ns is None and end_ns >= 0
@@ -117,7 +118,7 @@ class Recording:
             if seed is not None and not 0 <= seed < 2**63:
                 raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
 
-    def begin(self, display: Display, policy: str) -> None:
+    def begin(self, display: Display) -> None:
         """Begin the next episode for viewers, in a file that has room for it.
 
         With the first episode comes the layout.
@@ -128,13 +129,16 @@ class Recording:
             mcap.start_next(parts.next())
             display.forget_what_stands()
             self._first_in_file = self.episodes
-        if display.begin(start_ns, self.step_ns, self.episodes, policy):
+        display.begin(start_ns, self.step_ns)
+        if not self._has_layout:
+            topics = (LOG_TOPIC, *display.topics)
             layout = layout_of(
-                self._description, display.topics, display.telemetry_names, display.follow_frame
+                self._description, topics, display.telemetry_names, display.follow_frame
             )
             mcap.add_attachment(
                 LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns
             )
+            self._has_layout = True
 
     def close(self) -> None:
         """Finish the log. A file that was begun for an episode that did not come is removed."""

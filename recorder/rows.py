@@ -14,7 +14,7 @@ import warnings
 from array import array
 from collections.abc import Callable, Mapping
 from io import BytesIO
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 from gymnasium import spaces
@@ -52,14 +52,14 @@ class Arrays:
         take: Callable[[Any], object] = self._waiting.write
 
         def keep(value: Any) -> None:
-            if type(value) is np.ndarray and value.dtype is dtype and value.shape == shape:
-                try:
+            try:
+                if value.dtype is dtype and value.shape == shape:
                     take(value)
-                except ValueError:
-                    # It does not lie in memory as C has it.
-                    append(value)
-            else:
-                append(as_declared(value, leaf))
+                    return
+            except (AttributeError, TypeError, ValueError):
+                # No array, or one that does not lie in memory as C has it.
+                pass
+            append(as_declared(value, leaf))
 
         return keep
 
@@ -78,15 +78,20 @@ class Arrays:
 
 
 class Integers:
-    """64-bit integers that wait."""
+    """64-bit integers that wait.
+
+    Attributes:
+        append: keeps what is one; raises TypeError or OverflowError for anything else.
+    """
 
     def __init__(self) -> None:
         """Begin with none."""
         self._waiting = array("q")
+        self.append: Keeper = self._waiting.append
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps values of a leaf."""
-        append = self._waiting.append
+        append = self.append
 
         def keep(value: Any) -> None:
             try:
@@ -109,8 +114,9 @@ class StepColumns:
     """What of `/rl/step` is not yet on disk, all of one episode.
 
     Attributes:
+        take_action: keeps an action, or raises TypeError or OverflowError for one that only
+            `keep_action` keeps: a call less for the many that are integers.
         keep_action: keeps an action.
-        keep_behavior_prob: keeps its probability.
         keep_reward: keeps what it brought, a number of any type.
     """
 
@@ -122,9 +128,18 @@ class StepColumns:
         self._fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._rewards, self._probs = array("d"), array("d")
         self._waiting: dict[str, Arrays | Integers] = {}
-        self.keep_action = self.keeper(log.action)
-        self.keep_behavior_prob: Keeper = self._probs.append
+        self.keep_action = self.take_action = self.keeper(log.action)
+        actions = self._waiting[log.action.name]
+        if isinstance(actions, Integers):
+            self.take_action = actions.append
         self.keep_reward: Keeper = self._rewards.append
+
+    def keep_behavior_prob(self, prob: SupportsFloat) -> None:
+        """Keep the probability of the action that was kept last; of others it is not known."""
+        unknown = len(self._rewards) - len(self._probs)
+        if unknown:
+            self._probs.extend([math.nan] * unknown)
+        self._probs.append(prob)  # type: ignore[arg-type]
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps values of a leaf."""
@@ -170,8 +185,8 @@ class StepColumns:
         fields["action"][final], fields["reward"][final] = 0, 0.0
         fields["behavior_prob"][final], fields["final"][final] = math.nan, True
         self._write(final + 1)
-        for name in ("terminated", "truncated", "final"):
-            fields[name][: final + 1] = False
+        for name, row in (("terminated", final - 1), ("truncated", final - 1), ("final", final)):
+            fields[name][row] = False
 
     def total_reward(self, steps: int) -> float:
         """What the first `steps` transitions brought, added up in order."""
@@ -180,15 +195,17 @@ class StepColumns:
 
     def _fill(self, actions: int, observations: int) -> None:
         """Put what waits into the rows."""
+        probs = self._probs[:actions]
         self._fields["reward"][:actions] = self._rewards[:actions]
-        self._fields["behavior_prob"][:actions] = self._probs[:actions]
+        self._fields["behavior_prob"][: len(probs)] = probs
+        self._fields["behavior_prob"][len(probs) : actions] = math.nan
         for name, waiting in self._waiting.items():
             count = actions if name == "action" else observations
             waiting.put(self._fields[name][:count])
 
     def _write(self, count: int) -> None:
-        rows = self._rows[:count]
-        steps = np.arange(self._first_step, self._first_step + count)
+        rows, first = self._rows[:count], self._first_step
+        steps = np.arange(first, first + count)
         rows["log_time"] = self._start_ns + steps * self._step_ns
         self._fields["episode"][:count] = self._episode
         self._fields["step"][:count] = steps
@@ -304,8 +321,11 @@ def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
     """The sum in order, the same on every machine; `sum` and `np.sum` add in other ways."""
     if not len(rewards):
         return start
+    if start:
+        rewards = np.concatenate([[start], rewards])
     with np.errstate(all="ignore"):
-        return float(np.add.accumulate(np.concatenate([[start], rewards]))[-1])
+        # Of nothing but -0.0, too, the sum from 0.0 on is 0.0.
+        return float(np.add.accumulate(rewards)[-1] + 0.0)
 
 
 def _converter(leaf: Leaf) -> Converter:

@@ -322,11 +322,11 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             reason=reason,
         )
         start_ns, step_ns = summary.start_time_ns, recording.step_ns
-        recording.begin(self._display, episode.policy)
+        recording.begin(self._display)
         for table in self._images.values():
             table.write(number, steps + 1, start_ns, step_ns)
-        self._display.end(summary)
-        recording.log.write_episodes([summary])
+        self._display.end(steps)
+        recording.log.write_episodes([summary], log_lines=True)
         if self._learner is not None:
             self._learner.write(number, steps, start_ns, step_ns)
         self._columns.end(number, summary, step_ns)

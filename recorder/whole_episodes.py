@@ -167,7 +167,7 @@ def write_planned(reader: McapReader, writer: McapWriter, plan: EpisodePlan) -> 
         channel_id = writer.add_channel(
             EPISODE_TOPIC, messages.EPISODE_TYPE, messages.definition(messages.EPISODE_TYPE)
         )
-        told = [(s.end_time_ns, messages.encode(s.to_message())) for s in plan.told_anew]
+        told = [(s.end_time_ns, s.to_message()) for s in plan.told_anew]
         writer.write_messages([(channel_id, time_ns, data) for time_ns, data in told])
 
 

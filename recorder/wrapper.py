@@ -110,8 +110,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._columns = columns = StepColumns(log)
         # Looked up at each step.
         self._shows_steps = self._display.shows_steps
-        self._keep_action, self._keep_reward = columns.keep_action, columns.keep_reward
-        self._keep_behavior_prob = columns.keep_behavior_prob
+        self._take_action, self._keep_reward = columns.take_action, columns.keep_reward
         images = {
             leaf: ImageColumn(log, leaf.topic, leaf.shape, leaf.encoding)
             for leaf in log.image_leaves
@@ -157,9 +156,13 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         step = episode.steps + 1
         try:
             # Before the environment can change it.
-            self._keep_action(action)
-            self._keep_behavior_prob(self.behavior_prob)
-            self.behavior_prob = _UNKNOWN
+            try:
+                self._take_action(action)
+            except (TypeError, OverflowError):
+                self._columns.keep_action(action)
+            if self.behavior_prob is not _UNKNOWN:
+                self._columns.keep_behavior_prob(self.behavior_prob)
+                self.behavior_prob = _UNKNOWN
         except SpaceError:
             raise
         except BaseException:
@@ -205,7 +208,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             image.begin(start_ns, step_ns)
         self._full_at = self._next_full()
         self._keep_observation(observation)
-        recording.begin(self._display, episode.policy)
+        recording.begin(self._display)
         self._count(episode, 0, 0.0)
         self._open = episode
 
@@ -249,7 +252,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         )
         for image in self._images:
             image.flush(episode.steps + 1)
-        self._display.end(summary)
-        self._recording.log.write_episodes([summary])
+        self._display.end(episode.steps)
+        self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
         self._recording.advance(summary)

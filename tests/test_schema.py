@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import SpaceError
+from mcaprl.recorder import messages
+from mcaprl.recorder.log_writer import EpisodeSummary
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.schema import (
     image_dtype,
@@ -122,7 +124,6 @@ def test_comments_and_constants_take_no_place() -> None:
 
 @given(st.integers(1, 9), st.integers(1, 9), st.sampled_from(["a", "camera", "x/y_z"]))
 def test_image_layout_is_that_of_rosbags(height: int, width: int, frame: str) -> None:
-    from mcaprl.recorder import messages
     from mcaprl.recorder.schema import fill_image_constants
 
     dtype = image_dtype(height, width, 3, "rgb8", frame)
@@ -179,3 +180,32 @@ def test_action_names_are_one_for_each() -> None:
     assert names(spaces.Discrete(2), "left", "left") == {0: "0", 1: "1"}
     assert names(spaces.Discrete(2), "left") == {0: "0", 1: "1"}
     assert names(box, "left") == {}
+
+
+@given(
+    st.text(max_size=9),
+    st.text(max_size=9),
+    st.text(max_size=9),
+    st.integers(0, 2**62),
+    st.none() | st.integers(0, 2**62),
+)
+def test_what_is_told_of_an_episode_is_encoded_as_rosbags_does(
+    reason: str, policy: str, options: str, time_ns: int, seed: int | None
+) -> None:
+    summary = EpisodeSummary(
+        7, 9, -2.5, True, False, time_ns, time_ns + 9, reason, policy, 0.25, seed, options
+    )
+    fields = {**summary._asdict(), "seed": -1 if seed is None else seed}
+    episode = messages.new(messages.EPISODE_TYPE, **fields)
+    assert summary.to_message() == messages.encode(episode)
+    line = messages.new(
+        messages.LOG_TYPE,
+        stamp=messages.stamp(time_ns % 2**60),
+        level=20,
+        name="mcaprl",
+        msg=reason,
+        file="",
+        function="",
+        line=0,
+    )
+    assert messages.log_message(time_ns % 2**60, reason) == messages.encode(line)
