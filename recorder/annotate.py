@@ -20,7 +20,6 @@ from mcap.records import Attachment
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
-from mcaprl.recorder.chunks import message_rows
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.display import SCENE, Display
 from mcaprl.recorder.episode import Episode
@@ -29,6 +28,7 @@ from mcaprl.recorder.log_layout import layout_of_log
 from mcaprl.recorder.log_reader import describe
 from mcaprl.recorder.log_writer import LOG_TOPIC, LogWriter
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_records import message_rows
 from mcaprl.recorder.schema import ENCAPSULATION, message_dtype, values_schema
 from mcaprl.recorder.verify import Verification, verify
 

@@ -25,9 +25,10 @@ from mcap.writer import MCAP0_MAGIC
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunk_check import Contradiction, check_chunk, check_statistics, place
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, Scratch
+from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.episode_check import EpisodeCheck
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,16 @@ from mcap.records import ChunkIndex, Statistics
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.chunks import (
+from mcaprl.recorder.chunks import chunk_header
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import contents_of, parse_record, uniform_indexes
+from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
-    chunk_header,
     gather,
     message_index,
 )
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import contents_of, parse_record, uniform_indexes
 
 
 @dataclass(frozen=True)

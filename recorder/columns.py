@@ -19,20 +19,16 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.cdr import Layout, MessageType, message_type
-from mcaprl.recorder.chunks import (
-    MESSAGE_HEADER,
-    Scratch,
-    are_messages,
-    gather,
-    record_dtype,
-)
+from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.joined import Chosen, Rows, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import RECORD_HEADER, Span
+from mcaprl.recorder.mcap_records import RECORD_HEADER, Span, joined_index
+from mcaprl.recorder.message_records import MESSAGE_HEADER, are_messages, gather, record_dtype
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
 _MAX_LENGTHS = 16
-_LAST_NS = np.iinfo(np.int64).max
+# Entries of an index that are gone through at a time, so that they stay in a processor's cache.
+_ENTRIES_AT_ONCE = 2**15
 
 Columns = dict[str, NDArray[Any]]
 """Arrays of one length, by field name; texts are arrays of `str` objects."""
@@ -73,9 +69,15 @@ class Topic:
     @cached_property
     def times(self) -> NDArray[np.int64]:
         """(N,) log_time of each message in the order of its channels and of the file."""
-        times = np.empty(len(self), np.int64)
-        for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
-            times[stop - count : stop] = part.times
+        times, start = np.empty(len(self), np.int64), 0
+        for spans in _groups([part.span for part in self.parts]):
+            index = joined_index(spans)
+            times[start : start + len(index)] = index["log_time"]
+            start += len(index)
+        if (times < 0).any():
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.name} has a log_time beyond the year 2262"
+            )
         return times
 
     @property
@@ -145,15 +147,15 @@ class Topic:
                 part.fill(columns, records, index, rows)
                 return
             for one in together:
-                records = self._reader.records_of(one.part.span, scratch)
-                one.part.fill(columns, records, one.index, one.rows)
+                records = self._reader.records_of(one.span, scratch)
+                one.part.fill(columns, records, one.span.index, one.rows)
 
         _for_each(fill, list(neighbors(parts)), threads)
         return {LOG_TIME: self.times if order is None else _times_of(parts, len(order)), **columns}
 
     def _all(self) -> Iterator[Chosen]:
         for part, stop, count in zip(self.parts, self._stops.tolist(), self._counts, strict=True):
-            yield Chosen(part, part.span.index, slice(stop - count, stop))
+            yield Chosen(part, part.span, slice(stop - count, stop))
 
     def _chosen(self, order: NDArray[np.int64]) -> Iterator[Chosen]:
         """The parts with messages that are wanted, and where those go."""
@@ -164,10 +166,11 @@ class Topic:
         for part, stop, (low, high) in zip(self.parts, self._stops, pairwise(bounds), strict=True):
             if low == high:
                 continue
-            index = part.span.index
-            if high - low < len(index):
-                index = index[places[low:high] - (stop - len(index))]
-            yield Chosen(part, index, slice(low, high) if by_place is None else by_place[low:high])
+            span = part.span
+            if high - low < len(span):
+                index = span.index[places[low:high] - (stop - len(span))]
+                span = Span.of_index(span.chunk, index)
+            yield Chosen(part, span, slice(low, high) if by_place is None else by_place[low:high])
 
 
 class Part:
@@ -185,16 +188,6 @@ class Part:
         """Point at them; none is read."""
         self.span, self.channel, self.type = span, channel, type_
         self._reader = reader
-
-    @property
-    def times(self) -> NDArray[np.uint64]:
-        """The log_time of each message."""
-        times: NDArray[np.uint64] = self.span.index["log_time"]
-        if times.max() > _LAST_NS:
-            raise CorruptLogError(
-                f"{self._reader.path}: {self.channel.topic} has a log_time beyond the year 2262"
-            )
-        return times
 
     def empty_columns(
         self, wanted: Collection[str], count: int, scratch: Scratch | None = None
@@ -324,10 +317,24 @@ class Part:
             )
 
 
+def _groups(spans: list[Span]) -> Iterator[list[Span]]:
+    """Spans that follow each other, some thousand entries together."""
+    group: list[Span] = []
+    entries = 0
+    for span in spans:
+        group.append(span)
+        entries += len(span)
+        if entries >= _ENTRIES_AT_ONCE:
+            yield group
+            group, entries = [], 0
+    if group:
+        yield group
+
+
 def _times_of(parts: list[Chosen], count: int) -> NDArray[np.int64]:
     times = np.empty(count, np.int64)
     for chosen in parts:
-        times[chosen.rows] = chosen.index["log_time"]
+        times[chosen.rows] = chosen.span.index["log_time"]
     return times
 
 

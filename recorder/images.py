@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.chunks import MESSAGE_HEADER, chunk_header
+from mcaprl.recorder.chunks import chunk_header
 from mcaprl.recorder.columns import Columns, Part, Topic
 from mcaprl.recorder.episodes import time_order
 from mcaprl.recorder.log_writer import IMAGES_PER_CHUNK, STEP_TOPIC
 from mcaprl.recorder.mapped import Frames, MappedImages, PictureFile
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_records import MESSAGE_HEADER
 from mcaprl.recorder.spaces import Leaf
 from mcaprl.recorder.storage import IMAGE_TYPE, Storage, image_cache, is_mapped
 

@@ -8,21 +8,16 @@ piece of memory, and their messages are taken from there at once.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.chunks import (
-    MESSAGE_HEADER,
-    RECORD_HEADER_BYTES,
-    Scratch,
-    gather,
-    joined_records,
-)
+from mcaprl.recorder.chunks import Scratch, joined_records
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import Span, joined_index
+from mcaprl.recorder.message_records import MESSAGE_HEADER, RECORD_HEADER_BYTES, gather
 
 if TYPE_CHECKING:
     from mcaprl.recorder.columns import Part
@@ -33,18 +28,17 @@ _MOST_BYTES = 2**20
 Rows = slice | NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Chosen:
+class Chosen(NamedTuple):
     """Messages of a part, and their rows in the columns."""
 
     part: Part
-    index: NDArray[Any]
+    span: Span
     rows: Rows
 
     @property
     def chunk_bytes(self) -> int:
         """Length of the chunk's records; more than can be joined if there is no such chunk."""
-        chunk = self.part.span.chunk
+        chunk = self.span.chunk
         is_alone = chunk is None or not isinstance(self.rows, slice)
         return _MOST_BYTES if is_alone or chunk is None else chunk.uncompressed_size
 
@@ -76,16 +70,15 @@ def join(
     Raises:
         CorruptLogError: a chunk is damaged.
     """
-    spans = [one.part.span.chunk for one in together]
-    chunks = [chunk for chunk in spans if chunk is not None]
+    spans = [one.span for one in together]
+    chunks = [span.chunk for span in spans if span.chunk is not None]
     offsets = [chunk.chunk_start_offset for chunk in chunks]
     size = sum(chunk.uncompressed_size for chunk in chunks)
     try:
         records, stops = joined_records(reader.view, offsets, size, scratch)
     except CorruptLogError as error:
         raise CorruptLogError(f"{reader.path}: {error}") from error
-    counts = [len(one.index) for one in together]
-    index = np.concatenate([one.index for one in together])
+    counts, index = list(map(len, spans)), joined_index(spans)
     starts = np.repeat(np.array([0, *stops[:-1]], np.uint64), counts)
     room = np.repeat(np.array(stops, np.uint64), counts) - starts
     if (room < MESSAGE_HEADER.itemsize).any() or (

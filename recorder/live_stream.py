@@ -21,11 +21,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.recorder.chunks import message_rows
 from mcaprl.recorder.display import DEPTH, SCENE, SCENE_STATIC, TELEMETRY, TF, TF_STATIC
 from mcaprl.recorder.layout import RETURN_SO_FAR, TRAINING_TOPIC, VALUES_TOPIC, layout_of
 from mcaprl.recorder.log_writer import EpisodeSummary, LogWriter
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import message_rows
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.rows import as_declared
 from mcaprl.recorder.scene import (

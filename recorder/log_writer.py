@@ -6,7 +6,7 @@ A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, al
     /rl/step               mcaprl_msgs/msg/Step...   observation: what `schema` says
     /rl/observation/<key>  sensor_msgs/msg/Image     picture that is observed: mono8, rgb8 or rgba8
     /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end: what `messages` says
-                           and, of a recording, its start and end in words: /rosout
+    /rosout                rcl_interfaces/msg/Log    episode's start, and end, in words
     /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy told its version
     all others                                       what only viewers show: see `display`
 
@@ -22,10 +22,11 @@ nanoseconds; publish_time is the same. It rises from record to record of `/rl/st
 episode too, and all that belongs to one observation has its log_time: that is the key which joins
 topics. `/rl/episode` has that of the final record.
 
-Chunks. Each holds one kind of topic, as the lines above divide them, and is compressed by zstd, lz4
-or not at all, with its CRC, and a MessageIndex for each channel in it. Schemas, channels, metadata
-and attachments stand outside of chunks, before what needs them. The summary repeats schemas and
-channels, and indexes all else. Every CRC that MCAP has is there.
+Chunks. Each holds one kind of topic, as the lines above divide them (but `/rosout` stands with
+`/rl/episode`), and is compressed by zstd, lz4 or not at all, with its CRC, and a MessageIndex for
+each channel in it. Schemas, channels, metadata and attachments stand outside of chunks, before what
+needs them. The summary repeats schemas and channels, and indexes all else. Every CRC that MCAP has
+is there.
 
 Order. First comes the metadata record `mcaprl.dataset`. Of an episode, `/rl/step` is written last:
 a finished episode is one whose record `final` is in the file, and then all else of it is there too.
@@ -49,8 +50,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.recorder import messages
-from mcaprl.recorder.chunks import message_rows
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import message_rows
 from mcaprl.recorder.metadata import METADATA_NAME, SAME_WHEN_APPENDED, LogMetadata
 from mcaprl.recorder.schema import (
     ENCAPSULATION,
@@ -187,7 +188,7 @@ class LogWriter:
         return self.mcap.add_channel(topic, type_name, messages.definition(type_name))
 
     def step_rows(self) -> NDArray[Any]:
-        """Preallocate a chunk's rows of `/rl/step`: `chunks.record_dtype` around its fields."""
+        """Preallocate a chunk's rows of `/rl/step`: `record_dtype` around its fields."""
         count = _rows_per_chunk(STEPS_PER_CHUNK, self._step_dtype)
         rows = message_rows(count, self._step_dtype, self._step_channel)
         rows["payload"]["encapsulation"] = ENCAPSULATION
@@ -203,7 +204,7 @@ class LogWriter:
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
 
         Returns:
-            Rows of `chunks.record_dtype`; `payload.data` is the flat picture.
+            Rows of `message_records.record_dtype`; `payload.data` is the flat picture.
         """
         height, width, channels = (*shape, 1)[:3]
         item_bytes = 2 if encoding == "16UC1" else 1

@@ -12,10 +12,10 @@ from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import parse_record
 from mcaprl.recorder.mcap_summary import Summary
+from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 
 Standing = Metadata | Schema | Channel | Attachment
 """Records that stand outside of chunks."""

@@ -11,7 +11,8 @@ summary, because its writer was killed or is still at work, is scanned from the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,28 +22,23 @@ from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import (
-    MESSAGE_HEADER,
-    RECORD_HEADER_BYTES,
-    Scratch,
-    chunk_header,
-    chunk_records,
-    message_index,
-)
+from mcaprl.recorder.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.mcap_records import (
     MESSAGE_START,
     RECORD_HEADER,
     ChunkContents,
     LooseMessages,
     Span,
+    chunk_indexes,
     contents_of,
     map_file,
     parse_record,
     records_of,
 )
+from mcaprl.recorder.message_records import MESSAGE_HEADER, RECORD_HEADER_BYTES, message_indexes
 
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
-_SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.STATISTICS)
+_SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 _STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
@@ -131,12 +127,12 @@ class McapReader:
         """
         # A writer that was killed may have written some of the last chunk's indexes only.
         indexed = self.chunks if self.complete else self.chunks[:-1]
-        spans = [span for chunk in indexed if (span := self._span(chunk, channel.id))]
+        spans = self._indexed_spans(indexed, channel.id)
         rest = self.chunks[len(indexed) :]
         spans += [span for chunk in rest if (span := self._unindexed_span(chunk, channel.id))]
         loose = self._loose_indexes.get(channel.id)
         if loose is not None:
-            spans.append(Span(None, loose))
+            spans.append(Span.of_index(None, loose))
         found, told = sum(map(len, spans)), self._counts.get(channel.id)
         if told not in (None, found):
             raise CorruptLogError(
@@ -234,20 +230,26 @@ class McapReader:
         """
         return records_of(self.view, start)
 
-    def _span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
-        """A channel's messages in a chunk, by the index that the file has of them."""
-        offsets = chunk.message_index_offsets
-        if channel_id not in offsets:
-            return None if offsets else self._unindexed_span(chunk, channel_id)
+    def _indexed_spans(self, chunks: Sequence[ChunkIndex], channel_id: int) -> list[Span]:
+        """A channel's messages in chunks, by the indexes that the file has of them."""
+        told = [chunk.message_index_offsets for chunk in chunks]
+        places = [offsets[channel_id] for offsets in told if channel_id in offsets]
         try:
-            return Span(chunk, message_index(self.view, offsets[channel_id], channel_id))
+            entries = iter(message_indexes(self.view, places, channel_id))
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error}") from error
+        spans = []
+        for chunk, offsets in zip(chunks, told, strict=True):
+            if channel_id in offsets:
+                spans.append(Span(chunk, next(entries)))
+            elif not offsets and (span := self._unindexed_span(chunk, channel_id)) is not None:
+                spans.append(span)
+        return spans
 
     def _unindexed_span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
         """Likewise, by going through the chunk."""
         index = self._contents_of(chunk).indexes.get(channel_id)
-        return None if index is None else Span(chunk, index)
+        return None if index is None else Span.of_index(chunk, index)
 
     def _contents_of(self, chunk: ChunkIndex) -> ChunkContents:
         start = chunk.chunk_start_offset
@@ -277,10 +279,17 @@ class McapReader:
         return footer
 
     def _read_summary(self) -> None:
+        chunks = []
         for offset, opcode, content in self.records(self.summary_start):
-            if opcode in _SUMMARY:
+            if opcode == Opcode.CHUNK_INDEX:
+                chunks.append((offset + RECORD_HEADER_BYTES, len(content)))
+            elif opcode in _SUMMARY:
                 self._keep(self._parse(opcode, content, offset))
-        self.chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
+        try:
+            self.chunks = chunk_indexes(self.view, chunks)
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
+        self.chunks.sort(key=attrgetter("chunk_start_offset"))
 
     def _read_between_chunks(self) -> None:
         """Read what the summary does not tell of: everything, if there is none."""
@@ -370,8 +379,6 @@ class McapReader:
                 self.channels.setdefault(record.id, record)
             case Metadata():
                 self.metadata.setdefault(record.name, record.metadata)
-            case ChunkIndex():
-                self.chunks.append(record)
             case Statistics():
                 self._counts = record.channel_message_counts
 

@@ -7,11 +7,11 @@ import itertools
 import mmap
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -30,13 +30,22 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
+from mcaprl.recorder.message_records import (
+    INDEX_ENTRY,
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+    windows,
+)
 
 RECORD_HEADER = struct.Struct("<BQ")
 # Of a message behind its record header: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
 _CHUNK_INDEX_START, _CHUNK_INDEX_END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
+_CHUNK_INDEX_FIXED = _CHUNK_INDEX_START.size + 12 + _CHUNK_INDEX_END.size
+# One of all 65,536 channels is shorter.
+_CHUNK_INDEX_MOST = 2**20
 _MESSAGE_INDEX_OFFSET = struct.Struct("<HQ")
+_U4 = np.dtype("<u4")
 _PARSERS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
@@ -91,7 +100,7 @@ def parse_record(opcode: int, content: memoryview) -> Any:
     """
     try:
         if opcode == Opcode.CHUNK_INDEX:
-            return _chunk_index(content)
+            return chunk_indexes(content, [(0, len(content))])[0]
         return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
     # The library raises whatever its parsing meets; none of it is more than "damaged".
     except Exception as error:
@@ -103,25 +112,32 @@ class Span:
 
     Attributes:
         chunk: in which they are; None for messages outside of all chunks.
+        entries: their log_time and offset, `message_records.INDEX_ENTRY`, as bytes.
     """
 
-    def __init__(self, chunk: ChunkIndex | None, entries: memoryview | NDArray[Any]) -> None:
-        """Take entries of `chunks.INDEX_ENTRY`, or their bytes as they stand in the file."""
-        self.chunk = chunk
-        self._entries = entries
-        is_array = isinstance(entries, np.ndarray)
-        self._count = len(entries) if is_array else len(entries) // INDEX_ENTRY.itemsize
+    def __init__(self, chunk: ChunkIndex | None, entries: memoryview) -> None:
+        """Note them."""
+        self.chunk, self.entries = chunk, entries
+
+    @classmethod
+    def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
+        """Of an array of entries."""
+        return cls(chunk, np.ascontiguousarray(index).view(np.uint8).data)
 
     @cached_property
     def index(self) -> NDArray[Any]:
-        """Their log_time and offset: `chunks.INDEX_ENTRY`, one for each."""
-        if isinstance(self._entries, np.ndarray):
-            return self._entries
-        return np.frombuffer(self._entries, INDEX_ENTRY)
+        """The entries as an array."""
+        return np.frombuffer(self.entries, INDEX_ENTRY)
 
     def __len__(self) -> int:
         """Messages."""
-        return self._count
+        return len(self.entries) // INDEX_ENTRY.itemsize
+
+
+def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
+    """A copy of the entries of all spans: `message_records.INDEX_ENTRY`."""
+    # As bytes: to NumPy each array of structures is a negotiation about their fields.
+    return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
 
 
 @dataclass
@@ -144,7 +160,7 @@ class LooseMessages:
         self._offsets.setdefault(channel_id, array("Q")).append(offset)
 
     def indexes(self) -> dict[int, NDArray[Any]]:
-        """What a MessageIndex would tell, by channel id: arrays of `chunks.INDEX_ENTRY`."""
+        """What a MessageIndex would tell, by channel id: arrays of `INDEX_ENTRY`."""
         found = {}
         for channel_id, times in self._times.items():
             index = np.empty(len(times), INDEX_ENTRY)
@@ -218,33 +234,77 @@ def chunk_index_record(chunk: ChunkIndex) -> bytes:
     return RECORD_HEADER.pack(Opcode.CHUNK_INDEX, len(content)) + content
 
 
-def _chunk_index(content: memoryview) -> ChunkIndex:
-    """Ten times faster than the library's own; a log of short episodes has many."""
-    map_end = _CHUNK_INDEX_START.size + int.from_bytes(content[32:36], "little")
-    if map_end > len(content):
+def chunk_indexes(view: memoryview, places: Sequence[tuple[int, int]]) -> list[ChunkIndex]:
+    """ChunkIndex records: those of one form, and so nearly all, at once.
+
+    A log of short episodes has many, and one by one they take the library fifty times as long.
+
+    Args:
+        view: where they are.
+        places: first byte and length of each one's content.
+
+    Raises:
+        CorruptLogError: a record is damaged.
+    """
+    if not places:
+        return []
+    starts, lengths = np.array(places, np.int64).T
+    if (lengths < _CHUNK_INDEX_FIXED).any() or (lengths > _CHUNK_INDEX_MOST).any():
+        raise CorruptLogError("a chunk_index record is too short or too long")
+    map_bytes = windows(view, starts + _CHUNK_INDEX_START.size - 4, _U4).astype(np.int64)
+    if (map_bytes > lengths - _CHUNK_INDEX_FIXED).any():
         raise CorruptLogError("the map of a chunk_index record reaches beyond it")
-    name_bytes = int.from_bytes(content[map_end + 8 : map_end + 12], "little")
-    layout = _chunk_index_layout(map_end - _CHUNK_INDEX_START.size, name_bytes)
-    start_time, end_time, offset, length, _, *pairs, index_bytes, _, name, compressed, raw = (
-        layout.unpack_from(content)
-    )
-    return ChunkIndex(
-        chunk_length=length,
-        chunk_start_offset=offset,
-        compression=name.decode(),
-        compressed_size=compressed,
-        message_end_time=end_time,
-        message_index_length=index_bytes,
-        message_index_offsets=dict(zip(pairs[::2], pairs[1::2], strict=True)),
-        message_start_time=start_time,
-        uncompressed_size=raw,
+    name_bytes = windows(view, starts + _CHUNK_INDEX_START.size + map_bytes + 8, _U4)
+    found: list[ChunkIndex] = []
+    forms = zip(lengths.tolist(), map_bytes.tolist(), name_bytes.tolist(), strict=True)
+    for size, in_map, in_name in set(forms):
+        alike = (lengths == size) & (map_bytes == in_map) & (name_bytes == in_name)
+        dtype = _chunk_index_dtype(size, in_map, in_name)
+        found += _of_one_form(windows(view, starts[alike], dtype))
+    return found
+
+
+def _of_one_form(rows: NDArray[Any]) -> Iterable[ChunkIndex]:
+    maps, names = rows["map"], rows["name"].tolist()
+    try:
+        texts = {name: name.decode() for name in set(names)}
+    except UnicodeDecodeError as error:
+        raise CorruptLogError("the name of a chunk's compression is no text") from error
+    # In the order of the class's fields: by name takes twice as long.
+    return map(
+        ChunkIndex,
+        rows["length"].tolist(),
+        rows["offset"].tolist(),
+        [texts[name] for name in names],
+        rows["compressed_bytes"].tolist(),
+        rows["end_time"].tolist(),
+        rows["index_bytes"].tolist(),
+        map(dict, map(zip, maps["channel_id"].tolist(), maps["offset"].tolist())),
+        rows["start_time"].tolist(),
+        rows["raw_bytes"].tolist(),
     )
 
 
 @lru_cache(maxsize=64)
-def _chunk_index_layout(map_bytes: int, name_bytes: int) -> struct.Struct:
+def _chunk_index_dtype(size: int, map_bytes: int, name_bytes: int) -> np.dtype[Any]:
     """A whole ChunkIndex record with so long a map and name."""
-    pairs, rest = divmod(map_bytes, _MESSAGE_INDEX_OFFSET.size)
-    if rest:
-        raise CorruptLogError("the map of a chunk_index record has half an entry")
-    return struct.Struct(f"<QQQQI{'HQ' * pairs}QI{name_bytes}sQQ")
+    entry = np.dtype([("channel_id", "<u2"), ("offset", "<u8")])
+    pairs, rest = divmod(map_bytes, entry.itemsize)
+    fields = [
+        ("start_time", "<u8"),
+        ("end_time", "<u8"),
+        ("offset", "<u8"),
+        ("length", "<u8"),
+        ("map_bytes", "<u4"),
+        ("map", entry, (pairs,)),
+        ("index_bytes", "<u8"),
+        ("name_bytes", "<u4"),
+        ("name", f"V{name_bytes}"),
+        ("compressed_bytes", "<u8"),
+        ("raw_bytes", "<u8"),
+    ]
+    # A later version of MCAP may have more fields behind these.
+    behind = size - _CHUNK_INDEX_FIXED - map_bytes - name_bytes
+    if rest or behind < 0:
+        raise CorruptLogError("the map or the name of a chunk_index record does not fit it")
+    return np.dtype([*fields, ("behind", f"V{behind}")])

@@ -32,20 +32,22 @@ from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import (
-    INDEX_ENTRY,
     LONG_RECORDS,
     MAX_CHUNK_BYTES,
     MIXED_RECORDS,
     SHORT_RECORDS,
     ChunkHeader,
     compressor,
-    message_index_head,
-    message_record,
-    touching_offsets,
 )
 from mcaprl.recorder.log_file import create, release, reopen
 from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
+from mcaprl.recorder.message_records import (
+    INDEX_ENTRY,
+    message_index_head,
+    message_record,
+    touching_offsets,
+)
 from mcaprl.recorder.signals import HoldSignals
 
 COMPRESSIONS = ("zstd", "lz4", "none")
@@ -183,8 +185,8 @@ class McapWriter:
         """Write messages of one channel and length as one chunk.
 
         Args:
-            rows: of `chunks.record_dtype`, with their log_time. Sequence numbers and publish times
-                are filled in here.
+            rows: of `message_records.record_dtype`, with their log_time. Sequence numbers and
+                publish times are filled in here.
         """
         if len(rows) == 0:
             return
@@ -229,7 +231,7 @@ class McapWriter:
 
         Args:
             records: Message records of announced channels, their sequence numbers included.
-            indexes: of `chunks.INDEX_ENTRY`, by channel id.
+            indexes: of `message_records.INDEX_ENTRY`, by channel id.
         """
         for channel_id, index in indexes.items():
             self._summary.counts[channel_id] += len(index)

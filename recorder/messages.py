@@ -2,7 +2,7 @@
 
 Everything here is for topics with few messages, or that only viewers read; rosbags encodes them,
 but for the three that each episode ends with: a recorder is waited for. Transitions and images go
-another way (`schema`, `chunks`).
+another way (`schema`, `message_records`).
 """
 
 from __future__ import annotations

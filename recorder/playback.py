@@ -155,7 +155,7 @@ def _by_time(span: Span) -> Span:
     times: NDArray[np.uint64] = span.index["log_time"]
     if (times[1:] >= times[:-1]).all():
         return span
-    return Span(span.chunk, span.index[np.argsort(times, kind="stable")])
+    return Span.of_index(span.chunk, span.index[np.argsort(times, kind="stable")])
 
 
 @dataclass

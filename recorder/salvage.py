@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.mcap_records import RECORD_HEADER, parse_record, records_of
+from mcaprl.recorder.message_records import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 
 SoundRecord = tuple[int, int, memoryview]
 """Offset, opcode and content."""

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import RECORD_HEADER_BYTES, Scratch, chunk_records
+from mcaprl.recorder.chunks import Scratch, chunk_records
 from mcaprl.recorder.log_writer import STEP_TOPIC
 from mcaprl.recorder.mcap_records import contents_of, parse_record
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 from mcaprl.recorder.metadata import METADATA_NAME
 from mcaprl.recorder.salvage import Damage, SoundRecord, intact_summary
 

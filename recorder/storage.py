@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.recorder import messages
-from mcaprl.recorder.chunks import chunk_header, message_rows
+from mcaprl.recorder.chunks import chunk_header
 from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.log_writer import IMAGE_FRAME
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import message_rows
 from mcaprl.recorder.schema import fill_image_constants, image_dtype
 from mcaprl.recorder.spaces import IMAGE_ENCODINGS
 

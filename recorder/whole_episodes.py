@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder import messages
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
 from mcaprl.recorder.log_reader import described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, INTERRUPTED, STEP_TOPIC, EpisodeSummary
@@ -26,6 +25,7 @@ from mcaprl.recorder.mcap_append import what_is_written
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, contents_of
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.metadata import METADATA_NAME
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import message_dtype

@@ -18,8 +18,9 @@ from mcap.writer import Writer
 import mcaprl
 from mcaprl.errors import CorruptLogError, LogError, NoStepsError, NotMcapError
 from mcaprl.recorder.check import check_log
-from mcaprl.recorder.chunks import chunk_records, gather, message_rows
+from mcaprl.recorder.chunks import chunk_records
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_records import gather, message_rows
 from mcaprl.recorder.schema import message_dtype
 from tests.recordings import record
 

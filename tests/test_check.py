@@ -16,11 +16,12 @@ from mcap.records import ChunkIndex
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.check import check_log
-from mcaprl.recorder.chunks import INDEX_ENTRY, MESSAGE_HEADER, Scratch
+from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import contents_of
 from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.mcap_writer import McapWriter
+from mcaprl.recorder.message_records import INDEX_ENTRY, MESSAGE_HEADER
 from mcaprl.recorder.metadata import LogMetadata
 from mcaprl.recorder.recover import recover_log
 from mcaprl.recorder.schema import message_dtype
