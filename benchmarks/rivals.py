@@ -296,6 +296,13 @@ def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
         zstandard.decompress(data)
 
 
+def kept_zstd(chunks: Sequence[bytes | memoryview]) -> list[bytes]:
+    """Decompress chunks into memory, all of them: what no reader of columns can do without."""
+    import zstandard
+
+    return [zstandard.decompress(data) for data in chunks]
+
+
 def raw_chunks(path: Path, topic: str) -> list[bytes]:
     """The records of a topic's chunks."""
     import zstandard

@@ -22,8 +22,9 @@ from mcaprl.recorder.cdr import Layout, MessageType, message_type
 from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.joined import Chosen, Rows, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import RECORD_HEADER, Span, joined_index
+from mcaprl.recorder.mcap_records import RECORD_HEADER
 from mcaprl.recorder.message_records import MESSAGE_HEADER, are_messages, gather, record_dtype
+from mcaprl.recorder.message_spans import Span, joined_index
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
 _MAX_LENGTHS = 16

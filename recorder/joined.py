@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunks import Scratch, joined_records
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import Span, joined_index
 from mcaprl.recorder.message_records import MESSAGE_HEADER, RECORD_HEADER_BYTES, gather
+from mcaprl.recorder.message_spans import Span, joined_index
 
 if TYPE_CHECKING:
     from mcaprl.recorder.columns import Part

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
@@ -28,16 +29,22 @@ from mcaprl.recorder.mcap_records import (
     RECORD_HEADER,
     ChunkContents,
     LooseMessages,
-    Span,
     chunk_indexes,
     contents_of,
+    footer_of,
     map_file,
     parse_record,
     records_of,
 )
-from mcaprl.recorder.message_records import MESSAGE_HEADER, RECORD_HEADER_BYTES, message_indexes
+from mcaprl.recorder.message_records import (
+    INDEX_ENTRY,
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+    message_index,
+    message_indexes,
+)
+from mcaprl.recorder.message_spans import Span, told_spans
 
-_FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 _STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
@@ -78,7 +85,8 @@ class McapReader:
         # Who asks for a chunk's example asks for all of it next.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
-        footer = self._footer()
+        with self._named():
+            footer = footer_of(self.view)
         self.complete = footer is not None
         self.summary_start = footer.summary_start if footer is not None else 0
         if self.summary_start:
@@ -125,6 +133,9 @@ class McapReader:
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
+        spans = told_spans(self.chunks, channel.id, self._index_of)
+        if spans and sum(map(len, spans)) == self._counts.get(channel.id):
+            return spans
         # A writer that was killed may have written some of the last chunk's indexes only.
         indexed = self.chunks if self.complete else self.chunks[:-1]
         spans = self._indexed_spans(indexed, channel.id)
@@ -164,10 +175,8 @@ class McapReader:
         last, kept = self._last_chunk if scratch is None else scratch.kept
         if last == start:
             return kept
-        try:
+        with self._named():
             records = chunk_records(self.view, start, scratch)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
         if scratch is None:
             self._last_chunk = start, records
         else:
@@ -230,14 +239,23 @@ class McapReader:
         """
         return records_of(self.view, start)
 
+    def _index_of(self, chunk: ChunkIndex, channel_id: int, count: int) -> memoryview:
+        offset = chunk.message_index_offsets[channel_id]
+        with self._named():
+            entries = message_index(self.view, offset, channel_id)
+            if len(entries) != count * INDEX_ENTRY.itemsize:
+                raise CorruptLogError(
+                    f"the message index at byte {offset} has not the {count} messages that the"
+                    " summary tells of"
+                )
+            return entries
+
     def _indexed_spans(self, chunks: Sequence[ChunkIndex], channel_id: int) -> list[Span]:
         """A channel's messages in chunks, by the indexes that the file has of them."""
         told = [chunk.message_index_offsets for chunk in chunks]
         places = [offsets[channel_id] for offsets in told if channel_id in offsets]
-        try:
+        with self._named():
             entries = iter(message_indexes(self.view, places, channel_id))
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
         spans = []
         for chunk, offsets in zip(chunks, told, strict=True):
             if channel_id in offsets:
@@ -260,24 +278,6 @@ class McapReader:
                 raise CorruptLogError(f"{self.path}: {error} (chunk at byte {start})") from error
         return self._contents[start]
 
-    def _footer(self) -> Footer | None:
-        """The footer, if the file ends with one."""
-        start = len(self.view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
-        if start < len(MCAP0_MAGIC) or bytes(self.view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
-            return None
-        opcode, length = RECORD_HEADER.unpack_from(self.view, start)
-        if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD_HEADER_BYTES:
-            return None
-        footer: Footer = self._parse(opcode, self.view[start + RECORD_HEADER_BYTES :], start)
-        if footer.summary_start == 0:
-            return footer
-        if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
-            raise CorruptLogError(f"{self.path}: the footer points outside the file")
-        covered = self.view[footer.summary_start : start + _FOOTER_BYTES - 4]
-        if footer.summary_crc and crc32(covered) != footer.summary_crc:
-            raise CorruptLogError(f"{self.path}: the summary does not match its CRC")
-        return footer
-
     def _read_summary(self) -> None:
         chunks = []
         for offset, opcode, content in self.records(self.summary_start):
@@ -285,10 +285,8 @@ class McapReader:
                 chunks.append((offset + RECORD_HEADER_BYTES, len(content)))
             elif opcode in _SUMMARY:
                 self._keep(self._parse(opcode, content, offset))
-        try:
+        with self._named():
             self.chunks = chunk_indexes(self.view, chunks)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
         self.chunks.sort(key=attrgetter("chunk_start_offset"))
 
     def _read_between_chunks(self) -> None:
@@ -326,10 +324,8 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
 
     def _scanned_chunk(self, offset: int, content_bytes: int) -> ChunkIndex:
-        try:
+        with self._named():
             header = chunk_header(self.view, offset)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error}") from error
         return ChunkIndex(
             chunk_start_offset=offset,
             chunk_length=RECORD_HEADER_BYTES + content_bytes,
@@ -381,6 +377,14 @@ class McapReader:
                 self.metadata.setdefault(record.name, record.metadata)
             case Statistics():
                 self._counts = record.channel_message_counts
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Say of which file it is what is damaged."""
+        try:
+            yield
+        except CorruptLogError as error:
+            raise CorruptLogError(f"{self.path}: {error}") from error
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> Any:
         try:

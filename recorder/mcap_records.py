@@ -9,9 +9,9 @@ import struct
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -27,9 +27,11 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
@@ -40,6 +42,7 @@ from mcaprl.recorder.message_records import (
 RECORD_HEADER = struct.Struct("<BQ")
 # Of a message behind its record header: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
+_FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _CHUNK_INDEX_START, _CHUNK_INDEX_END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
 _CHUNK_INDEX_FIXED = _CHUNK_INDEX_START.size + 12 + _CHUNK_INDEX_END.size
 # One of all 65,536 channels is shorter.
@@ -105,39 +108,6 @@ def parse_record(opcode: int, content: memoryview) -> Any:
     # The library raises whatever its parsing meets; none of it is more than "damaged".
     except Exception as error:
         raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
-
-
-class Span:
-    """Messages of one channel that stand together; its length is how many.
-
-    Attributes:
-        chunk: in which they are; None for messages outside of all chunks.
-        entries: their log_time and offset, `message_records.INDEX_ENTRY`, as bytes.
-    """
-
-    def __init__(self, chunk: ChunkIndex | None, entries: memoryview) -> None:
-        """Note them."""
-        self.chunk, self.entries = chunk, entries
-
-    @classmethod
-    def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
-        """Of an array of entries."""
-        return cls(chunk, np.ascontiguousarray(index).view(np.uint8).data)
-
-    @cached_property
-    def index(self) -> NDArray[Any]:
-        """The entries as an array."""
-        return np.frombuffer(self.entries, INDEX_ENTRY)
-
-    def __len__(self) -> int:
-        """Messages."""
-        return len(self.entries) // INDEX_ENTRY.itemsize
-
-
-def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
-    """A copy of the entries of all spans: `message_records.INDEX_ENTRY`."""
-    # As bytes: to NumPy each array of structures is a negotiation about their fields.
-    return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
 
 
 @dataclass
@@ -215,6 +185,29 @@ def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
     if (ids == ids[0]).all():
         return {int(ids[0]): entries}
     return {int(channel_id): entries[ids == channel_id] for channel_id in np.unique(ids)}
+
+
+def footer_of(view: memoryview) -> Footer | None:
+    """The footer, if a file ends with one.
+
+    Raises:
+        CorruptLogError: the summary that it points at is not there, or does not match its CRC.
+    """
+    start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
+    if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
+        return None
+    opcode, length = RECORD_HEADER.unpack_from(view, start)
+    if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD_HEADER_BYTES:
+        return None
+    footer: Footer = parse_record(opcode, view[start + RECORD_HEADER_BYTES :])
+    if footer.summary_start == 0:
+        return footer
+    if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
+        raise CorruptLogError("the footer points outside the file")
+    covered = view[footer.summary_start : start + _FOOTER_BYTES - 4]
+    if footer.summary_crc and crc32(covered) != footer.summary_crc:
+        raise CorruptLogError("the summary does not match its CRC")
+    return footer
 
 
 def chunk_index_record(chunk: ChunkIndex) -> bytes:

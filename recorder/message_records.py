@@ -32,7 +32,7 @@ MESSAGE_HEADER = np.dtype(
 RECORD_HEADER_BYTES = 9
 INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 # What a MessageIndex record has before its entries.
-_INDEX_HEAD = np.dtype(
+INDEX_HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel_id", "<u2"), ("entries_bytes", "<u4")]
 )
 # So few of something are sooner looked at one by one than as an array.
@@ -114,11 +114,11 @@ def message_indexes(
     file: memoryview, offsets: Sequence[int], channel_id: int
 ) -> Iterable[memoryview]:
     """Those of the MessageIndex records at several offsets, all looked at together; likewise."""
-    if len(offsets) < _FEW or max(offsets) > len(file) - _INDEX_HEAD.itemsize:
+    if len(offsets) < _FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
         return [message_index(file, offset, channel_id) for offset in offsets]
     starts = np.array(offsets, np.int64)
-    heads = windows(file, starts, _INDEX_HEAD)
-    starts += _INDEX_HEAD.itemsize
+    heads = windows(file, starts, INDEX_HEAD)
+    starts += INDEX_HEAD.itemsize
     stops = starts + heads["entries_bytes"]
     is_wrong = (heads["opcode"] != Opcode.MESSAGE_INDEX) | (heads["channel_id"] != channel_id)
     is_wrong |= (heads["entries_bytes"] % INDEX_ENTRY.itemsize != 0) | (stops > len(file))

@@ -17,7 +17,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import Span
+from mcaprl.recorder.message_spans import Span
 
 _CHUNKS_KEPT = 24
 

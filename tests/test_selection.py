@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -157,3 +158,58 @@ def test_threads_tell_of_damage(log: Path, tmp_path: Path) -> None:
         mcaprl.open(tmp_path / "log.mcap", threads=3)
     with pytest.raises(UsageError, match="threads 0"):
         mcaprl.open(log, threads=0)
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of vectors in several large chunks, forty episodes of a thousand steps."""
+    path = tmp_path_factory.mktemp("selection") / "large.mcap"
+    steps = 40_000
+    frames = np.random.default_rng(0).standard_normal((steps + 1, 4), np.float32)
+    mcaprl.Dataset.from_arrays(
+        observations=frames[:-1],
+        next_observations=frames[1:],
+        actions=np.zeros(steps, np.int64),
+        rewards=np.arange(float(steps)),
+        terminated=np.arange(1, steps + 1) % 1000 == 0,
+        truncated=np.zeros(steps, bool),
+    ).save(path)
+    return path
+
+
+def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> None:
+    """Who looks for one episode must not touch a large file all over."""
+    reader = McapReader(large)
+    channel = reader.channel_of("/rl/step")
+    assert channel is not None
+    spoilt = bytearray(large.read_bytes())
+    chunks = [span.chunk for span in reader.spans(channel)]
+    assert len(chunks) == 5
+    for chunk in chunks[:-1]:
+        assert chunk is not None
+        start = chunk.message_index_offsets[channel.id]
+        spoilt[start : start + chunk.message_index_length] = bytes(chunk.message_index_length)
+    path = tmp_path / "spoilt.mcap"
+    path.write_bytes(spoilt)
+    assert_same_bits(
+        mcaprl.open(path, episodes=39).rewards, mcaprl.open(large, episodes=39).rewards
+    )
+    with pytest.raises(CorruptLogError, match="no message index of channel"):
+        mcaprl.open(path)
+
+
+def test_an_index_that_leads_to_fewer_messages_is_found_out(large: Path, tmp_path: Path) -> None:
+    reader = McapReader(large)
+    channel = reader.channel_of("/rl/step")
+    assert channel is not None
+    chunk = reader.spans(channel)[2].chunk
+    assert chunk is not None
+    spoilt = bytearray(large.read_bytes())
+    # Behind opcode, length and channel stands how many bytes of entries there are.
+    place = chunk.message_index_offsets[channel.id] + 11
+    (told,) = struct.unpack_from("<I", spoilt, place)
+    struct.pack_into("<I", spoilt, place, told - 16)
+    path = tmp_path / "spoilt.mcap"
+    path.write_bytes(spoilt)
+    with pytest.raises(CorruptLogError, match="has not the 8192 messages that the summary tells"):
+        mcaprl.open(path)

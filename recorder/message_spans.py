@@ -1,0 +1,98 @@
+"""Where messages of a channel stand together, and the entries of the index that lead to each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property, partial
+from typing import Any, Self
+
+import numpy as np
+from mcap.records import ChunkIndex
+from numpy.typing import NDArray
+
+from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD
+
+# The indexes of smaller chunks stand so close that they are sooner read all at once.
+_LARGE_CHUNK_BYTES = 2**16
+
+
+class Span:
+    """Messages of one channel that stand together; its length is how many.
+
+    Attributes:
+        chunk: in which they are; None for messages outside of all chunks.
+        entries: their log_time and offset, `message_records.INDEX_ENTRY`, as bytes.
+    """
+
+    def __init__(self, chunk: ChunkIndex | None, entries: memoryview) -> None:
+        """Note them."""
+        self.chunk, self.entries = chunk, entries
+
+    @classmethod
+    def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
+        """Of an array of entries."""
+        return cls(chunk, np.ascontiguousarray(index).view(np.uint8).data)
+
+    @cached_property
+    def index(self) -> NDArray[Any]:
+        """The entries as an array."""
+        return np.frombuffer(self.entries, INDEX_ENTRY)
+
+    def __len__(self) -> int:
+        """Messages."""
+        return len(self.entries) // INDEX_ENTRY.itemsize
+
+
+class ToldSpan(Span):
+    """A span whose entries are not read before they are asked for: a summary tells how many."""
+
+    def __init__(self, chunk: ChunkIndex, count: int, read: Callable[[], memoryview]) -> None:
+        """Note how many there are, and what reads them."""
+        self.chunk, self._count, self._read = chunk, count, read
+
+    @cached_property
+    def entries(self) -> memoryview:  # type: ignore[override]
+        """As a span's.
+
+        Raises:
+            CorruptLogError: the index is damaged, or there are not as many.
+        """
+        return self._read()
+
+    def __len__(self) -> int:
+        """Messages."""
+        return self._count
+
+
+def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
+    """A copy of the entries of all spans: `message_records.INDEX_ENTRY`."""
+    # As bytes: to NumPy each array of structures is a negotiation about their fields.
+    return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
+
+
+def told_spans(
+    chunks: Sequence[ChunkIndex],
+    channel_id: int,
+    index_of: Callable[[ChunkIndex, int, int], memoryview],
+) -> list[Span]:
+    """A channel's messages by the summary alone, if it has large chunks to itself; else none.
+
+    No index is read before it must: who looks for one episode in a large file does not touch it all
+    over then.
+
+    Args:
+        chunks: of the file.
+        channel_id: of the channel.
+        index_of: reads the entries of a chunk's index of a channel, which must be so many.
+    """
+    spans: list[Span] = []
+    for chunk in chunks:
+        offsets = chunk.message_index_offsets
+        if channel_id not in offsets:
+            continue
+        if len(offsets) > 1 or chunk.chunk_length < _LARGE_CHUNK_BYTES:
+            return []
+        entries_bytes = max(0, chunk.message_index_length - INDEX_HEAD.itemsize)
+        count = entries_bytes // INDEX_ENTRY.itemsize
+        spans.append(ToldSpan(chunk, count, partial(index_of, chunk, channel_id, count)))
+    return spans
