@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -25,6 +26,7 @@ from mcaprl.errors import LogError, NoEpisodesError, NotMcapError, OutputExistsE
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.recover import Recovery, recover_log
+from mcaprl.recorder.salvage import Damage, sound_records
 from tests.recordings import Truth, assert_holds, record
 
 SPACE = spaces.Dict(
@@ -344,3 +346,29 @@ def test_a_log_whose_steps_have_lost_their_name(
     with pytest.raises(NoEpisodesError, match="no whole episode"):
         recover_log(log_path, tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_the_search_for_records_copies_nothing_of_the_rest(log_path: Path) -> None:
+    """A copy of the rest of a file at each of its records would make the search quadratic."""
+    steps = 20_000
+    frames = np.random.default_rng(0).standard_normal((steps + 1, 20))
+    mcaprl.Dataset.from_arrays(
+        observations=frames[:-1],
+        next_observations=frames[1:],
+        actions=np.zeros(steps, np.int64),
+        rewards=np.zeros(steps),
+        terminated=np.zeros(steps, bool),
+        truncated=np.arange(steps) == steps - 1,
+    ).save(log_path, compression="none")
+    view = memoryview(log_path.read_bytes())
+    assert len(view) > 2_000_000
+    tracemalloc.start()
+    try:
+        damages: list[Damage] = []
+        found = sum(1 for _ in sound_records(view, damages))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert found > 5
+    assert damages == []
+    assert peak < 300_000
