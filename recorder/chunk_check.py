@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,15 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunks import chunk_header
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import contents_of, parse_record, uniform_indexes
+from mcaprl.recorder.mcap_records import (
+    MESSAGE_START,
+    contents_of,
+    parse_record,
+    records_of,
+    uniform_indexes,
+)
 from mcaprl.recorder.message_records import (
+    FEW,
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
@@ -55,24 +63,23 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
     Raises:
         CorruptLogError: an index or a record is damaged.
     """
-    where, view = place(reader, chunk), reader.view
+    found, view = [], reader.view
     header = chunk_header(view, chunk.chunk_start_offset)
     told = (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
-    found = [] if told == (header.start_time, header.end_time, header.uncompressed_bytes) else [
-        Contradiction("the summary does not tell what the chunk is", where)
-    ]  # fmt: skip
+    if told != (header.start_time, header.end_time, header.uncompressed_bytes):
+        found.append("the summary does not tell what the chunk is")
     indexes = {
         channel_id: np.frombuffer(message_index(view, offset, channel_id), INDEX_ENTRY)
         for channel_id, offset in chunk.message_index_offsets.items()
     }
     if not _is_complete(records, indexes):
-        found += _wrong_indexes(reader, indexes, contents_of(records).indexes, where)
+        found += _wrong_indexes(reader, indexes, contents_of(records).indexes)
     times = [index["log_time"] for index in indexes.values() if len(index)]
     if times:
         first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
         if (first, last) != (header.start_time, header.end_time):
-            found.append(Contradiction("the times of the chunk are not those in it", where))
-    return found
+            found.append("the times of the chunk are not those in it")
+    return [Contradiction(what, place(reader, chunk)) for what in found]
 
 
 def check_statistics(reader: McapReader) -> list[Contradiction]:
@@ -110,6 +117,8 @@ def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     """Whether the indexes tell of every byte of a chunk: messages that touch each other."""
     if not indexes or not len(records):
         return False
+    if sum(map(len, indexes.values())) < FEW:
+        return _are_all(records, indexes)
     uniform = uniform_indexes(records)
     if uniform is not None:
         return uniform.keys() == indexes.keys() and all(
@@ -137,12 +146,26 @@ def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     )
 
 
+def _are_all(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
+    """Likewise, of a few messages, one by one."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    end = 0
+    for offset, opcode, content in records_of(records, 0):
+        if opcode != Opcode.MESSAGE or len(content) < MESSAGE_START.size:
+            return False
+        channel_id, _, log_time = MESSAGE_START.unpack_from(content)
+        found.setdefault(channel_id, []).append((log_time, offset))
+        end = offset + RECORD_HEADER_BYTES + len(content)
+    told = {
+        channel_id: sorted(index.tolist(), key=itemgetter(1))
+        for channel_id, index in indexes.items()
+    }
+    return end == len(records) and found == told
+
+
 def _wrong_indexes(
-    reader: McapReader,
-    told: dict[int, NDArray[Any]],
-    actual: dict[int, NDArray[Any]],
-    where: str,
-) -> list[Contradiction]:
+    reader: McapReader, told: dict[int, NDArray[Any]], actual: dict[int, NDArray[Any]]
+) -> list[str]:
     found, none = [], np.empty(0, INDEX_ENTRY)
     for channel_id in sorted(told.keys() | actual.keys()):
         known = reader.channels.get(channel_id)
@@ -150,7 +173,7 @@ def _wrong_indexes(
         here = np.sort(told.get(channel_id, none), order="offset")
         there = np.sort(actual.get(channel_id, none), order="offset")
         if channel_id not in told:
-            found.append(Contradiction(f"{topic} is not in the message index", where))
+            found.append(f"{topic} is not in the message index")
         elif not np.array_equal(here, there):
-            found.append(Contradiction(f"the message index of {topic} is wrong", where))
+            found.append(f"the message index of {topic} is wrong")
     return found

@@ -7,7 +7,7 @@ import itertools
 import mmap
 import struct
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -166,6 +166,21 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     if end != len(chunk):
         raise CorruptLogError("a record reaches beyond its chunk")
     return ChunkContents(topics, loose.indexes())
+
+
+def only(
+    records: memoryview, indexes: Mapping[int, NDArray[Any]]
+) -> tuple[memoryview, dict[int, NDArray[Any]]]:
+    """Those records of a chunk that indexes lead to, one behind the other, and their indexes."""
+    kept, new = bytearray(), {}
+    for channel_id, index in indexes.items():
+        entries = []
+        for time_ns, offset in index.tolist():
+            _, length = RECORD_HEADER.unpack_from(records, offset)
+            entries.append((time_ns, len(kept)))
+            kept += records[offset : offset + RECORD_HEADER_BYTES + length]
+        new[channel_id] = np.array(entries, INDEX_ENTRY)
+    return memoryview(bytes(kept)), new
 
 
 def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:

@@ -44,6 +44,7 @@ from mcaprl.recorder.mcap_append import Standing, what_is_written
 from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
+    RECORD_HEADER_BYTES,
     message_index_head,
     message_record,
     touching_offsets,
@@ -237,12 +238,11 @@ class McapWriter:
             self._summary.counts[channel_id] += len(index)
         starts = [int(index["log_time"].min()) for index in indexes.values()]
         ends = [int(index["log_time"].max()) for index in indexes.values()]
-        is_long = len(records) > _LONG_MESSAGE_BYTES * sum(map(len, indexes.values()))
         self._write_chunk(
             records,
             {channel_id: index.view(np.uint8).data for channel_id, index in indexes.items()},
             (min(starts), max(ends)),
-            self._compress_long if is_long else self._compress_short,
+            self._compressor_of(records, sum(map(len, indexes.values()))),
         )
 
     def close(self) -> None:
@@ -326,6 +326,14 @@ class McapWriter:
                     message_index_length=index_bytes,
                 )
             )
+
+    def _compressor_of(self, records: memoryview, count: int) -> Callable[[Any], bytes]:
+        """For so many messages of which no more is known: by their lengths."""
+        if len(records) > _LONG_MESSAGE_BYTES * count:
+            return self._compress_long
+        first_bytes = RECORD_HEADER_BYTES + int.from_bytes(records[1:RECORD_HEADER_BYTES], "little")
+        is_uniform = len(records) == first_bytes * count
+        return self._compress_short if is_uniform else self._compress_mixed
 
     def _next_sequence(self, channel_id: int) -> int:
         number = self._summary.counts[channel_id]

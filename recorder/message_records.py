@@ -36,7 +36,7 @@ INDEX_HEAD = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel_id", "<u2"), ("entries_bytes", "<u4")]
 )
 # So few of something are sooner looked at one by one than as an array.
-_FEW = 8
+FEW = 8
 _INDEX_START = struct.Struct("<BQHI")
 # What all records of one channel and length begin with: opcode, length, channel.
 _HEAD = struct.Struct("<BQH")
@@ -114,7 +114,7 @@ def message_indexes(
     file: memoryview, offsets: Sequence[int], channel_id: int
 ) -> Iterable[memoryview]:
     """Those of the MessageIndex records at several offsets, all looked at together; likewise."""
-    if len(offsets) < _FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
+    if len(offsets) < FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
         return [message_index(file, offset, channel_id) for offset in offsets]
     starts = np.array(offsets, np.int64)
     heads = windows(file, starts, INDEX_HEAD)

@@ -13,7 +13,7 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import Scratch, chunk_records
 from mcaprl.recorder.log_writer import STEP_TOPIC
-from mcaprl.recorder.mcap_records import contents_of, parse_record
+from mcaprl.recorder.mcap_records import contents_of, only, parse_record
 from mcaprl.recorder.mcap_writer import McapWriter
 from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 from mcaprl.recorder.metadata import METADATA_NAME
@@ -162,5 +162,7 @@ class _Copy:
             else:
                 what = f"{len(index)} messages of channel {channel_id}, which nothing tells of,"
                 self._damages.append(Damage(offset, 0, what))
+        if len(known) < len(contents.indexes):
+            records, known = only(records, known)
         if known:
             self._writer.write_records(records, known)

@@ -18,13 +18,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, NoEpisodesError, NotMcapError, OutputExistsError, UsageError
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 from mcaprl.recorder.recover import Recovery, recover_log
 from mcaprl.recorder.salvage import Damage, sound_records
 from tests.recordings import Truth, assert_holds, record
@@ -128,6 +129,26 @@ def test_file_without_summary_loses_nothing(log_path: Path, truth: tuple[bytes, 
         recovery, data = recovered(log_path, truth[0][:cut])
         assert_holds(data, truth[1])
         assert not recovery.has_losses or cut < start
+
+
+def test_a_lost_channel_costs_its_messages_alone(
+    log_path: Path, truth: tuple[bytes, Truth]
+) -> None:
+    """They stand in chunks with those of a channel that is known."""
+    good, recorded = truth
+    log_path.write_bytes(good)
+    reader = McapReader(log_path)
+    start, size = next(
+        (offset, RECORD_HEADER_BYTES + len(content))
+        for offset, opcode, content in reader.records(len(MCAP0_MAGIC))
+        if opcode == Opcode.CHANNEL and b"/rosout" in bytes(content)
+    )
+    lost, data = recovered(log_path, good[:start] + good[start + size : reader.summary_start - 13])
+    assert_holds(data, recorded)
+    assert lost.episodes == 4
+    assert sum("2 messages of channel" in str(damage) for damage in lost.damages) == 4
+    topics = {c.topic for c in McapReader(log_path.with_name("out.mcap")).channels.values()}
+    assert topics == {c.topic for c in reader.channels.values()} - {"/rosout"}
 
 
 @pytest.mark.parametrize("topic", ["/rl/step", "/rl/observation/picture"])
