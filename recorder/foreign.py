@@ -81,7 +81,10 @@ def _check_names(reader: McapReader, metadata: LogMetadata, columns: Columns) ->
 
 
 def _image_space(reader: McapReader, topic: str) -> spaces.Box:
-    first = Topic(reader, topic).read(("height", "width", "encoding"), np.zeros(1, np.int64))
+    images = Topic(reader, topic)
+    if not len(images):
+        raise LogError(f"{reader.path}: no images on {topic}")
+    first = images.read(("height", "width", "encoding"), np.zeros(1, np.int64))
     height, width, encoding = (first[name][0] for name in ("height", "width", "encoding"))
     channels = {name: count for count, name in IMAGE_ENCODINGS.items()}.get(encoding)
     if channels is None:

@@ -210,6 +210,23 @@ def test_images_of_another_writer(log_path: Path) -> None:
     assert_same_bits(found.observations["state"], STEPS.fields["observation"][STEPS.actual])
 
 
+def test_an_announced_camera_that_never_sent_a_picture_is_told(log_path: Path) -> None:
+    from mcaprl.recorder import messages
+
+    writer = Writer(str(log_path))
+    writer.start("ros2")
+    schema = writer.register_schema("robot_msgs/msg/Transition", "ros2msg", PLAIN.encode())
+    step = writer.register_channel("/rl/step", "cdr", schema)
+    text = messages.definition("sensor_msgs/msg/Image")
+    schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", text.encode())
+    writer.register_channel("/rl/observation/front", "cdr", schema)
+    for time_ns, data in plain_messages(STEPS):
+        writer.add_message(step, time_ns, data, time_ns)
+    writer.finish()
+    with pytest.raises(LogError, match="no images on /rl/observation/front"):
+        mcaprl.open(log_path)
+
+
 def test_missing_fields_are_named(log_path: Path) -> None:
     text = PLAIN.replace("bool final\n", "").replace("float64 reward\n", "")
     codec = Codec(text)
