@@ -12,6 +12,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 
 import mcaprl
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.spaces import space_from_json, space_to_json
 from tests.recordings import MIXED_SPACE, assert_holds, assert_same_bits, leaves_of, record
 from tests.strategies import observation_spaces, transitions
@@ -75,6 +76,26 @@ def test_arrays_round_trip(arrays: dict[str, Any]) -> None:
 @given(observation_spaces())
 def test_space_json_round_trip(space: spaces.Space[Any]) -> None:
     assert space_from_json(space_to_json(space)) == space
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("255", "655"),
+        ("[2, 3]", "[2, -3]"),
+        ("[2, 3]", "[2, 9000000000000]"),
+        ('"uint8"', '"uint9"'),
+        ('"low": 0', '"low": []'),
+        ('"low": 0', '"low": "many"'),
+        ('"type"', '"kind"'),
+        ("{", "[" * 100_000),
+    ],
+)
+def test_a_damaged_description_of_a_space_is_one_error(old: str, new: str) -> None:
+    text = space_to_json(spaces.Box(0, 255, (2, 3), np.uint8))
+    assert old in text
+    with pytest.raises(SpaceError, match="no description of a space"):
+        space_from_json(text.replace(old, new))
 
 
 def test_save_keeps_episodes_and_times(tmp_path: Path) -> None:
