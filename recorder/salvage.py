@@ -127,7 +127,7 @@ def _is_sound(opcode: int, content: memoryview) -> bool:
             return len(content) == 4
         case Opcode.FOOTER:
             return len(content) == 20
-        case _ if opcode in _REWRITTEN:
+        case _ if opcode == Opcode.HEADER or opcode in _REWRITTEN:
             return _repeats(opcode, content)
     return True
 

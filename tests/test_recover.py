@@ -131,6 +131,16 @@ def test_file_without_summary_loses_nothing(log_path: Path, truth: tuple[bytes, 
         assert not recovery.has_losses or cut < start
 
 
+def test_a_damaged_header_costs_nothing_else(log_path: Path, truth: tuple[bytes, Truth]) -> None:
+    good, recorded = truth
+    spoilt = bytearray(good)
+    # Behind the magic, opcode and length: the length of the profile.
+    spoilt[8 + RECORD_HEADER_BYTES + 3] = 255
+    recovery, data = recovered(log_path, bytes(spoilt))
+    assert_holds(data, recorded)
+    assert [damage.offset for damage in recovery.damages][:1] == [8]
+
+
 def test_a_lost_channel_costs_its_messages_alone(
     log_path: Path, truth: tuple[bytes, Truth]
 ) -> None:
