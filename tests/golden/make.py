@@ -98,6 +98,26 @@ def told(path: Path) -> None:
         play(env)
 
 
+def short_episodes(path: Path) -> None:
+    """Each told of in the chunk of its log lines; of some actions the probability is known."""
+    space = spaces.Box(-1, 1, (2,), np.float32)
+    lengths = [1 + k % 3 for k in range(12)]
+    episodes = [
+        [(np.full(2, k / 4, np.float32), float(k), k == last, False) for k in range(last + 1)]
+        for last in lengths
+    ]
+    env = mcaprl.RecordMcap(
+        ScriptedEnv(space, spaces.Discrete(2), episodes), path, start_time_ns=START_NS
+    )
+    with closing(env):
+        for length in lengths:
+            env.reset()
+            for step in range(length):
+                if step == 1:
+                    env.behavior_prob = 0.75
+                env.step(step % 2)
+
+
 FILES: dict[str, Callable[[Path], None]] = {
     **{
         f"every-space-{name}": partial(every_space, compression=name)
@@ -120,6 +140,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "vector-of-environments": of_a_vector,
     "lane-with-scene": with_scene,
     "told": told,
+    "short-episodes": short_episodes,
 }
 
 
