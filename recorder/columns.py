@@ -28,8 +28,8 @@ from mcaprl.recorder.message_spans import Span, joined_index
 
 # Messages of a chunk that are of more lengths than this are decoded one by one.
 _MAX_LENGTHS = 16
-# Entries of an index that are gone through at a time, so that they stay in a processor's cache.
-_ENTRIES_AT_ONCE = 2**15
+# Indexes of fewer entries are joined to so many: each by itself costs as much as some hundred.
+_ENTRIES_AT_ONCE = 2**12
 
 Columns = dict[str, NDArray[Any]]
 """Arrays of one length, by field name; texts are arrays of `str` objects."""
@@ -72,7 +72,7 @@ class Topic:
         """(N,) log_time of each message in the order of its channels and of the file."""
         times, start = np.empty(len(self), np.int64), 0
         for spans in _groups([part.span for part in self.parts]):
-            index = joined_index(spans)
+            index = spans[0].index if len(spans) == 1 else joined_index(spans)
             times[start : start + len(index)] = index["log_time"]
             start += len(index)
         if (times < 0).any():
@@ -319,7 +319,7 @@ class Part:
 
 
 def _groups(spans: list[Span]) -> Iterator[list[Span]]:
-    """Spans that follow each other, some thousand entries together."""
+    """Spans that follow each other: one with many entries, or several."""
     group: list[Span] = []
     entries = 0
     for span in spans:
