@@ -52,7 +52,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
 
 
 def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
-    episodes, bare = 30, "the environment alone"
+    episodes, bare = 100, "the environment alone"
     messages = (encoded * (1 + episodes * EPISODE_STEPS // len(encoded)))[
         : episodes * EPISODE_STEPS
     ]
@@ -91,7 +91,7 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
             ),
         ],
         goal="4 times less than mcap's Writer, 2 than foxglove-sdk, 15 than Minari's DataCollector",
-        rounds=20,
+        rounds=12,
     )
     table.ratios.pop(bare)
     return table
@@ -139,7 +139,7 @@ def _writing(
             ),
         ],
         goal="10 times mcap's Writer, 5 times foxglove-sdk",
-        rounds=8,
+        rounds=16,
     )
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -233,10 +234,16 @@ def _names(env: object, attribute: str) -> tuple[str, ...]:
 
 def installed_versions() -> dict[str, str]:
     """Versions of what a recording depends on."""
+    return dict(_installed_versions())
+
+
+@lru_cache(maxsize=1)
+def _installed_versions() -> tuple[tuple[str, str], ...]:
+    # Each is read from a file; together they would take most of the time to begin a log.
     found = {"mcaprl": __version__}
     for package in _VERSIONED:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return tuple(found.items())
