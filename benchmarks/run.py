@@ -13,6 +13,8 @@ from benchmarks import growth, logs, sims
 from benchmarks.measure import Table
 
 ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results.json"
+PARTS = ["logs", "growth", "sims"]
 LIBRARIES = (
     "numpy",
     "zstandard",
@@ -46,13 +48,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transitions", type=int, default=1_000_000, help="of the vector log")
     parser.add_argument("--largest", type=int, default=10_000_000, help="log of the growth table")
+    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="keep the others")
     arguments = parser.parse_args()
     sizes = tuple(size for size in (10**4, 10**5, 10**6, 10**7) if size <= arguments.largest)
+    tables = {} if arguments.only == PARTS else _last_tables()
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        tables = [*logs.tables(folder, arguments.transitions), *growth.tables(folder, sizes)]
-        tables += sims.tables()
-    write_results(tables, arguments.transitions)
+        folder, found = Path(name), []
+        if "logs" in arguments.only:
+            found += logs.tables(folder, arguments.transitions)
+        if "growth" in arguments.only:
+            found += growth.tables(folder, sizes)
+        if "sims" in arguments.only:
+            found += sims.tables()
+    tables |= {table.title: table for table in found}
+    write_results(list(tables.values()), arguments.transitions)
+
+
+def _last_tables() -> dict[str, Table]:
+    """Those of the last run, by title."""
+    results = json.loads(RESULTS.read_text())
+    return {table["title"]: Table(**table) for table in results["tables"]}
 
 
 def write_results(tables: list[Table], transitions: int) -> None:
@@ -64,7 +79,7 @@ def write_results(tables: list[Table], transitions: int) -> None:
         "versions": {name: _version(name) for name in LIBRARIES},
         "tables": [table.to_json() for table in tables],
     }
-    (ROOT / "benchmarks" / "results.json").write_text(json.dumps(results, indent=2) + "\n")
+    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
     versions = ", ".join(f"{name} {_version(name)}" for name in LIBRARIES)
     about = (
         f"The log of vectors has {transitions:,} transitions of 19 float32 in episodes of 1,000;"
