@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,8 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunks import chunk_header
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import (
-    MESSAGE_START,
     contents_of,
     parse_record,
-    records_of,
     uniform_indexes,
 )
 from mcaprl.recorder.message_records import (
@@ -117,12 +114,11 @@ def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     """Whether the indexes tell of every byte of a chunk: messages that touch each other."""
     if not indexes or not len(records):
         return False
-    if sum(map(len, indexes.values())) < FEW:
-        return _are_all(records, indexes)
-    uniform = uniform_indexes(records)
-    if uniform is not None:
-        return uniform.keys() == indexes.keys() and all(
-            np.array_equal(index.view("<u8"), uniform[channel_id].view("<u8"))
+    are_few = sum(map(len, indexes.values())) < FEW
+    found = contents_of(records).indexes if are_few else uniform_indexes(records)
+    if found is not None:
+        return found.keys() == indexes.keys() and all(
+            np.array_equal(index.view("<u8"), found[channel_id].view("<u8"))
             for channel_id, index in indexes.items()
         )
     entries = np.concatenate(list(indexes.values()))
@@ -144,23 +140,6 @@ def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
         and (heads["channel_id"] == ids).all()
         and (heads["log_time"] == entries["log_time"]).all()
     )
-
-
-def _are_all(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Likewise, of a few messages, one by one."""
-    found: dict[int, list[tuple[int, int]]] = {}
-    end = 0
-    for offset, opcode, content in records_of(records, 0):
-        if opcode != Opcode.MESSAGE or len(content) < MESSAGE_START.size:
-            return False
-        channel_id, _, log_time = MESSAGE_START.unpack_from(content)
-        found.setdefault(channel_id, []).append((log_time, offset))
-        end = offset + RECORD_HEADER_BYTES + len(content)
-    told = {
-        channel_id: sorted(index.tolist(), key=itemgetter(1))
-        for channel_id, index in indexes.items()
-    }
-    return end == len(records) and found == told
 
 
 def _wrong_indexes(

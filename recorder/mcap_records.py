@@ -171,7 +171,7 @@ def contents_of(chunk: memoryview) -> ChunkContents:
 def only(
     records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Those records of a chunk that indexes lead to, one behind the other, and their indexes."""
+    """Copies of those records that indexes lead to, one behind the other, and their indexes."""
     kept, new = bytearray(), {}
     for channel_id, index in indexes.items():
         entries = []
@@ -180,7 +180,7 @@ def only(
             entries.append((time_ns, len(kept)))
             kept += records[offset : offset + RECORD_HEADER_BYTES + length]
         new[channel_id] = np.array(entries, INDEX_ENTRY)
-    return memoryview(bytes(kept)), new
+    return memoryview(kept), new
 
 
 def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:

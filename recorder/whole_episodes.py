@@ -23,9 +23,9 @@ from mcaprl.recorder.log_reader import described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, INTERRUPTED, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_append import what_is_written
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import RECORD_HEADER, contents_of
+from mcaprl.recorder.mcap_records import contents_of, only
 from mcaprl.recorder.mcap_writer import McapWriter
-from mcaprl.recorder.message_records import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
+from mcaprl.recorder.message_records import MESSAGE_HEADER
 from mcaprl.recorder.metadata import METADATA_NAME
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import message_dtype
@@ -316,25 +316,20 @@ def _write_some(
     fates: dict[int, NDArray[np.uint8]],
 ) -> None:
     """Write those messages of a chunk that are not dropped."""
-    kept, new_indexes = bytearray(), {}
-    for channel_id, index in indexes.items():
-        entries = []
-        for (time_ns, offset), fate in zip(index.tolist(), fates[channel_id].tolist(), strict=True):
-            if fate == Fate.DROP:
-                continue
-            entries.append((time_ns, len(kept)))
-            _, length = RECORD_HEADER.unpack_from(records, offset)
-            record = bytearray(records[offset : offset + RECORD_HEADER_BYTES + length])
-            if fate != Fate.KEEP:
-                _end_at(record, reader, reader.channels[channel_id], Fate(fate))
-            kept += record
-        if entries:
-            new_indexes[channel_id] = np.array(entries, INDEX_ENTRY)
+    left = {channel_id: fate[fate != Fate.DROP] for channel_id, fate in fates.items()}
+    kept, new_indexes = only(
+        records,
+        {id_: index[fates[id_] != Fate.DROP] for id_, index in indexes.items() if len(left[id_])},
+    )
+    for channel_id, index in new_indexes.items():
+        for row in np.flatnonzero(left[channel_id] != Fate.KEEP).tolist():
+            record = kept[int(index["offset"][row]) :]
+            _end_at(record, reader, reader.channels[channel_id], Fate(left[channel_id][row]))
     if new_indexes:
-        writer.write_records(memoryview(bytes(kept)), new_indexes)
+        writer.write_records(kept, new_indexes)
 
 
-def _end_at(record: bytearray, reader: McapReader, channel: Channel, fate: Fate) -> None:
+def _end_at(record: memoryview, reader: McapReader, channel: Channel, fate: Fate) -> None:
     """Change a message so that its episode ends there."""
     form = _form(reader.schema_of(channel))
     assert form is not None, "episodes of other forms are not ended"
