@@ -259,7 +259,7 @@ class McapReader:
         spans = []
         for chunk, offsets in zip(chunks, told, strict=True):
             if channel_id in offsets:
-                spans.append(Span(chunk, next(entries)))
+                spans.append(Span.of_entries(chunk, next(entries)))
             elif not offsets and (span := self._unindexed_span(chunk, channel_id)) is not None:
                 spans.append(span)
         return spans

@@ -21,43 +21,37 @@ class Span:
 
     Attributes:
         chunk: in which they are; None for messages outside of all chunks.
-        entries: their log_time and offset, `message_records.INDEX_ENTRY`, as bytes.
     """
 
-    def __init__(self, chunk: ChunkIndex | None, entries: memoryview) -> None:
-        """Note them."""
-        self.chunk, self.entries = chunk, entries
+    def __init__(
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[], memoryview]
+    ) -> None:
+        """Note how many there are, and what reads the entries of their index."""
+        self.chunk, self._count, self._read = chunk, count, read
+
+    @classmethod
+    def of_entries(cls, chunk: ChunkIndex | None, entries: memoryview) -> Self:
+        """Of entries that are at hand: `message_records.INDEX_ENTRY`, as bytes."""
+        return cls(chunk, len(entries) // INDEX_ENTRY.itemsize, lambda: entries)
 
     @classmethod
     def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
-        """Of an array of entries."""
-        return cls(chunk, np.ascontiguousarray(index).view(np.uint8).data)
+        """Likewise, of an array."""
+        return cls.of_entries(chunk, np.ascontiguousarray(index).view(np.uint8).data)
+
+    @cached_property
+    def entries(self) -> memoryview:
+        """Their log_time and offset, `message_records.INDEX_ENTRY`, as bytes; read when asked for.
+
+        Raises:
+            CorruptLogError: the index is damaged.
+        """
+        return self._read()
 
     @cached_property
     def index(self) -> NDArray[Any]:
         """The entries as an array."""
         return np.frombuffer(self.entries, INDEX_ENTRY)
-
-    def __len__(self) -> int:
-        """Messages."""
-        return len(self.entries) // INDEX_ENTRY.itemsize
-
-
-class ToldSpan(Span):
-    """A span whose entries are not read before they are asked for: a summary tells how many."""
-
-    def __init__(self, chunk: ChunkIndex, count: int, read: Callable[[], memoryview]) -> None:
-        """Note how many there are, and what reads them."""
-        self.chunk, self._count, self._read = chunk, count, read
-
-    @cached_property
-    def entries(self) -> memoryview:  # type: ignore[override]
-        """As a span's.
-
-        Raises:
-            CorruptLogError: the index is damaged, or there are not as many.
-        """
-        return self._read()
 
     def __len__(self) -> int:
         """Messages."""
@@ -94,5 +88,5 @@ def told_spans(
             return []
         entries_bytes = max(0, chunk.message_index_length - INDEX_HEAD.itemsize)
         count = entries_bytes // INDEX_ENTRY.itemsize
-        spans.append(ToldSpan(chunk, count, partial(index_of, chunk, channel_id, count)))
+        spans.append(Span(chunk, count, partial(index_of, chunk, channel_id, count)))
     return spans

@@ -14,7 +14,7 @@ import warnings
 from array import array
 from collections.abc import Callable, Mapping
 from io import BytesIO
-from typing import Any, SupportsFloat
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -134,12 +134,12 @@ class StepColumns:
             self.take_action = actions.append
         self.keep_reward: Keeper = self._rewards.append
 
-    def keep_behavior_prob(self, prob: SupportsFloat) -> None:
+    def keep_behavior_prob(self, prob: float) -> None:
         """Keep the probability of the action that was kept last; of others it is not known."""
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
-        self._probs.append(prob)  # type: ignore[arg-type]
+        self._probs.append(prob)
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps values of a leaf."""
