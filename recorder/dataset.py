@@ -35,7 +35,6 @@ class Dataset:
 
     Attributes:
         sources: the files that it was read from; empty if it was not.
-        metadata: the log's own description of itself, strings by name.
     """
 
     def __init__(
@@ -49,7 +48,6 @@ class Dataset:
         self._transitions = transitions
         self._description = description
         self._leaves = leaves_of(description.observation_space)
-        self.metadata = description.to_strings()
         self.sources = sources
 
     @classmethod
@@ -131,6 +129,11 @@ class Dataset:
             LogMetadata.common([part._description for part in parts]),
             sources=tuple(path for part in parts for path in part.sources),
         )
+
+    @cached_property
+    def metadata(self) -> dict[str, str]:
+        """The log's own description of itself, strings by name."""
+        return self._description.to_strings()
 
     @cached_property
     def observations(self) -> Any:

@@ -13,18 +13,22 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
 from mcaprl.recorder.chunk_check import Contradiction
-from mcaprl.recorder.columns import LOG_TIME, Columns, Part, Topic
+from mcaprl.recorder.columns import LOG_TIME, Topic
+from mcaprl.recorder.decoder import Columns, Decoder
 from mcaprl.recorder.episode import Episode
 from mcaprl.recorder.episodes import COUNTERS, Told, episode_lengths, summaries
 from mcaprl.recorder.log_reader import LogReader, described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.message_spans import Span
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import step_schema
 from mcaprl.recorder.spaces import Leaf, observation_leaves
 
 _FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
+# Messages, what decodes them, and where they belong: rows of the steps' columns, or pictures.
+_Place = tuple[Decoder, Span, slice | Leaf]
 
 
 class EpisodeCheck:
@@ -54,17 +58,17 @@ class EpisodeCheck:
         # What is not of the form in which this library writes is read as any reader does.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
-        self._places: dict[int, list[tuple[Part, slice | Leaf]]] = defaultdict(list)
+        self._places: dict[int, list[_Place]] = defaultdict(list)
         if self._has_our_form:
             self._prepare()
 
     def take(self, chunk: ChunkIndex, records: memoryview) -> None:
         """Look at a chunk of the log."""
-        for part, place in self._places.get(chunk.chunk_start_offset, ()):
-            if isinstance(place, slice):
-                self._take_steps(part, records, place)
+        for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
+            if isinstance(where, slice):
+                self._take_steps(decoder.alike(records, span.index, _FIELDS), where)
             else:
-                self._take_images(part, records, place)
+                self._take_images(decoder.alike(records, span.index, _IMAGE_FIELDS), where)
 
     def finish(self) -> Iterator[Contradiction]:
         """Tell what contradicts each other.
@@ -116,32 +120,30 @@ class EpisodeCheck:
     def _prepare(self) -> None:
         """Note which messages of which chunk belong to what."""
         start = 0
-        for part in self._steps.parts:
-            stop = start + len(part.span)
-            self._place(part, slice(start, stop))
+        for decoder, span in self._steps.parts:
+            stop = start + len(span)
+            self._place(decoder, span, slice(start, stop))
             start = stop
         for leaf, topic in self._images:
-            for part in topic.parts:
-                self._place(part, leaf)
+            for decoder, span in topic.parts:
+                self._place(decoder, span, leaf)
         self._columns = {name: np.empty(start, self._steps.fields[name]) for name in _FIELDS} | {
             LOG_TIME: self._steps.times
         }
 
-    def _place(self, part: Part, place: slice | Leaf) -> None:
-        if part.span.chunk is None:
+    def _place(self, decoder: Decoder, span: Span, where: slice | Leaf) -> None:
+        if span.chunk is None:
             self._has_our_form = False
         else:
-            self._places[part.span.chunk.chunk_start_offset].append((part, place))
+            self._places[span.chunk.chunk_start_offset].append((decoder, span, where))
 
-    def _take_steps(self, part: Part, records: memoryview, rows: slice) -> None:
-        found = part.alike(records, part.span.index, _FIELDS)
+    def _take_steps(self, found: NDArray[Any] | None, rows: slice) -> None:
         if found is None:
             raise CorruptLogError(f"messages of {STEP_TOPIC} have not the form of their schema")
         for name in _FIELDS:
             self._columns[name][rows] = found[name]
 
-    def _take_images(self, part: Part, records: memoryview, leaf: Leaf) -> None:
-        found = part.alike(records, part.span.index, _IMAGE_FIELDS)
+    def _take_images(self, found: NDArray[Any] | None, leaf: Leaf) -> None:
         if found is None or not _is_image(found, leaf):
             raise CorruptLogError(f"pictures on {leaf.topic} are not as the metadata's space says")
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns import Columns, Topic
+from mcaprl.recorder.columns import Topic
+from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.log_writer import STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.rows import add_up
 
@@ -106,21 +107,15 @@ class Told:
         """Of those with these last log_times, and maybe others."""
         if not self._is_ours:
             return []
-        names = [name for name in EpisodeSummary._fields if name in self._topic.fields]
-        rows = None
+        columns, fields = self._columns, EpisodeSummary._fields
         if len(ends) < len(self._topic) // 2:
-            rows = np.flatnonzero(np.isin(self._columns["end_time_ns"], ends))
-        columns = self._topic.read(names, rows)
-        columns["terminated"] = columns["terminated"].astype(bool)
-        columns["truncated"] = columns["truncated"].astype(bool)
-        values = {name: columns[name].tolist() for name in names}
+            chosen = np.isin(columns["end_time_ns"], ends)
+            columns = {name: column[chosen] for name, column in columns.items()}
+        values = {name: columns[name].tolist() for name in fields if name in columns}
         if "seed" in values:
             values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
         defaults, told = EpisodeSummary._field_defaults, len(values["length"])
-        every = [
-            values[name] if name in values else [defaults[name]] * told
-            for name in EpisodeSummary._fields
-        ]
+        every = [values[name] if name in values else [defaults[name]] * told for name in fields]
         return list(map(EpisodeSummary._make, zip(*every, strict=True)))
 
     @property
@@ -130,7 +125,11 @@ class Told:
 
     @cached_property
     def _columns(self) -> Columns:
-        return self._topic.read(("length", "end_time_ns"))
+        names = [name for name in EpisodeSummary._fields if name in self._topic.fields]
+        columns = self._topic.read(names)
+        for name in ("terminated", "truncated"):
+            columns[name] = columns[name].astype(bool)
+        return columns
 
 
 def summaries(

@@ -18,7 +18,8 @@ from gymnasium import spaces
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.arrays import action_space_of, box_of
-from mcaprl.recorder.columns import Columns, Topic
+from mcaprl.recorder.columns import Topic
+from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.log_writer import STEP_TOPIC
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.metadata import LogMetadata

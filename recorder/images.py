@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunks import chunk_header
-from mcaprl.recorder.columns import Columns, Part, Topic
+from mcaprl.recorder.columns import Topic
+from mcaprl.recorder.decoder import Columns, Decoder
 from mcaprl.recorder.episodes import time_order
 from mcaprl.recorder.log_writer import IMAGES_PER_CHUNK, STEP_TOPIC
 from mcaprl.recorder.mapped import Frames, MappedImages, PictureFile
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.message_records import MESSAGE_HEADER
+from mcaprl.recorder.message_spans import Span
 from mcaprl.recorder.spaces import Leaf
 from mcaprl.recorder.storage import IMAGE_TYPE, Storage, image_cache, is_mapped
 
@@ -57,10 +59,8 @@ class _Images:
     @property
     def are_mappable(self) -> bool:
         """Whether all pictures stand in the file as they are."""
-        return all(
-            part.span.chunk is not None and not part.span.chunk.compression
-            for part in self.topic.parts
-        )
+        chunks = [span.chunk for span in self.topic.spans]
+        return all(chunk is not None and not chunk.compression for chunk in chunks)
 
     def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
         """Which message is that of each time.
@@ -102,14 +102,14 @@ class _Images:
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()
-        for number, part in enumerate(self.topic.parts):
-            chunk, index = part.span.chunk, part.span.index
+        for number, (decoder, span) in enumerate(self.topic.parts):
+            chunk, index = span.chunk, span.index
             assert chunk is not None, "pictures outside of chunks are not mapped"
             data = chunk_header(self._reader.view, chunk.chunk_start_offset).data
             stop = start + len(index)
             places[start:stop, 0], places[start:stop, 1] = 0, number
             places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
-            checks.append(self._check_of(part, first))
+            checks.append(self._check_of(decoder, span, first))
             start = stop
         name = str(self._reader.path)
         file = PictureFile(name, self._reader.view, self._leaf.size, checks)
@@ -117,15 +117,15 @@ class _Images:
 
     def _data_offset(self) -> int:
         """Where the first message's picture is, counted from its record."""
-        part = self.topic.parts[0]
-        found = part.alike(self._reader.records_of(part.span), part.span.index[:1], _FIELDS)
+        decoder, span = next(self.topic.parts)
+        found = decoder.alike(self._reader.records_of(span), span.index[:1], _FIELDS)
         if found is None:
             raise CorruptLogError(f"{self._reader.path}: an image on {self.topic.name} is damaged")
         return _offset_of_data(found.dtype)
 
-    def _check_of(self, part: Part, data_offset: int) -> Callable[[], None]:
+    def _check_of(self, decoder: Decoder, span: Span, data_offset: int) -> Callable[[], None]:
         def check() -> None:
-            found = part.alike(self._reader.records_of(part.span), part.span.index, _FIELDS)
+            found = decoder.alike(self._reader.records_of(span), span.index, _FIELDS)
             if found is None or _offset_of_data(found.dtype) != data_offset:
                 raise CorruptLogError(
                     f"{self._reader.path}: images on {self.topic.name} are not all of one form;"

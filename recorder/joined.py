@@ -8,30 +8,26 @@ piece of memory, and their messages are taken from there at once.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunks import Scratch, joined_records
+from mcaprl.recorder.decoder import Decoder, Rows
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.message_records import MESSAGE_HEADER, RECORD_HEADER_BYTES, gather
 from mcaprl.recorder.message_spans import Span, joined_index
 
-if TYPE_CHECKING:
-    from mcaprl.recorder.columns import Part
-
 # So large a piece stays in a processor's cache from one pass over it to the next.
 _MOST_BYTES = 2**20
 
-Rows = slice | NDArray[np.int64]
-
 
 class Chosen(NamedTuple):
-    """Messages of a part, and their rows in the columns."""
+    """Messages of a channel, what decodes them, and their rows in the columns."""
 
-    part: Part
+    decoder: Decoder
     span: Span
     rows: Rows
 
@@ -49,7 +45,7 @@ def neighbors(chosen: Iterable[Chosen]) -> Iterator[list[Chosen]]:
     size = 0
     for one in chosen:
         more = one.chunk_bytes
-        is_other = bool(together) and one.part.channel is not together[0].part.channel
+        is_other = bool(together) and one.decoder is not together[0].decoder
         if together and (is_other or size + more > _MOST_BYTES):
             yield together
             together, size = [], 0

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
-from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
+from mcaprl.recorder.columns import LOG_TIME, Topic
 from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.episodes import (
     COUNTERS,
     Told,

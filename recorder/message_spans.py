@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -24,15 +24,15 @@ class Span:
     """
 
     def __init__(
-        self, chunk: ChunkIndex | None, count: int, read: Callable[[], memoryview]
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[Span], memoryview]
     ) -> None:
-        """Note how many there are, and what reads the entries of their index."""
+        """Note how many there are, and what reads the entries of this span's index."""
         self.chunk, self._count, self._read = chunk, count, read
 
     @classmethod
     def of_entries(cls, chunk: ChunkIndex | None, entries: memoryview) -> Self:
         """Of entries that are at hand: `message_records.INDEX_ENTRY`, as bytes."""
-        return cls(chunk, len(entries) // INDEX_ENTRY.itemsize, lambda: entries)
+        return cls(chunk, len(entries) // INDEX_ENTRY.itemsize, lambda _: entries)
 
     @classmethod
     def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
@@ -46,7 +46,7 @@ class Span:
         Raises:
             CorruptLogError: the index is damaged.
         """
-        return self._read()
+        return self._read(self)
 
     @cached_property
     def index(self) -> NDArray[Any]:
@@ -79,14 +79,15 @@ def told_spans(
         channel_id: of the channel.
         index_of: reads the entries of a chunk's index of a channel, which must be so many.
     """
-    spans: list[Span] = []
-    for chunk in chunks:
-        offsets = chunk.message_index_offsets
-        if channel_id not in offsets:
-            continue
-        if len(offsets) > 1 or chunk.chunk_length < _LARGE_CHUNK_BYTES:
-            return []
-        entries_bytes = max(0, chunk.message_index_length - INDEX_HEAD.itemsize)
-        count = entries_bytes // INDEX_ENTRY.itemsize
-        spans.append(Span(chunk, count, partial(index_of, chunk, channel_id, count)))
-    return spans
+    mine = [chunk for chunk in chunks if channel_id in chunk.message_index_offsets]
+    smallest = min((chunk.chunk_length for chunk in mine), default=0)
+    if smallest < _LARGE_CHUNK_BYTES or any(len(c.message_index_offsets) > 1 for c in mine):
+        return []
+
+    def read(span: Span) -> memoryview:
+        assert span.chunk is not None
+        return index_of(span.chunk, channel_id, len(span))
+
+    bytes_ = [chunk.message_index_length - INDEX_HEAD.itemsize for chunk in mine]
+    counts = [max(0, count) // INDEX_ENTRY.itemsize for count in bytes_]
+    return [Span(chunk, count, read) for chunk, count in zip(mine, counts, strict=True)]

@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.columns import Columns, Topic
+from mcaprl.recorder.columns import Topic
+from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.layout import is_values_topic
 from mcaprl.recorder.log_writer import STEP_TOPIC
 from mcaprl.recorder.mcap_reader import McapReader

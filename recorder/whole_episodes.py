@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder import messages
-from mcaprl.recorder.columns import LOG_TIME, Columns, Topic
+from mcaprl.recorder.columns import LOG_TIME, Topic
+from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.log_reader import described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, INTERRUPTED, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_append import what_is_written
@@ -279,10 +280,10 @@ def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
 
 def _by_place(steps: Topic, fates: NDArray[np.uint8]) -> Iterator[tuple[Place, NDArray[np.uint8]]]:
     start = 0
-    for part in steps.parts:
-        stop = start + len(part.span)
-        assert part.span.chunk is not None, "all messages are in chunks"
-        yield (part.span.chunk.chunk_start_offset, part.channel.id), fates[start:stop]
+    for decoder, span in steps.parts:
+        stop = start + len(span)
+        assert span.chunk is not None, "all messages are in chunks"
+        yield (span.chunk.chunk_start_offset, decoder.channel.id), fates[start:stop]
         start = stop
 
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder import joined
-from mcaprl.recorder.columns import Part
+from mcaprl.recorder.decoder import Decoder
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.message_records import INDEX_ENTRY
 from tests.recordings import MIXED_SPACE, ScriptedEnv, record
@@ -41,13 +41,13 @@ def test_visits_do_not_grow_with_the_episodes(
     log_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record(log_path, spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), LENGTHS)
-    visits, fill = [], Part.fill
+    visits, fill = [], Decoder.fill
 
-    def count(part: Part, *arguments: object) -> None:
-        visits.append(part)
-        fill(part, *arguments)  # type: ignore[arg-type]
+    def count(decoder: Decoder, *arguments: object) -> None:
+        visits.append(decoder)
+        fill(decoder, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Part, "fill", count)
+    monkeypatch.setattr(Decoder, "fill", count)
     data = mcaprl.open(log_path)
     assert len(data.episodes) == len(LENGTHS)
     assert len(McapReader(log_path).chunks) == 2 * len(LENGTHS)
