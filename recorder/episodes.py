@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +14,7 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns import Topic
 from mcaprl.recorder.decoder import Columns
 from mcaprl.recorder.log_writer import STEP_TOPIC, EpisodeSummary
-from mcaprl.recorder.rows import add_up
+from mcaprl.recorder.rows import add_up_each
 
 COUNTERS = ("episode", "step", "final")
 """The fields that say which episode a record belongs to, where in it, and whether it is the end."""
@@ -142,14 +144,14 @@ def summaries(
     """
     # By the time of their last record: appended recordings count from 0 again.
     by_end = {summary.end_time_ns: summary for summary in told}
-    found = []
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()
-    for end, final, length in zip(ends, finals.tolist(), lengths.tolist(), strict=True):
-        summary = by_end.get(end)
-        if summary is None:
-            summary = _summary_of_records(columns, final, length)
-        elif summary.length != length:
+    untold = np.array([end not in by_end for end in ends], bool)
+    summed_up = _of_records(columns, finals[untold], lengths[untold])
+    found = []
+    for end, length in zip(ends, lengths.tolist(), strict=True):
+        summary = by_end[end] if end in by_end else next(summed_up)
+        if summary.length != length:
             raise CorruptLogError(
                 f"{path}: /rl/episode gives episode {summary.episode} {summary.length} steps,"
                 f" {STEP_TOPIC} has {length}"
@@ -158,15 +160,21 @@ def summaries(
     return tuple(found)
 
 
-def _summary_of_records(columns: Columns, final: int, length: int) -> EpisodeSummary:
-    first = final - length
-    last = max(final - 1, first)
-    return EpisodeSummary(
-        episode=int(columns["episode"][final]),
-        length=length,
-        total_reward=add_up(columns["reward"][first:final]),
-        terminated=bool(columns["terminated"][last]),
-        truncated=bool(columns["truncated"][last]),
-        start_time_ns=int(columns["log_time"][first]),
-        end_time_ns=int(columns["log_time"][final]),
+def _of_records(
+    columns: Columns, finals: NDArray[np.int64], lengths: NDArray[np.int64]
+) -> Iterator[EpisodeSummary]:
+    """Summaries of the episodes that end with these records."""
+    firsts = finals - lengths
+    lasts = np.maximum(finals - 1, firsts)
+    rewards = columns["reward"].astype(np.float64, copy=False)
+    # In the order of the summary's fields.
+    values = (
+        columns["episode"][finals].tolist(),
+        lengths.tolist(),
+        add_up_each(rewards, firsts.tolist(), finals.tolist()),
+        columns["terminated"][lasts].astype(bool).tolist(),
+        columns["truncated"][lasts].astype(bool).tolist(),
+        columns["log_time"][firsts].tolist(),
+        columns["log_time"][finals].tolist(),
     )
+    return itertools.starmap(EpisodeSummary, zip(*values, strict=True))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import warnings
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
 from typing import Any
 
@@ -326,6 +326,17 @@ def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
     with np.errstate(all="ignore"):
         # Of nothing but -0.0, too, the sum from 0.0 on is 0.0.
         return float(np.add.accumulate(rewards)[-1] + 0.0)
+
+
+def add_up_each(
+    rewards: NDArray[np.float64], starts: Iterable[int], stops: Iterable[int]
+) -> list[float]:
+    """The sums, likewise, of several spans of rewards."""
+    with np.errstate(all="ignore"):
+        return [
+            float(np.add.accumulate(rewards[start:stop])[-1] + 0.0) if start < stop else 0.0
+            for start, stop in zip(starts, stops, strict=True)
+        ]
 
 
 def _converter(leaf: Leaf) -> Converter:

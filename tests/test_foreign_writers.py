@@ -251,6 +251,16 @@ def test_no_observation(log_path: Path) -> None:
         mcaprl.open(log_path)
 
 
+def test_small_numbers_are_added_up_in_large_ones(log_path: Path) -> None:
+    """Of float32, 2**24 and 1 make 2**24."""
+    text = PLAIN.replace("float64 reward", "float32 reward")
+    codec, steps = Codec(text), steps_of([3])
+    steps.fields["reward"] = np.array([2**24, 1, 1, 0], np.float32)
+    messages = [(time_ns, codec.encode(**fields)) for time_ns, fields in steps.rows()]
+    write_with_mcap(log_path, messages, text)
+    assert mcaprl.open(log_path).episodes[0].total_reward == 2**24 + 2
+
+
 def test_observations_of_several_lengths(log_path: Path) -> None:
     text = PLAIN.replace("float32[3]", "float32[]")
     codec = Codec(text)
