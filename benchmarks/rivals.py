@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
+from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.chunks import ChunkHeader, chunk_header
+from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import map_file
 from mcaprl.recorder.schema import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)
@@ -275,8 +279,6 @@ def compressed_chunks(
     path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
 ) -> list[memoryview]:
     """The bytes of the chunks that hold a topic in a time, as they stand in the file."""
-    from mcaprl.recorder.mcap_reader import McapReader
-
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
     found = []
@@ -296,17 +298,29 @@ def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
         zstandard.decompress(data)
 
 
-def zstd_into_new_memory(chunks: Sequence[bytes | memoryview]) -> NDArray[np.uint8]:
-    """Decompress chunks into one new array: what no reader of columns can do without."""
+def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
+    """Of the chunks that hold a topic."""
+    reader = McapReader(path)
+    ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
+    found = [chunk for chunk in reader.chunks if ids & set(chunk.message_index_offsets)]
+    return [chunk_header(reader.view, chunk.chunk_start_offset) for chunk in found]
+
+
+def least_work(path: Path, headers: Sequence[ChunkHeader]) -> NDArray[np.uint8]:
+    """Map a file, decompress these chunks into new memory, and check them against their CRCs.
+
+    No reader of columns can do without: what it does to find, check and sort messages comes on top.
+    """
     import zstandard
 
-    decompressor = zstandard.ZstdDecompressor()
-    ends = np.cumsum([zstandard.frame_content_size(data) for data in chunks]).tolist()
-    memory = np.empty(ends[-1], np.uint8)
-    for data, start, end in zip(chunks, [0, *ends[:-1]], ends, strict=True):
-        with decompressor.stream_reader(data) as reader:
-            read = reader.readinto(memory.data[start:end])
-        assert read == end - start
+    decompressor, view = zstandard.ZstdDecompressor(), map_file(path)
+    memory, start = np.empty(sum(header.uncompressed_bytes for header in headers), np.uint8), 0
+    for header in headers:
+        records = memory.data[start : start + header.uncompressed_bytes]
+        with decompressor.stream_reader(view[header.data]) as reader:
+            read = reader.readinto(records)
+        assert (read, crc32(records)) == (len(records), header.crc)
+        start += read
     return memory
 
 

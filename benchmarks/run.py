@@ -33,8 +33,8 @@ _PAGE = """\
 Measured by the command below, which also writes this page. All sides of a table run in one process,
 in turns, on the same data, in one thread; CPU time counts, and the best of several turns. Seconds
 depend on the machine, so there are ratios only. Side by side with ours stand the limits: copies in
-memory, and plain decompression of the same chunks by zstd: each into the place of the one before,
-or all into new memory, which who reads columns needs as well.
+memory; plain decompression of the same chunks by zstd, each into the place of the one before; and
+the least that a reader of columns must do: map the file, decompress into new memory, check CRCs.
 
 ```sh
 make bench
