@@ -11,6 +11,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.checksum import crc32
@@ -86,6 +87,25 @@ class ChunkHeader(NamedTuple):
             len(name),
         )
         return b"".join((start, name, data_bytes.to_bytes(8, "little")))
+
+    def to_index(self, offset: int, content_bytes: int) -> ChunkIndex:
+        """What a summary would tell, before anything is known of indexes of its messages.
+
+        Args:
+            offset: of the Chunk record.
+            content_bytes: that record's length.
+        """
+        return ChunkIndex(
+            chunk_start_offset=offset,
+            chunk_length=RECORD_HEADER_BYTES + content_bytes,
+            compression=self.compression,
+            compressed_size=self.data.stop - self.data.start,
+            uncompressed_size=self.uncompressed_bytes,
+            message_start_time=self.start_time,
+            message_end_time=self.end_time,
+            message_index_offsets={},
+            message_index_length=0,
+        )
 
 
 def chunk_header(file: memoryview, offset: int) -> ChunkHeader:

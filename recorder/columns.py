@@ -7,10 +7,9 @@ them; the rest are decoded one by one. Which way a message went cannot be seen i
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from operator import le
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.decoder import Columns, Decoder
 from mcaprl.recorder.joined import Chosen, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.message_spans import Span, joined_index
+from mcaprl.recorder.message_spans import Span, joined_index, joined_spans
 
 # Indexes of fewer entries are joined to so many: each by itself costs as much as some hundred.
 _ENTRIES_AT_ONCE = 2**12
@@ -45,24 +44,19 @@ class Topic:
         """
         self.name = name
         self._reader = reader
-        self.spans: list[Span] = []
-        # Of each channel, and again of each span.
-        self._decoders: list[Decoder] = []
-        self._decoder_of: list[Decoder] = []
-        for channel in reader.channels_of(name):
-            spans = reader.spans(channel)
-            # A channel without messages may be of any type.
-            if spans:
-                decoder = Decoder(reader, channel)
-                self._decoders.append(decoder)
-                self._decoder_of += [decoder] * len(spans)
-                self.spans += spans
-        self._counts = list(map(len, self.spans))
-        self._stops = np.cumsum(self._counts, dtype=np.int64)
+        found = [(channel, reader.spans(channel)) for channel in reader.channels_of(name)]
+        # A channel without messages may be of any type.
+        found = [(channel, spans) for channel, spans in found if len(spans)]
+        self._decoders = [Decoder(reader, channel) for channel, _ in found]
+        # Which of these each span is for.
+        sizes = np.array([len(spans) for _, spans in found], np.int64)
+        self._owners = np.repeat(np.arange(len(found)), sizes)
+        self.spans = joined_spans([spans for _, spans in found])
+        self._stops = np.cumsum(self.spans.counts)
 
     def __len__(self) -> int:
         """Messages."""
-        return sum(self._counts)
+        return int(self._stops[-1]) if len(self._stops) else 0
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
@@ -81,7 +75,8 @@ class Topic:
     @property
     def parts(self) -> Iterator[tuple[Decoder, Span]]:
         """Its spans, each with what decodes its messages."""
-        return zip(self._decoder_of, self.spans, strict=True)
+        decoders = [self._decoders[owner] for owner in self._owners.tolist()]
+        return zip(decoders, self.spans, strict=True)
 
     @property
     def channels(self) -> int:
@@ -91,17 +86,13 @@ class Topic:
     @property
     def channel_ids(self) -> NDArray[np.uint16]:
         """(N,) of each message, likewise."""
-        ids = np.array([decoder.channel.id for decoder in self._decoder_of], np.uint16)
-        return np.repeat(ids, self._counts)
+        ids = np.array([decoder.channel.id for decoder in self._decoders], np.uint16)
+        return np.repeat(ids[self._owners], self.spans.counts)
 
-    @cached_property
+    @property
     def chunks_rise(self) -> bool:
         """Whether it is one channel in chunks, none of which begins before its forerunner ends."""
-        chunks = [span.chunk for span in self.spans if span.chunk is not None]
-        ends = [chunk.message_end_time for chunk in chunks[:-1]]
-        starts = [chunk.message_start_time for chunk in chunks[1:]]
-        are_in_chunks = self.channels == 1 and len(chunks) == len(self.spans)
-        return are_in_chunks and all(map(le, ends, starts))
+        return self.channels == 1 and self.spans.are_in_order
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
@@ -175,10 +166,10 @@ class Topic:
                 index = span.index[places[low:high] - (self._stops[number] - len(span))]
                 span = Span.of_index(span.chunk, index)
             rows = slice(low, high) if by_place is None else by_place[low:high]
-            yield Chosen(self._decoder_of[number], span, rows)
+            yield Chosen(self._decoders[int(self._owners[number])], span, rows)
 
 
-def _groups(spans: list[Span]) -> Iterator[list[Span]]:
+def _groups(spans: Iterable[Span]) -> Iterator[list[Span]]:
     """Spans that follow each other: one with many entries, or several."""
     group: list[Span] = []
     entries = 0

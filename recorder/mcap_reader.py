@@ -11,39 +11,40 @@ summary, because its writer was killed or is still at work, is scanned from the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Iterator
 from contextlib import contextmanager
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.checksum import crc32
+from mcaprl.recorder.chunk_table import ChunkTable
 from mcaprl.recorder.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.mcap_records import (
     MESSAGE_START,
     RECORD_HEADER,
     ChunkContents,
     LooseMessages,
-    chunk_indexes,
     contents_of,
     footer_of,
     map_file,
     parse_record,
     records_of,
+    runs_of,
 )
 from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
     message_index,
-    message_indexes,
 )
-from mcaprl.recorder.message_spans import Span, told_spans
+from mcaprl.recorder.message_spans import Span, Spans, indexed_spans, told_spans
 
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 _STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -59,7 +60,6 @@ class McapReader:
         data_end: where the records that precede it end, as far as they were read.
         schemas: by id.
         channels: by id.
-        chunks: indexes of all chunks, in file order.
         metadata: metadata records, by name; of several with one name, the first.
     """
 
@@ -77,7 +77,7 @@ class McapReader:
             raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.chunks: list[ChunkIndex] = []
+        self._table = ChunkTable.of([])
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
         self._counts: dict[int, int] = {}
@@ -97,6 +97,11 @@ class McapReader:
         if self._loose_indexes:
             self._check_data_crc()
         self._find_topics_in_chunks()
+
+    @property
+    def chunks(self) -> list[ChunkIndex]:
+        """Indexes of all chunks, in file order."""
+        return self._table.chunks
 
     def channels_of(self, topic: str) -> list[Channel]:
         """The channels of a topic, by id; more than one where several writers took part."""
@@ -127,30 +132,33 @@ class McapReader:
             raise CorruptLogError(f"{self.path}: {channel.topic} has no schema")
         return schema
 
-    def spans(self, channel: Channel) -> list[Span]:
+    def spans(self, channel: Channel) -> Spans:
         """Where the messages of a channel are, in file order. No chunk is read that has an index.
 
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
-        spans = told_spans(self.chunks, channel.id, self._index_of)
-        if spans and sum(map(len, spans)) == self._counts.get(channel.id):
+        told = self._counts.get(channel.id)
+        with self._named():
+            spans = told_spans(self._table, channel.id, self._index_at)
+        if spans is not None and len(spans) and int(spans.counts.sum()) == told:
             return spans
         # A writer that was killed may have written some of the last chunk's indexes only.
-        indexed = self.chunks if self.complete else self.chunks[:-1]
-        spans = self._indexed_spans(indexed, channel.id)
-        rest = self.chunks[len(indexed) :]
-        spans += [span for chunk in rest if (span := self._unindexed_span(chunk, channel.id))]
+        indexed = len(self._table) - (not self.complete)
+        with self._named():
+            found = indexed_spans(self.view, self._table, indexed, channel.id, self._unindexed_span)
+        rest = self._table.some(np.arange(indexed, len(self._table)))
+        found += [span for chunk in rest if (span := self._unindexed_span(chunk, channel.id))]
         loose = self._loose_indexes.get(channel.id)
         if loose is not None:
-            spans.append(Span.of_index(None, loose))
-        found, told = sum(map(len, spans)), self._counts.get(channel.id)
-        if told not in (None, found):
+            found.append(Span.of_index(None, loose))
+        count = sum(map(len, found))
+        if told not in (None, count):
             raise CorruptLogError(
                 f"{self.path}: the summary tells of {told} messages of {channel.topic}, its indexes"
-                f" of {found}"
+                f" of {count}"
             )
-        return spans
+        return Spans.of(found)
 
     def records_of(self, span: Span, scratch: Scratch | None = None) -> memoryview:
         """The bytes that the offsets of a span's index point into; see `chunk_records`.
@@ -239,8 +247,7 @@ class McapReader:
         """
         return records_of(self.view, start)
 
-    def _index_of(self, chunk: ChunkIndex, channel_id: int, count: int) -> memoryview:
-        offset = chunk.message_index_offsets[channel_id]
+    def _index_at(self, offset: int, channel_id: int, count: int) -> memoryview:
         with self._named():
             entries = message_index(self.view, offset, channel_id)
             if len(entries) != count * INDEX_ENTRY.itemsize:
@@ -249,20 +256,6 @@ class McapReader:
                     " summary tells of"
                 )
             return entries
-
-    def _indexed_spans(self, chunks: Sequence[ChunkIndex], channel_id: int) -> list[Span]:
-        """A channel's messages in chunks, by the indexes that the file has of them."""
-        told = [chunk.message_index_offsets for chunk in chunks]
-        places = [offsets[channel_id] for offsets in told if channel_id in offsets]
-        with self._named():
-            entries = iter(message_indexes(self.view, places, channel_id))
-        spans = []
-        for chunk, offsets in zip(chunks, told, strict=True):
-            if channel_id in offsets:
-                spans.append(Span.of_entries(chunk, next(entries)))
-            elif not offsets and (span := self._unindexed_span(chunk, channel_id)) is not None:
-                spans.append(span)
-        return spans
 
     def _unindexed_span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
         """Likewise, by going through the chunk."""
@@ -279,29 +272,47 @@ class McapReader:
         return self._contents[start]
 
     def _read_summary(self) -> None:
-        chunks = []
-        for offset, opcode, content in self.records(self.summary_start):
+        runs = array("q")
+        for offset, opcode, length, count in runs_of(self.view, self.summary_start):
+            start, size = offset + RECORD_HEADER_BYTES, RECORD_HEADER_BYTES + length
             if opcode == Opcode.CHUNK_INDEX:
-                chunks.append((offset + RECORD_HEADER_BYTES, len(content)))
+                runs.extend((start, length, count))
             elif opcode in _SUMMARY:
-                self._keep(self._parse(opcode, content, offset))
+                for first in range(start, start + count * size, size):
+                    self._keep(self._parse(opcode, self.view[first : first + length], first))
         with self._named():
-            self.chunks = chunk_indexes(self.view, chunks)
-        self.chunks.sort(key=attrgetter("chunk_start_offset"))
+            self._table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
 
     def _read_between_chunks(self) -> None:
         """Read what the summary does not tell of: everything, if there is none."""
-        start, known, self.chunks = len(MCAP0_MAGIC), self.chunks, []
-        for chunk in known:
-            # Mostly they stand one behind the other.
-            if start != chunk.chunk_start_offset:
-                self._read_records(start, chunk.chunk_start_offset)
-            self.chunks.append(chunk)
-            start = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
-        self._read_records(start, None)
+        table = self._table
+        with self._named():
+            stops = table.stops(len(self.view))
+        starts = np.append(len(MCAP0_MAGIC), stops)
+        # Mostly they stand one behind the other.
+        found: dict[int, ChunkIndex] = {}
+        for number in np.flatnonzero(starts[:-1] != table.offset).tolist():
+            before = table.some(np.arange(max(0, number - 1), number))
+            self._read_records(int(starts[number]), int(table.offset[number]), found, *before)
+        self._read_records(int(starts[-1]), None, found, *table.some(np.arange(len(table))[-1:]))
+        if found:
+            every = {chunk.chunk_start_offset: chunk for chunk in table.chunks} | found
+            self._table = ChunkTable.of([every[offset] for offset in sorted(every)])
 
-    def _read_records(self, start: int, stop: int | None) -> None:
+    def _read_records(
+        self,
+        start: int,
+        stop: int | None,
+        found: dict[int, ChunkIndex],
+        chunk: ChunkIndex | None = None,
+    ) -> None:
         """Read the data section from `start` on, to `stop` or its end.
+
+        Args:
+            start: first byte.
+            stop: where it ends; None for the end of the section.
+            found: takes up chunks, by their first byte.
+            chunk: in front of these records, if there is one.
 
         Raises:
             CorruptLogError: there are no whole records in a file that has a summary.
@@ -309,10 +320,13 @@ class McapReader:
         self.data_end = start
         for offset, opcode, content in records_of(self.view, start, stop):
             if opcode == Opcode.CHUNK:
-                self.chunks.append(self._scanned_chunk(offset, len(content)))
-            elif opcode == Opcode.MESSAGE_INDEX and self.chunks:
+                with self._named():
+                    header = chunk_header(self.view, offset)
+                chunk = found[offset] = header.to_index(offset, len(content))
+            elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 (channel_id,) = struct.unpack_from("<H", content)
-                self.chunks[-1].message_index_offsets[channel_id] = offset
+                chunk.message_index_offsets[channel_id] = offset
+                found[chunk.chunk_start_offset] = chunk
             elif opcode == Opcode.MESSAGE:
                 self._loose.add(offset, content)
             elif opcode == Opcode.DATA_END:
@@ -322,21 +336,6 @@ class McapReader:
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
             raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
-
-    def _scanned_chunk(self, offset: int, content_bytes: int) -> ChunkIndex:
-        with self._named():
-            header = chunk_header(self.view, offset)
-        return ChunkIndex(
-            chunk_start_offset=offset,
-            chunk_length=RECORD_HEADER_BYTES + content_bytes,
-            compression=header.compression,
-            compressed_size=header.data.stop - header.data.start,
-            uncompressed_size=header.uncompressed_bytes,
-            message_start_time=header.start_time,
-            message_end_time=header.end_time,
-            message_index_offsets={},
-            message_index_length=0,
-        )
 
     def _check_data_crc(self) -> None:
         """The only one that covers messages outside of chunks."""
@@ -349,6 +348,9 @@ class McapReader:
 
     def _find_topics_in_chunks(self) -> None:
         """Look into chunks for schemas and channels that stand nowhere else."""
+        is_bare = self._table.map_sizes == 0
+        if all(map(self._is_known, self._table.channel_ids)) and not is_bare.any():
+            return
         for chunk in self.chunks:
             ids = chunk.message_index_offsets
             if not all(map(self._is_known, ids)) or not (ids or self._summary_has_topics):
@@ -380,10 +382,12 @@ class McapReader:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Say of which file it is what is damaged."""
+        """Say of which file it is what is damaged, if that is not said yet."""
         try:
             yield
         except CorruptLogError as error:
+            if str(error).startswith(f"{self.path}: "):
+                raise
             raise CorruptLogError(f"{self.path}: {error}") from error
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> Any:

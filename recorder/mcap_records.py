@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import io
-import itertools
 import mmap
 import struct
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,6 @@ from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     Channel,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -36,25 +33,17 @@ from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
-    windows,
 )
 
 RECORD_HEADER = struct.Struct("<BQ")
 # Of a message behind its record header: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
-_CHUNK_INDEX_START, _CHUNK_INDEX_END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
-_CHUNK_INDEX_FIXED = _CHUNK_INDEX_START.size + 12 + _CHUNK_INDEX_END.size
-# One of all 65,536 channels is shorter.
-_CHUNK_INDEX_MOST = 2**20
-_MESSAGE_INDEX_OFFSET = struct.Struct("<HQ")
-_U4 = np.dtype("<u4")
 _PARSERS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.METADATA: Metadata,
     Opcode.ATTACHMENT: Attachment,
     Opcode.DATA_END: DataEnd,
@@ -95,6 +84,41 @@ def records_of(
         offset = content + length
 
 
+def runs_of(view: memoryview, start: int) -> Iterator[tuple[int, int, int, int]]:
+    """Likewise, but of records of one kind and length that follow each other, the first.
+
+    Yields:
+        Its offset and opcode, the length of its content, and how many they are.
+    """
+    offset, end = start, len(view)
+    while offset + RECORD_HEADER.size <= end:
+        head = RECORD_HEADER.unpack_from(view, offset)
+        opcode, length = head
+        size = RECORD_HEADER.size + length
+        following = offset + size
+        if opcode == 0 or following > end:
+            return
+        count, room = 1, end - RECORD_HEADER.size
+        # Mostly there is one, or there are very many.
+        if following <= room and RECORD_HEADER.unpack_from(view, following) == head:
+            count = _run_length(view, offset, size)
+        yield offset, opcode, length, count
+        offset += count * size
+
+
+def _run_length(view: memoryview, offset: int, size: int) -> int:
+    """How many records like that at `offset`, of so many bytes, follow each other."""
+    count, most = 1, (len(view) - offset) // size
+    while count < most:
+        look_at = min(8 * count, most)
+        heads = np.ndarray(look_at, f"V{RECORD_HEADER.size}", view, offset, (size,))
+        others = np.flatnonzero(heads != heads[0])
+        if len(others):
+            return int(others[0])
+        count = look_at
+    return count
+
+
 def parse_record(opcode: int, content: memoryview) -> Any:
     """A record of the `mcap` library from its content.
 
@@ -102,8 +126,6 @@ def parse_record(opcode: int, content: memoryview) -> Any:
         CorruptLogError: the content is no such record.
     """
     try:
-        if opcode == Opcode.CHUNK_INDEX:
-            return chunk_indexes(content, [(0, len(content))])[0]
         return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
     # The library raises whatever its parsing meets; none of it is more than "damaged".
     except Exception as error:
@@ -223,96 +245,3 @@ def footer_of(view: memoryview) -> Footer | None:
     if footer.summary_crc and crc32(covered) != footer.summary_crc:
         raise CorruptLogError("the summary does not match its CRC")
     return footer
-
-
-def chunk_index_record(chunk: ChunkIndex) -> bytes:
-    """A ChunkIndex record; twenty times faster than the library's own."""
-    offsets, name = chunk.message_index_offsets, chunk.compression.encode()
-    start = _CHUNK_INDEX_START.pack(
-        chunk.message_start_time,
-        chunk.message_end_time,
-        chunk.chunk_start_offset,
-        chunk.chunk_length,
-        len(offsets) * _MESSAGE_INDEX_OFFSET.size,
-    )
-    pairs = b"".join(itertools.starmap(_MESSAGE_INDEX_OFFSET.pack, offsets.items()))
-    middle = struct.pack("<QI", chunk.message_index_length, len(name))
-    end = _CHUNK_INDEX_END.pack(chunk.compressed_size, chunk.uncompressed_size)
-    content = b"".join((start, pairs, middle, name, end))
-    return RECORD_HEADER.pack(Opcode.CHUNK_INDEX, len(content)) + content
-
-
-def chunk_indexes(view: memoryview, places: Sequence[tuple[int, int]]) -> list[ChunkIndex]:
-    """ChunkIndex records: those of one form, and so nearly all, at once.
-
-    A log of short episodes has many, and one by one they take the library fifty times as long.
-
-    Args:
-        view: where they are.
-        places: first byte and length of each one's content.
-
-    Raises:
-        CorruptLogError: a record is damaged.
-    """
-    if not places:
-        return []
-    starts, lengths = np.array(places, np.int64).T
-    if (lengths < _CHUNK_INDEX_FIXED).any() or (lengths > _CHUNK_INDEX_MOST).any():
-        raise CorruptLogError("a chunk_index record is too short or too long")
-    map_bytes = windows(view, starts + _CHUNK_INDEX_START.size - 4, _U4).astype(np.int64)
-    if (map_bytes > lengths - _CHUNK_INDEX_FIXED).any():
-        raise CorruptLogError("the map of a chunk_index record reaches beyond it")
-    name_bytes = windows(view, starts + _CHUNK_INDEX_START.size + map_bytes + 8, _U4)
-    found: list[ChunkIndex] = []
-    forms = zip(lengths.tolist(), map_bytes.tolist(), name_bytes.tolist(), strict=True)
-    for size, in_map, in_name in set(forms):
-        alike = (lengths == size) & (map_bytes == in_map) & (name_bytes == in_name)
-        dtype = _chunk_index_dtype(size, in_map, in_name)
-        found += _of_one_form(windows(view, starts[alike], dtype))
-    return found
-
-
-def _of_one_form(rows: NDArray[Any]) -> Iterable[ChunkIndex]:
-    maps, names = rows["map"], rows["name"].tolist()
-    try:
-        texts = {name: name.decode() for name in set(names)}
-    except UnicodeDecodeError as error:
-        raise CorruptLogError("the name of a chunk's compression is no text") from error
-    # In the order of the class's fields: by name takes twice as long.
-    return map(
-        ChunkIndex,
-        rows["length"].tolist(),
-        rows["offset"].tolist(),
-        [texts[name] for name in names],
-        rows["compressed_bytes"].tolist(),
-        rows["end_time"].tolist(),
-        rows["index_bytes"].tolist(),
-        map(dict, map(zip, maps["channel_id"].tolist(), maps["offset"].tolist())),
-        rows["start_time"].tolist(),
-        rows["raw_bytes"].tolist(),
-    )
-
-
-@lru_cache(maxsize=64)
-def _chunk_index_dtype(size: int, map_bytes: int, name_bytes: int) -> np.dtype[Any]:
-    """A whole ChunkIndex record with so long a map and name."""
-    entry = np.dtype([("channel_id", "<u2"), ("offset", "<u8")])
-    pairs, rest = divmod(map_bytes, entry.itemsize)
-    fields = [
-        ("start_time", "<u8"),
-        ("end_time", "<u8"),
-        ("offset", "<u8"),
-        ("length", "<u8"),
-        ("map_bytes", "<u4"),
-        ("map", entry, (pairs,)),
-        ("index_bytes", "<u8"),
-        ("name_bytes", "<u4"),
-        ("name", f"V{name_bytes}"),
-        ("compressed_bytes", "<u8"),
-        ("raw_bytes", "<u8"),
-    ]
-    # A later version of MCAP may have more fields behind these.
-    behind = size - _CHUNK_INDEX_FIXED - map_bytes - name_bytes
-    if rest or behind < 0:
-        raise CorruptLogError("the map or the name of a chunk_index record does not fit it")
-    return np.dtype([*fields, ("behind", f"V{behind}")])

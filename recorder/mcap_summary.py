@@ -23,7 +23,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.mcap_records import chunk_index_record
+from mcaprl.recorder.chunk_table import chunk_index_record
 
 
 @dataclass

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
-from typing import Any, Self
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property, partial
+from operator import le
+from typing import Any, Self, overload
 
 import numpy as np
 from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
-from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD
+from mcaprl.recorder.chunk_table import ChunkTable
+from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD, message_indexes
 
 # The indexes of smaller chunks stand so close that they are sooner read all at once.
 _LARGE_CHUNK_BYTES = 2**16
@@ -24,15 +26,15 @@ class Span:
     """
 
     def __init__(
-        self, chunk: ChunkIndex | None, count: int, read: Callable[[Span], memoryview]
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[], memoryview]
     ) -> None:
-        """Note how many there are, and what reads the entries of this span's index."""
+        """Note how many there are, and what reads the entries of their index."""
         self.chunk, self._count, self._read = chunk, count, read
 
     @classmethod
     def of_entries(cls, chunk: ChunkIndex | None, entries: memoryview) -> Self:
         """Of entries that are at hand: `message_records.INDEX_ENTRY`, as bytes."""
-        return cls(chunk, len(entries) // INDEX_ENTRY.itemsize, lambda _: entries)
+        return cls(chunk, len(entries) // INDEX_ENTRY.itemsize, lambda: entries)
 
     @classmethod
     def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
@@ -46,7 +48,7 @@ class Span:
         Raises:
             CorruptLogError: the index is damaged.
         """
-        return self._read(self)
+        return self._read()
 
     @cached_property
     def index(self) -> NDArray[Any]:
@@ -64,30 +66,125 @@ def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
     return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
 
 
+class Spans(Sequence[Span]):
+    """Where all messages of a channel are; each span is made when it is asked for.
+
+    Attributes:
+        counts: (S,) int64 messages in each.
+        are_in_order: whether all are in chunks, and none of these begins before the one in front
+            of it ends.
+    """
+
+    def __init__(
+        self,
+        counts: NDArray[np.int64],
+        make: Callable[[NDArray[np.int64]], Iterator[Span]],
+        *,
+        are_in_order: bool,
+    ) -> None:
+        """Note what makes the spans of some numbers."""
+        self.counts, self._make, self.are_in_order = counts, make, are_in_order
+
+    @classmethod
+    def of(cls, spans: Sequence[Span]) -> Self:
+        """Of spans that are there."""
+        chunks = [span.chunk for span in spans if span.chunk is not None]
+        ends = [chunk.message_end_time for chunk in chunks[:-1]]
+        starts = [chunk.message_start_time for chunk in chunks[1:]]
+        return cls(
+            np.array(list(map(len, spans)), np.int64),
+            lambda numbers: (spans[number] for number in numbers.tolist()),
+            are_in_order=len(chunks) == len(spans) and all(map(le, ends, starts)),
+        )
+
+    @overload
+    def __getitem__(self, key: int) -> Span: ...
+
+    @overload
+    def __getitem__(self, key: slice) -> list[Span]: ...
+
+    def __getitem__(self, key: int | slice) -> Span | list[Span]:
+        """One, or some."""
+        spans = list(self._make(np.atleast_1d(np.arange(len(self))[key])))
+        return spans if isinstance(key, slice) else spans[0]
+
+    def __iter__(self) -> Iterator[Span]:
+        """All of them."""
+        return self._make(np.arange(len(self)))
+
+    def __len__(self) -> int:
+        """Spans."""
+        return len(self.counts)
+
+
+def joined_spans(parts: Sequence[Spans]) -> Spans:
+    """Those of several channels, one behind the other."""
+    return parts[0] if len(parts) == 1 else Spans.of([span for spans in parts for span in spans])
+
+
 def told_spans(
-    chunks: Sequence[ChunkIndex],
+    table: ChunkTable,
     channel_id: int,
-    index_of: Callable[[ChunkIndex, int, int], memoryview],
-) -> list[Span]:
-    """A channel's messages by the summary alone, if it has large chunks to itself; else none.
+    index_at: Callable[[int, int, int], memoryview],
+) -> Spans | None:
+    """A channel's messages by the summary alone, if it has large chunks to itself; else None.
 
     No index is read before it must: who looks for one episode in a large file does not touch it all
     over then.
 
     Args:
-        chunks: of the file.
+        table: the file's chunks.
         channel_id: of the channel.
-        index_of: reads the entries of a chunk's index of a channel, which must be so many.
+        index_at: reads the entries of a channel's index at a byte, which must be so many.
+
+    Raises:
+        CorruptLogError: a chunk has several indexes of the channel.
     """
-    mine = [chunk for chunk in chunks if channel_id in chunk.message_index_offsets]
-    smallest = min((chunk.chunk_length for chunk in mine), default=0)
-    if smallest < _LARGE_CHUNK_BYTES or any(len(c.message_index_offsets) > 1 for c in mine):
-        return []
+    numbers, offsets = table.indexes_of(channel_id)
+    is_alone = (table.map_sizes[numbers] == 1) & (table.length[numbers] >= _LARGE_CHUNK_BYTES)
+    if not is_alone.all():
+        return None
+    entries_bytes = np.maximum(table.index_bytes[numbers], INDEX_HEAD.itemsize) - np.uint64(
+        INDEX_HEAD.itemsize
+    )
+    counts = (entries_bytes // np.uint64(INDEX_ENTRY.itemsize)).astype(np.int64)
 
-    def read(span: Span) -> memoryview:
-        assert span.chunk is not None
-        return index_of(span.chunk, channel_id, len(span))
+    def make(some: NDArray[np.int64]) -> Iterator[Span]:
+        places = zip(offsets[some].tolist(), counts[some].tolist(), strict=True)
+        for chunk, (offset, count) in zip(table.some(numbers[some]), places, strict=True):
+            yield Span(chunk, count, partial(index_at, offset, channel_id, count))
 
-    bytes_ = [chunk.message_index_length - INDEX_HEAD.itemsize for chunk in mine]
-    counts = [max(0, count) // INDEX_ENTRY.itemsize for count in bytes_]
-    return [Span(chunk, count, read) for chunk, count in zip(mine, counts, strict=True)]
+    starts, ends = table.start_time[numbers], table.end_time[numbers]
+    return Spans(counts, make, are_in_order=bool((ends[:-1] <= starts[1:]).all()))
+
+
+def indexed_spans(
+    view: memoryview,
+    table: ChunkTable,
+    count: int,
+    channel_id: int,
+    unindexed: Callable[[ChunkIndex, int], Span | None],
+) -> list[Span]:
+    """A channel's messages by the indexes that the file has of them.
+
+    Args:
+        view: of the file.
+        table: its chunks.
+        count: how many of these are looked at.
+        channel_id: of the channel.
+        unindexed: finds a channel's messages in a chunk of which there are no indexes.
+
+    Raises:
+        CorruptLogError: an index is damaged.
+    """
+    numbers, offsets = table.indexes_of(channel_id)
+    numbers, offsets = numbers[numbers < count], offsets[numbers < count]
+    entries = message_indexes(view, offsets.tolist(), channel_id)
+    spans = map(Span.of_entries, table.some(numbers), entries)
+    bare = np.flatnonzero(table.map_sizes[:count] == 0)
+    if not len(bare):
+        return list(spans)
+    by_number: dict[int, Span | None] = dict(zip(numbers.tolist(), spans, strict=True))
+    for number, chunk in zip(bare.tolist(), table.some(bare), strict=True):
+        by_number[number] = unindexed(chunk, channel_id)
+    return [span for _, span in sorted(by_number.items()) if span is not None]

@@ -1,0 +1,247 @@
+"""What a file's summary tells of its chunks, in columns: a long log has very many.
+
+One ChunkIndex record after the other would take as long as reading some ten thousand messages of a
+long log, to look up a single episode in it. So they are parsed together, and what is asked of all
+of them is asked of arrays; the `mcap` library's objects are made of those chunks that are used.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Iterator, Sequence
+from functools import cached_property, lru_cache
+from typing import Any, Self
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.message_records import windows
+
+_HEAD = struct.Struct("<BQ")
+_START, _END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
+_FIXED_BYTES = _START.size + 12 + _END.size
+# One of all 65,536 channels is shorter.
+_MOST_BYTES = 2**20
+_MAP_ENTRY = struct.Struct("<HQ")
+_U4 = np.dtype("<u4")
+_NUMBERS = (
+    "start_time",
+    "end_time",
+    "offset",
+    "length",
+    "index_bytes",
+    "compressed_bytes",
+    "raw_bytes",
+)
+
+
+def chunk_index_record(chunk: ChunkIndex) -> bytes:
+    """A ChunkIndex record; twenty times faster than the library's own."""
+    offsets, name = chunk.message_index_offsets, chunk.compression.encode()
+    start = _START.pack(
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.chunk_start_offset,
+        chunk.chunk_length,
+        len(offsets) * _MAP_ENTRY.size,
+    )
+    pairs = b"".join(itertools.starmap(_MAP_ENTRY.pack, offsets.items()))
+    middle = struct.pack("<QI", chunk.message_index_length, len(name))
+    end = _END.pack(chunk.compressed_size, chunk.uncompressed_size)
+    content = b"".join((start, pairs, middle, name, end))
+    return _HEAD.pack(Opcode.CHUNK_INDEX, len(content)) + content
+
+
+class ChunkTable:
+    """K chunks, in the order of the file; (K,) uint64 columns.
+
+    Attributes:
+        start_time: smallest log_time in each, nanoseconds.
+        end_time: largest.
+        offset: byte at which its Chunk record begins.
+        length: bytes of that record.
+        index_bytes: of the MessageIndex records behind it.
+        compressed_bytes: of its records in the file.
+        raw_bytes: of its records.
+        map_sizes: (K,) int64, how many channels have an index of it.
+    """
+
+    start_time: NDArray[np.uint64]
+    end_time: NDArray[np.uint64]
+    offset: NDArray[np.uint64]
+    length: NDArray[np.uint64]
+    index_bytes: NDArray[np.uint64]
+    compressed_bytes: NDArray[np.uint64]
+    raw_bytes: NDArray[np.uint64]
+
+    def __init__(self, count: int, map_sizes: NDArray[np.int64]) -> None:
+        """Make room; use `read` or `of`."""
+        for name in _NUMBERS:
+            setattr(self, name, np.empty(count, np.uint64))
+        self._compression = np.empty(count, object)
+        self.map_sizes = map_sizes
+        self._map_stops = np.cumsum(map_sizes)
+        entries = int(self._map_stops[-1]) if count else 0
+        self._channel_ids = np.empty(entries, np.uint16)
+        self._index_offsets = np.empty(entries, np.uint64)
+
+    @classmethod
+    def read(cls, view: memoryview, runs: NDArray[np.int64]) -> Self:
+        """Read ChunkIndex records, those of one form at once.
+
+        Args:
+            view: where they are.
+            runs: (R, 3) of records of one length that follow each other: the first byte of the
+                first one's content, the length of their contents, and how many they are.
+
+        Raises:
+            CorruptLogError: a record is damaged.
+        """
+        if not len(runs):
+            return cls.of([])
+        counts = runs[:, 2]
+        starts, lengths = np.repeat(runs[:, :2], counts, axis=0).T
+        before = np.repeat(np.cumsum(counts) - counts, counts)
+        starts = starts + (np.arange(len(starts)) - before) * (lengths + _HEAD.size)
+        if (lengths < _FIXED_BYTES).any() or (lengths > _MOST_BYTES).any():
+            raise CorruptLogError("a chunk_index record is too short or too long")
+        map_bytes = windows(view, starts + _START.size - 4, _U4).astype(np.int64)
+        if (map_bytes > lengths - _FIXED_BYTES).any():
+            raise CorruptLogError("the map of a chunk_index record reaches beyond it")
+        name_bytes = windows(view, starts + _START.size + map_bytes + 8, _U4)
+        table = cls(len(starts), map_bytes // _MAP_ENTRY.size)
+        forms = zip(lengths.tolist(), map_bytes.tolist(), name_bytes.tolist(), strict=True)
+        for form in set(forms):
+            size, in_map, in_name = form
+            alike = (lengths == size) & (map_bytes == in_map) & (name_bytes == in_name)
+            table._fill(np.flatnonzero(alike), windows(view, starts[alike], _record_dtype(*form)))
+        if (table.offset[1:] < table.offset[:-1]).any():
+            return cls.of(sorted(table.chunks, key=lambda chunk: chunk.chunk_start_offset))
+        return table
+
+    @classmethod
+    def of(cls, chunks: Sequence[ChunkIndex]) -> Self:
+        """Of chunks that were found otherwise, in the order of the file."""
+        maps = [chunk.message_index_offsets for chunk in chunks]
+        table = cls(len(chunks), np.array(list(map(len, maps)), np.int64))
+        table.start_time[:] = [chunk.message_start_time for chunk in chunks]
+        table.end_time[:] = [chunk.message_end_time for chunk in chunks]
+        table.offset[:] = [chunk.chunk_start_offset for chunk in chunks]
+        table.length[:] = [chunk.chunk_length for chunk in chunks]
+        table.index_bytes[:] = [chunk.message_index_length for chunk in chunks]
+        table.compressed_bytes[:] = [chunk.compressed_size for chunk in chunks]
+        table.raw_bytes[:] = [chunk.uncompressed_size for chunk in chunks]
+        table._compression[:] = [chunk.compression for chunk in chunks]
+        table._channel_ids[:] = [channel_id for map_ in maps for channel_id in map_]
+        table._index_offsets[:] = [offset for map_ in maps for offset in map_.values()]
+        return table
+
+    def __len__(self) -> int:
+        """Chunks."""
+        return len(self.offset)
+
+    @cached_property
+    def chunks(self) -> list[ChunkIndex]:
+        """All of them."""
+        return list(self.some(np.arange(len(self))))
+
+    def stops(self, file_bytes: int) -> NDArray[np.uint64]:
+        """(K,) uint64 where the MessageIndex records behind each chunk end.
+
+        Raises:
+            CorruptLogError: beyond a file of so many bytes.
+        """
+        # Each by itself, so that no sum can wrap around.
+        for name in ("offset", "length", "index_bytes"):
+            is_beyond = getattr(self, name) > file_bytes
+            if is_beyond.any():
+                start = self.offset[int(np.argmax(is_beyond))]
+                raise CorruptLogError(f"the chunk at byte {start} would end beyond the file")
+        return self.offset + self.length + self.index_bytes
+
+    @property
+    def channel_ids(self) -> set[int]:
+        """Channels that have an index of a chunk."""
+        return set(self._channel_ids.tolist())
+
+    def some(self, numbers: NDArray[np.int64]) -> Iterator[ChunkIndex]:
+        """Those of these numbers."""
+        # In the order of the class's fields: by name takes twice as long.
+        return map(
+            ChunkIndex,
+            self.length[numbers].tolist(),
+            self.offset[numbers].tolist(),
+            self._compression[numbers].tolist(),
+            self.compressed_bytes[numbers].tolist(),
+            self.end_time[numbers].tolist(),
+            self.index_bytes[numbers].tolist(),
+            self._maps(numbers),
+            self.start_time[numbers].tolist(),
+            self.raw_bytes[numbers].tolist(),
+        )
+
+    def _maps(self, numbers: NDArray[np.int64]) -> Iterator[dict[int, int]]:
+        stops = self._map_stops[numbers]
+        starts = stops - self.map_sizes[numbers]
+        first, last = int(starts.min(initial=len(self._channel_ids))), int(stops.max(initial=0))
+        ids = self._channel_ids[first:last].tolist()
+        offsets = self._index_offsets[first:last].tolist()
+        for start, stop in zip((starts - first).tolist(), (stops - first).tolist(), strict=True):
+            yield dict(zip(ids[start:stop], offsets[start:stop], strict=True))
+
+    def indexes_of(self, channel_id: int) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
+        """The numbers of the chunks that have an index of a channel, and where those indexes are.
+
+        Raises:
+            CorruptLogError: a chunk has several.
+        """
+        found = np.flatnonzero(self._channel_ids == channel_id)
+        numbers = np.searchsorted(self._map_stops, found, side="right")
+        if (numbers[1:] == numbers[:-1]).any():
+            raise CorruptLogError(f"a chunk_index record tells of channel {channel_id} twice")
+        return numbers, self._index_offsets[found]
+
+    def _fill(self, numbers: NDArray[np.int64], rows: NDArray[Any]) -> None:
+        """Take up records of one form."""
+        for name in _NUMBERS:
+            getattr(self, name)[numbers] = rows[name]
+        names = rows["name"].tolist()
+        try:
+            texts = {name: name.decode() for name in set(names)}
+        except UnicodeDecodeError as error:
+            raise CorruptLogError("the name of a chunk's compression is no text") from error
+        self._compression[numbers] = [texts[name] for name in names]
+        maps = rows["map"]
+        stops = self._map_stops[numbers]
+        entries = stops[:, None] - np.arange(maps.shape[1], 0, -1)
+        self._channel_ids[entries] = maps["channel_id"]
+        self._index_offsets[entries] = maps["offset"]
+
+
+@lru_cache(maxsize=64)
+def _record_dtype(size: int, map_bytes: int, name_bytes: int) -> np.dtype[Any]:
+    """A whole ChunkIndex record's content with so long a map and name."""
+    entry = np.dtype([("channel_id", "<u2"), ("offset", "<u8")])
+    pairs, rest = divmod(map_bytes, _MAP_ENTRY.size)
+    fields = [
+        ("start_time", "<u8"),
+        ("end_time", "<u8"),
+        ("offset", "<u8"),
+        ("length", "<u8"),
+        ("map_bytes", "<u4"),
+        ("map", entry, (pairs,)),
+        ("index_bytes", "<u8"),
+        ("name_bytes", "<u4"),
+        ("name", f"V{name_bytes}"),
+        ("compressed_bytes", "<u8"),
+        ("raw_bytes", "<u8"),
+    ]
+    # A later version of MCAP may have more fields behind these.
+    behind = size - _FIXED_BYTES - map_bytes - name_bytes
+    if rest or behind < 0:
+        raise CorruptLogError("the map or the name of a chunk_index record does not fit it")
+    return np.dtype([*fields, ("behind", f"V{behind}")])
