@@ -144,7 +144,7 @@ class McapReader:
         if spans is not None and len(spans) and int(spans.counts.sum()) == told:
             return spans
         # A writer that was killed may have written some of the last chunk's indexes only.
-        indexed = len(self._table) - (not self.complete)
+        indexed = max(0, len(self._table) - (not self.complete))
         with self._named():
             found = indexed_spans(self.view, self._table, indexed, channel.id, self._unindexed_span)
         rest = self._table.some(np.arange(indexed, len(self._table)))
