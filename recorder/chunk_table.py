@@ -28,14 +28,16 @@ _FIXED_BYTES = _START.size + 12 + _END.size
 _MOST_BYTES = 2**20
 _MAP_ENTRY = struct.Struct("<HQ")
 _U4 = np.dtype("<u4")
-_NUMBERS = (
-    "start_time",
-    "end_time",
-    "offset",
-    "length",
-    "index_bytes",
-    "compressed_bytes",
-    "raw_bytes",
+_ROW = np.dtype(
+    [
+        ("start_time", "<u8"),
+        ("end_time", "<u8"),
+        ("offset", "<u8"),
+        ("length", "<u8"),
+        ("index_bytes", "<u8"),
+        ("compressed_bytes", "<u8"),
+        ("raw_bytes", "<u8"),
+    ]
 )
 
 
@@ -57,35 +59,22 @@ def chunk_index_record(chunk: ChunkIndex) -> bytes:
 
 
 class ChunkTable:
-    """K chunks, in the order of the file; (K,) uint64 columns.
+    """K chunks, in the order of the file.
 
     Attributes:
-        start_time: smallest log_time in each, nanoseconds.
-        end_time: largest.
-        offset: byte at which its Chunk record begins.
-        length: bytes of that record.
-        index_bytes: of the MessageIndex records behind it.
-        compressed_bytes: of its records in the file.
-        raw_bytes: of its records.
-        map_sizes: (K,) int64, how many channels have an index of it.
+        rows: (K,) of each its smallest and largest log_time (`start_time`, `end_time`), the byte at
+            which its record begins and the length of that (`offset`, `length`), and how many bytes
+            the indexes behind it take (`index_bytes`), and its records in the file
+            (`compressed_bytes`) and out of it (`raw_bytes`).
+        map_sizes: (K,) int64, of how many channels there are indexes of it.
     """
 
-    start_time: NDArray[np.uint64]
-    end_time: NDArray[np.uint64]
-    offset: NDArray[np.uint64]
-    length: NDArray[np.uint64]
-    index_bytes: NDArray[np.uint64]
-    compressed_bytes: NDArray[np.uint64]
-    raw_bytes: NDArray[np.uint64]
-
-    def __init__(self, count: int, map_sizes: NDArray[np.int64]) -> None:
+    def __init__(self, map_sizes: NDArray[np.int64]) -> None:
         """Make room; use `read` or `of`."""
-        for name in _NUMBERS:
-            setattr(self, name, np.empty(count, np.uint64))
-        self._compression = np.empty(count, object)
-        self.map_sizes = map_sizes
+        self.rows, self.map_sizes = np.empty(len(map_sizes), _ROW), map_sizes
+        self._compression = np.empty(len(map_sizes), object)
         self._map_stops = np.cumsum(map_sizes)
-        entries = int(self._map_stops[-1]) if count else 0
+        entries = int(map_sizes.sum())
         self._channel_ids = np.empty(entries, np.uint16)
         self._index_offsets = np.empty(entries, np.uint64)
 
@@ -113,13 +102,14 @@ class ChunkTable:
         if (map_bytes > lengths - _FIXED_BYTES).any():
             raise CorruptLogError("the map of a chunk_index record reaches beyond it")
         name_bytes = windows(view, starts + _START.size + map_bytes + 8, _U4)
-        table = cls(len(starts), map_bytes // _MAP_ENTRY.size)
+        table = cls(map_bytes // _MAP_ENTRY.size)
         forms = zip(lengths.tolist(), map_bytes.tolist(), name_bytes.tolist(), strict=True)
         for form in set(forms):
             size, in_map, in_name = form
             alike = (lengths == size) & (map_bytes == in_map) & (name_bytes == in_name)
             table._fill(np.flatnonzero(alike), windows(view, starts[alike], _record_dtype(*form)))
-        if (table.offset[1:] < table.offset[:-1]).any():
+        offsets = table.rows["offset"]
+        if (offsets[1:] < offsets[:-1]).any():
             return cls.of(sorted(table.chunks, key=lambda chunk: chunk.chunk_start_offset))
         return table
 
@@ -127,14 +117,19 @@ class ChunkTable:
     def of(cls, chunks: Sequence[ChunkIndex]) -> Self:
         """Of chunks that were found otherwise, in the order of the file."""
         maps = [chunk.message_index_offsets for chunk in chunks]
-        table = cls(len(chunks), np.array(list(map(len, maps)), np.int64))
-        table.start_time[:] = [chunk.message_start_time for chunk in chunks]
-        table.end_time[:] = [chunk.message_end_time for chunk in chunks]
-        table.offset[:] = [chunk.chunk_start_offset for chunk in chunks]
-        table.length[:] = [chunk.chunk_length for chunk in chunks]
-        table.index_bytes[:] = [chunk.message_index_length for chunk in chunks]
-        table.compressed_bytes[:] = [chunk.compressed_size for chunk in chunks]
-        table.raw_bytes[:] = [chunk.uncompressed_size for chunk in chunks]
+        table = cls(np.array(list(map(len, maps)), np.int64))
+        table.rows[:] = [
+            (
+                chunk.message_start_time,
+                chunk.message_end_time,
+                chunk.chunk_start_offset,
+                chunk.chunk_length,
+                chunk.message_index_length,
+                chunk.compressed_size,
+                chunk.uncompressed_size,
+            )
+            for chunk in chunks
+        ]
         table._compression[:] = [chunk.compression for chunk in chunks]
         table._channel_ids[:] = [channel_id for map_ in maps for channel_id in map_]
         table._index_offsets[:] = [offset for map_ in maps for offset in map_.values()]
@@ -142,7 +137,7 @@ class ChunkTable:
 
     def __len__(self) -> int:
         """Chunks."""
-        return len(self.offset)
+        return len(self.rows)
 
     @cached_property
     def chunks(self) -> list[ChunkIndex]:
@@ -156,12 +151,13 @@ class ChunkTable:
             CorruptLogError: beyond a file of so many bytes.
         """
         # Each by itself, so that no sum can wrap around.
-        for name in ("offset", "length", "index_bytes"):
-            is_beyond = getattr(self, name) > file_bytes
-            if is_beyond.any():
-                start = self.offset[int(np.argmax(is_beyond))]
-                raise CorruptLogError(f"the chunk at byte {start} would end beyond the file")
-        return self.offset + self.length + self.index_bytes
+        parts = [self.rows[name] for name in ("offset", "length", "index_bytes")]
+        is_beyond = np.logical_or.reduce([part > file_bytes for part in parts])
+        if is_beyond.any():
+            start = self.rows["offset"][int(np.argmax(is_beyond))]
+            raise CorruptLogError(f"the chunk at byte {start} would end beyond the file")
+        stops: NDArray[np.uint64] = np.add.reduce(parts)
+        return stops
 
     @property
     def channel_ids(self) -> set[int]:
@@ -170,18 +166,19 @@ class ChunkTable:
 
     def some(self, numbers: NDArray[np.int64]) -> Iterator[ChunkIndex]:
         """Those of these numbers."""
+        rows = self.rows[numbers]
         # In the order of the class's fields: by name takes twice as long.
         return map(
             ChunkIndex,
-            self.length[numbers].tolist(),
-            self.offset[numbers].tolist(),
+            rows["length"].tolist(),
+            rows["offset"].tolist(),
             self._compression[numbers].tolist(),
-            self.compressed_bytes[numbers].tolist(),
-            self.end_time[numbers].tolist(),
-            self.index_bytes[numbers].tolist(),
+            rows["compressed_bytes"].tolist(),
+            rows["end_time"].tolist(),
+            rows["index_bytes"].tolist(),
             self._maps(numbers),
-            self.start_time[numbers].tolist(),
-            self.raw_bytes[numbers].tolist(),
+            rows["start_time"].tolist(),
+            rows["raw_bytes"].tolist(),
         )
 
     def _maps(self, numbers: NDArray[np.int64]) -> Iterator[dict[int, int]]:
@@ -207,8 +204,8 @@ class ChunkTable:
 
     def _fill(self, numbers: NDArray[np.int64], rows: NDArray[Any]) -> None:
         """Take up records of one form."""
-        for name in _NUMBERS:
-            getattr(self, name)[numbers] = rows[name]
+        for name in _ROW.names or ():
+            self.rows[name][numbers] = rows[name]
         names = rows["name"].tolist()
         try:
             texts = {name: name.decode() for name in set(names)}

@@ -265,8 +265,9 @@ class McapReader:
     def _contents_of(self, chunk: ChunkIndex) -> ChunkContents:
         start = chunk.chunk_start_offset
         if start not in self._contents:
+            records = self.chunk_records(chunk)
             try:
-                self._contents[start] = contents_of(self.chunk_records(chunk))
+                self._contents[start] = contents_of(records)
             except CorruptLogError as error:
                 raise CorruptLogError(f"{self.path}: {error} (chunk at byte {start})") from error
         return self._contents[start]
@@ -288,12 +289,13 @@ class McapReader:
         table = self._table
         with self._named():
             stops = table.stops(len(self.view))
-        starts = np.append(len(MCAP0_MAGIC), stops)
-        # Mostly they stand one behind the other.
+        starts = np.concatenate([np.array([len(MCAP0_MAGIC)], np.uint64), stops])
+        offsets = table.rows["offset"]
         found: dict[int, ChunkIndex] = {}
-        for number in np.flatnonzero(starts[:-1] != table.offset).tolist():
+        # Mostly they stand one behind the other.
+        for number in np.flatnonzero(starts[:-1] != offsets).tolist():
             before = table.some(np.arange(max(0, number - 1), number))
-            self._read_records(int(starts[number]), int(table.offset[number]), found, *before)
+            self._read_records(int(starts[number]), int(offsets[number]), found, *before)
         self._read_records(int(starts[-1]), None, found, *table.some(np.arange(len(table))[-1:]))
         if found:
             every = {chunk.chunk_start_offset: chunk for chunk in table.chunks} | found

@@ -141,12 +141,11 @@ def told_spans(
         CorruptLogError: a chunk has several indexes of the channel.
     """
     numbers, offsets = table.indexes_of(channel_id)
-    is_alone = (table.map_sizes[numbers] == 1) & (table.length[numbers] >= _LARGE_CHUNK_BYTES)
+    rows, head_bytes = table.rows[numbers], np.uint64(INDEX_HEAD.itemsize)
+    is_alone = (table.map_sizes[numbers] == 1) & (rows["length"] >= _LARGE_CHUNK_BYTES)
     if not is_alone.all():
         return None
-    entries_bytes = np.maximum(table.index_bytes[numbers], INDEX_HEAD.itemsize) - np.uint64(
-        INDEX_HEAD.itemsize
-    )
+    entries_bytes = np.maximum(rows["index_bytes"], head_bytes) - head_bytes
     counts = (entries_bytes // np.uint64(INDEX_ENTRY.itemsize)).astype(np.int64)
 
     def make(some: NDArray[np.int64]) -> Iterator[Span]:
@@ -154,8 +153,8 @@ def told_spans(
         for chunk, (offset, count) in zip(table.some(numbers[some]), places, strict=True):
             yield Span(chunk, count, partial(index_at, offset, channel_id, count))
 
-    starts, ends = table.start_time[numbers], table.end_time[numbers]
-    return Spans(counts, make, are_in_order=bool((ends[:-1] <= starts[1:]).all()))
+    are_in_order = bool((rows["end_time"][:-1] <= rows["start_time"][1:]).all())
+    return Spans(counts, make, are_in_order=are_in_order)
 
 
 def indexed_spans(
