@@ -10,7 +10,7 @@ import click
 
 from mcaprl.cli.policies import policy_names, trained_policy
 from mcaprl.cli.replay import sim_of
-from mcaprl.cli.show import progress
+from mcaprl.cli.show import counted, progress
 from mcaprl.errors import UsageError
 from mcaprl.recorder.annotate import AnnotatedCopy, values_topics
 from mcaprl.recorder.dataset import Dataset
@@ -48,7 +48,8 @@ def annotate(
         if scene:
             with closing(sim_of(dataset, file, sim)) as env:
                 found = copy.add_scene(dataset, env, camera=camera)
-            click.echo(f"{out}: the scene of {found.episodes} episodes, {found.steps} steps")
+            episodes, steps = counted(found.episodes, "episode"), counted(found.steps, "step")
+            click.echo(f"{out}: the scene of {episodes}, {steps}")
 
 
 def _values(dataset: Dataset, name: str, gamma: float | None) -> list[tuple[Any, Any]]:

@@ -16,7 +16,7 @@ from mcaprl.cli.curves import learning_curves
 from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
-from mcaprl.cli.show import print_json, print_table, progress, write_json
+from mcaprl.cli.show import counted, print_json, print_table, progress, write_json
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.reader import find_logs, open_logs
 from mcaprl.recorder.wrapper import RecordMcap
@@ -251,7 +251,7 @@ def _print_scores(
                 "",
                 _score(logged["normalized_score"]),
                 "",
-                f"{logged['episodes']} episodes",
+                counted(logged["episodes"], "episode"),
             ]
         )
     rows += [
@@ -267,7 +267,7 @@ def _print_scores(
         for score in scores
     ]
     print_table(
-        f"{sim}: {episodes} episodes for each policy and training seed",
+        f"{sim}: {counted(episodes, 'episode')} for each policy and training seed",
         [
             "policy",
             "mean return",

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from mcaprl.cli.show import print_facts, print_json, size, write_json
+from mcaprl.cli.show import counted, print_facts, print_json, size, write_json
 from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
 from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.check import Problem, check_log
@@ -134,12 +134,14 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     """
     found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
     losses = [*map(str, found.damages), *map(str, found.dropped)]
-    losses += [f"{found.strays} messages of episodes that are not kept"] if found.strays else []
+    if found.strays:
+        losses.append(f"{counted(found.strays, 'message')} of episodes that are not kept")
     if as_json:
         print_json({"ok": not found.has_losses, **asdict(found)})
     else:
         ended = f", {found.ended} of them without their end" if found.ended else ""
-        click.echo(f"{out}: {found.episodes} episodes{ended}, {found.messages} messages")
+        episodes = counted(found.episodes, "episode")
+        click.echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
         for loss in losses:
             click.echo(f"lost: {loss}")
     return _WITH_LOSSES if found.has_losses else 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mcaprl.cli.policies import policy_names, trained_policies
-from mcaprl.cli.show import print_table, progress
+from mcaprl.cli.show import counted, print_table, progress
 from mcaprl.recorder.calibration import calibration
 from mcaprl.recorder.reader import open_logs
 
@@ -84,7 +84,7 @@ def print_estimates(result: dict[str, Any]) -> None:
         for estimate in result["estimates"]
     ]
     print_table(
-        f"{result['data']}: {result['episodes']} episodes, mean return discounted by"
+        f"{result['data']}: {counted(result['episodes'], 'episode')}, mean return discounted by"
         f" {result['gamma']}: {result['behavior_return']:.3f}"
         f" ({_interval(result['behavior_interval'])})",
         ["policy", "estimator", "value", "95 % interval", "effective episodes", "verdict"],

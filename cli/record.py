@@ -18,7 +18,7 @@ import numpy as np
 
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import policies_of, policy_names
-from mcaprl.cli.show import progress, size
+from mcaprl.cli.show import counted, progress, size
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.recorder.mcap_writer import COMPRESSIONS
 from mcaprl.recorder.wrapper import RecordMcap
@@ -135,8 +135,9 @@ def _print_summary(whole: Recording, results: list[EpisodeResult]) -> None:
     length = sum(result.length for result in results)
     bytes_ = sum(path.stat().st_size for path in _files(whole.out))
     click.echo(
-        f"{whole.out}: {len(results)} episodes, {length} steps, mean return {returns.mean():.2f}"
-        f" (standard deviation {returns.std():.2f}), {size(bytes_)}"
+        f"{whole.out}: {counted(len(results), 'episode')}, {counted(length, 'step')},"
+        f" mean return {returns.mean():.2f} (standard deviation {returns.std():.2f}),"
+        f" {size(bytes_)}"
     )
 
 

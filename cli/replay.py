@@ -13,7 +13,7 @@ from typing import Any
 import click
 import gymnasium as gym
 
-from mcaprl.cli.show import progress
+from mcaprl.cli.show import counted, progress
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset import Dataset
 from mcaprl.recorder.live import LiveServer
@@ -161,14 +161,14 @@ def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
     if found.unseeded:
         shown = ", ".join(map(str, found.unseeded[:10])) + ", ..." * (len(found.unseeded) > 10)
         click.echo(
-            f"{path}: the log has no seed of {len(found.unseeded)} episodes, so they were not"
+            f"{path}: the log has no seed of {counted(len(found.unseeded), 'episode')}, so not"
             f" compared: {shown}"
         )
     if found.difference is not None:
         click.echo(f"{path}: {found.difference}")
     elif found.episodes:
         click.echo(
-            f"{path}: {found.episodes} episodes and {found.steps} steps compared: every"
-            " observation, reward and end is the same, bit for bit"
+            f"{path}: {counted(found.episodes, 'episode')} and {counted(found.steps, 'step')}"
+            " compared: every observation, reward and end is the same, bit for bit"
         )
     return found.difference is None and found.episodes > 0

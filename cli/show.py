@@ -22,6 +22,11 @@ from mcaprl.errors import LogError
 _PIPE_WIDTH = 120
 
 
+def counted(number: int, noun: str) -> str:
+    """As `1 episode`, `2 episodes`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def print_json(value: Any) -> None:
     """One JSON object on stdout; NaN and infinities, which JSON lacks, as null."""
     click.echo(json.dumps(_finite(value), indent=2))

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from mcaprl.cli.settings import setting_options
+from mcaprl.cli.show import counted
 from mcaprl.errors import MissingExtraError
 from mcaprl.settings import check_settings, plain_settings
 
@@ -96,8 +97,8 @@ def train_offline(
     growing = GrowingLogs(data) if follow else None
     dataset, weights = (growing.dataset, None) if growing else open_weighted(data, threads=threads)
     click.echo(
-        f"{algo} learns from {len(dataset.episodes)} episodes, {len(dataset)} transitions,"
-        f" mean return {dataset.statistics.mean_return:.2f}"
+        f"{algo} learns from {counted(len(dataset.episodes), 'episode')},"
+        f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
     )
     summaries = train(
         dataset,

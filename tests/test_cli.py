@@ -114,6 +114,13 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert "pilot has no network to ask about a log" in line
 
 
+def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "CartPole-v1", "--policy=random", "--steps=1", "--out=one.mcap"]) == 0
+    assert "one.mcap: 1 episode, 1 step, mean return 1.00" in capsys.readouterr().out
+    assert run(["recover", "one.mcap", "two.mcap"]) == 0
+    assert "two.mcap: 1 episode, 5 messages" in capsys.readouterr().out
+
+
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("a", "b"):
         arguments = ["--policy", "pilot", "--epsilon", "0.3", "--steps", "50", "--seed", "3"]

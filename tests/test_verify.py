@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
+from mcaprl.cli.show import counted
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.verify import Verification, verify
 from mcaprl.sims import SIMS, make_sim
@@ -78,8 +79,8 @@ def test_what_a_simulator_gave_it_gives_again(
     assert run(command) == 0
     capsys.readouterr()
     assert run(["replay", str(log_path), "--verify"]) == 0
-    episodes = len(mcaprl.open(log_path).episodes)
-    assert f"{episodes} episodes and 60 steps compared: every" in capsys.readouterr().out
+    episodes = counted(len(mcaprl.open(log_path).episodes), "episode")
+    assert f"{episodes} and 60 steps compared: every" in capsys.readouterr().out
 
 
 def test_pictures_and_dict_observations_are_compared(log_path: Path) -> None:
