@@ -100,7 +100,8 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> memoryview:
     """
     try:
         opcode, _, channel, entries_bytes = _INDEX_START.unpack_from(file, offset)
-    except struct.error:
+    # The latter from 2**63 on.
+    except (struct.error, OverflowError):
         opcode = None
     if opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
         start = offset + _INDEX_START.size

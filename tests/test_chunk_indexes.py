@@ -137,5 +137,6 @@ def test_of_many_message_indexes_the_wrong_one_is_named() -> None:
         with pytest.raises(CorruptLogError) as together:
             message_indexes(view, places[:14], 7)
         assert str(together.value) == str(alone.value)
-    with pytest.raises(CorruptLogError, match="at byte 5000"):
-        message_indexes(memoryview(data), [*places, 5000], 7)
+    for beyond in (5000, 2**63, 2**64 - 1):
+        with pytest.raises(CorruptLogError, match=f"at byte {beyond}"):
+            message_indexes(memoryview(data), [*places, beyond], 7)
