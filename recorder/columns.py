@@ -160,8 +160,9 @@ class Topic:
         places = order if by_place is None else order[by_place]
         highs = np.searchsorted(places, self._stops)
         lows = np.concatenate([[0], highs[:-1]])
-        for number in np.flatnonzero(highs > lows).tolist():
-            span, low, high = self.spans[number], int(lows[number]), int(highs[number])
+        numbers = np.flatnonzero(highs > lows)
+        for number, span in zip(numbers.tolist(), self.spans.some(numbers), strict=True):
+            low, high = int(lows[number]), int(highs[number])
             if high - low < len(span):
                 index = span.index[places[low:high] - (self._stops[number] - len(span))]
                 span = Span.of_index(span.chunk, index)

@@ -85,7 +85,8 @@ class _Images:
 
     def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
         """(F, *shape) the pictures in memory."""
-        columns = self.topic.read(_FIELDS, order, threads=threads)
+        is_all = len(order) == len(self.topic) and bool((np.diff(order) == 1).all())
+        columns = self.topic.read(_FIELDS, None if is_all else order, threads=threads)
         self._check(columns)
         return columns["data"].reshape(-1, *self._leaf.shape)
 

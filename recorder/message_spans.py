@@ -73,17 +73,18 @@ class Spans(Sequence[Span]):
         counts: (S,) int64 messages in each.
         are_in_order: whether all are in chunks, and none of these begins before the one in front
             of it ends.
+        some: makes the spans of these numbers.
     """
 
     def __init__(
         self,
         counts: NDArray[np.int64],
-        make: Callable[[NDArray[np.int64]], Iterator[Span]],
+        some: Callable[[NDArray[np.int64]], Iterator[Span]],
         *,
         are_in_order: bool,
     ) -> None:
-        """Note what makes the spans of some numbers."""
-        self.counts, self._make, self.are_in_order = counts, make, are_in_order
+        """Note how they are made."""
+        self.counts, self.some, self.are_in_order = counts, some, are_in_order
 
     @classmethod
     def of(cls, spans: Sequence[Span]) -> Self:
@@ -105,12 +106,12 @@ class Spans(Sequence[Span]):
 
     def __getitem__(self, key: int | slice) -> Span | list[Span]:
         """One, or some."""
-        spans = list(self._make(np.atleast_1d(np.arange(len(self))[key])))
+        spans = list(self.some(np.atleast_1d(np.arange(len(self))[key])))
         return spans if isinstance(key, slice) else spans[0]
 
     def __iter__(self) -> Iterator[Span]:
         """All of them."""
-        return self._make(np.arange(len(self)))
+        return self.some(np.arange(len(self)))
 
     def __len__(self) -> int:
         """Spans."""
@@ -148,13 +149,13 @@ def told_spans(
     entries_bytes = np.maximum(rows["index_bytes"], head_bytes) - head_bytes
     counts = (entries_bytes // np.uint64(INDEX_ENTRY.itemsize)).astype(np.int64)
 
-    def make(some: NDArray[np.int64]) -> Iterator[Span]:
-        places = zip(offsets[some].tolist(), counts[some].tolist(), strict=True)
-        for chunk, (offset, count) in zip(table.some(numbers[some]), places, strict=True):
+    def some(of: NDArray[np.int64]) -> Iterator[Span]:
+        places = zip(offsets[of].tolist(), counts[of].tolist(), strict=True)
+        for chunk, (offset, count) in zip(table.some(numbers[of]), places, strict=True):
             yield Span(chunk, count, partial(index_at, offset, channel_id, count))
 
     are_in_order = bool((rows["end_time"][:-1] <= rows["start_time"][1:]).all())
-    return Spans(counts, make, are_in_order=are_in_order)
+    return Spans(counts, some, are_in_order=are_in_order)
 
 
 def indexed_spans(
