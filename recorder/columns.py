@@ -53,6 +53,8 @@ class Topic:
         self._owners = np.repeat(np.arange(len(found)), sizes)
         self.spans = joined_spans([spans for _, spans in found])
         self._stops = np.cumsum(self.spans.counts)
+        # Who asks for a column of a chunk may ask for another next.
+        self._scratch, self._is_read = Scratch(), threading.Lock()
 
     def __len__(self) -> int:
         """Messages."""
@@ -127,10 +129,9 @@ class Topic:
         if not parts:
             return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
         local = threading.local()
-        local.scratch = Scratch()
+        local.scratch = self._scratch
         count = len(self) if order is None else len(order)
         first, span, _ = parts[0]
-        columns = first.empty_columns(wanted, count, span, local.scratch)
 
         def fill(together: list[Chosen]) -> None:
             if not hasattr(local, "scratch"):
@@ -145,7 +146,9 @@ class Topic:
                 records = self._reader.records_of(one.span, scratch)
                 one.decoder.fill(columns, records, one.span.index, one.rows)
 
-        _for_each(fill, list(neighbors(parts)), threads)
+        with self._is_read:
+            columns = first.empty_columns(wanted, count, span, self._scratch)
+            _for_each(fill, list(neighbors(parts)), threads)
         return {LOG_TIME: self.times if order is None else _times_of(parts, len(order)), **columns}
 
     def _all(self) -> Iterator[Chosen]:

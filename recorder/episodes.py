@@ -109,10 +109,12 @@ class Told:
         """Of those with these last log_times, and maybe others."""
         if not self._is_ours:
             return []
-        columns, fields = self._columns, EpisodeSummary._fields
+        fields, rows = EpisodeSummary._fields, None
         if len(ends) < len(self._topic) // 2:
-            chosen = np.isin(columns["end_time_ns"], ends)
-            columns = {name: column[chosen] for name, column in columns.items()}
+            rows = np.flatnonzero(np.isin(self._columns["end_time_ns"], ends))
+        columns = self._topic.read([name for name in fields if name in self._topic.fields], rows)
+        for name in ("terminated", "truncated"):
+            columns[name] = columns[name].astype(bool)
         values = {name: columns[name].tolist() for name in fields if name in columns}
         if "seed" in values:
             values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
@@ -127,11 +129,7 @@ class Told:
 
     @cached_property
     def _columns(self) -> Columns:
-        names = [name for name in EpisodeSummary._fields if name in self._topic.fields]
-        columns = self._topic.read(names)
-        for name in ("terminated", "truncated"):
-            columns[name] = columns[name].astype(bool)
-        return columns
+        return self._topic.read(("length", "end_time_ns"))
 
 
 def summaries(
