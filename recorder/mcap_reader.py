@@ -294,19 +294,14 @@ class McapReader:
         found: dict[int, ChunkIndex] = {}
         # Mostly they stand one behind the other.
         for number in np.flatnonzero(starts[:-1] != offsets).tolist():
-            before = table.some(np.arange(max(0, number - 1), number))
-            self._read_records(int(starts[number]), int(offsets[number]), found, *before)
-        self._read_records(int(starts[-1]), None, found, *table.some(np.arange(len(table))[-1:]))
+            self._read_records(int(starts[number]), int(offsets[number]), found, number - 1)
+        self._read_records(int(starts[-1]), None, found, len(table) - 1)
         if found:
             every = {chunk.chunk_start_offset: chunk for chunk in table.chunks} | found
             self._table = ChunkTable.of([every[offset] for offset in sorted(every)])
 
     def _read_records(
-        self,
-        start: int,
-        stop: int | None,
-        found: dict[int, ChunkIndex],
-        chunk: ChunkIndex | None = None,
+        self, start: int, stop: int | None, found: dict[int, ChunkIndex], before: int
     ) -> None:
         """Read the data section from `start` on, to `stop` or its end.
 
@@ -314,18 +309,19 @@ class McapReader:
             start: first byte.
             stop: where it ends; None for the end of the section.
             found: takes up chunks, by their first byte.
-            chunk: in front of these records, if there is one.
+            before: the number of the known chunk in front of these records; -1 if there is none.
 
         Raises:
             CorruptLogError: there are no whole records in a file that has a summary.
         """
-        self.data_end = start
+        self.data_end, chunk = start, None
         for offset, opcode, content in records_of(self.view, start, stop):
             if opcode == Opcode.CHUNK:
                 with self._named():
                     header = chunk_header(self.view, offset)
                 chunk = found[offset] = header.to_index(offset, len(content))
-            elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+            elif opcode == Opcode.MESSAGE_INDEX and (chunk is not None or before >= 0):
+                chunk = chunk or next(self._table.some(np.arange(before, before + 1)))
                 (channel_id,) = struct.unpack_from("<H", content)
                 chunk.message_index_offsets[channel_id] = offset
                 found[chunk.chunk_start_offset] = chunk

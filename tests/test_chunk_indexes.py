@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
@@ -14,10 +17,14 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
+import mcaprl
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.chunk_table import ChunkTable
+from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, records_of, runs_of
+from mcaprl.recorder.mcap_summary import Summary
 from mcaprl.recorder.message_records import message_index, message_indexes
+from tests.recordings import MIXED_SPACE, record
 
 _U8 = st.integers(0, 2**64 - 1)
 CHUNK_INDEXES = st.builds(
@@ -60,6 +67,25 @@ def test_they_are_what_the_library_wrote(chunks: list[ChunkIndex], behind: bytes
             found = dict(zip(numbers.tolist(), offsets.tolist(), strict=True))
             maps = enumerate(chunk.message_index_offsets for chunk in chunks)
             assert found == {k: map_[channel_id] for k, map_ in maps if channel_id in map_}
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_indexes_that_the_summary_does_not_tell_of_are_found(log_path: Path, every: int) -> None:
+    record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
+    reader = McapReader(log_path)
+    told = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
+    chunks = [
+        replace(chunk, message_index_offsets={}, message_index_length=0)
+        if number % every == 0
+        else chunk
+        for number, chunk in enumerate(reader.chunks)
+    ]
+    summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
+    data = log_path.read_bytes()[: reader.summary_start]
+    log_path.write_bytes(data + summary.to_bytes(len(data)))
+    assert McapReader(log_path).chunks != reader.chunks
+    found = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
+    assert [data.fingerprint for data in found] == [data.fingerprint for data in told]
 
 
 @given(st.lists(CHUNK_INDEXES, min_size=2, max_size=12))
