@@ -10,8 +10,8 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Iterator, Sequence
-from functools import cached_property, lru_cache
-from typing import Any, Self
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -22,22 +22,28 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.message_records import windows
 
 _HEAD = struct.Struct("<BQ")
-_START, _END = struct.Struct("<QQQQI"), struct.Struct("<QQ")
-_FIXED_BYTES = _START.size + 12 + _END.size
-# One of all 65,536 channels is shorter.
-_MOST_BYTES = 2**20
-_MAP_ENTRY = struct.Struct("<HQ")
-_U4 = np.dtype("<u4")
-_ROW = np.dtype(
+_START, _PAIR, _END = struct.Struct("<QQQQI"), struct.Struct("<HQ"), struct.Struct("<QQ")
+# The content of a record: this, the map, this, the name of the compression, this.
+_BEFORE_MAP = np.dtype(
     [
         ("start_time", "<u8"),
         ("end_time", "<u8"),
         ("offset", "<u8"),
         ("length", "<u8"),
-        ("index_bytes", "<u8"),
-        ("compressed_bytes", "<u8"),
-        ("raw_bytes", "<u8"),
+        ("map_bytes", "<u4"),
     ]
+)
+_BEHIND_MAP = np.dtype([("index_bytes", "<u8"), ("name_bytes", "<u4")])
+_BEHIND_NAME = np.dtype([("compressed_bytes", "<u8"), ("raw_bytes", "<u8")])
+_MAP_ENTRY = np.dtype([("channel_id", "<u2"), ("offset", "<u8")])
+_FIXED_BYTES = _BEFORE_MAP.itemsize + _BEHIND_MAP.itemsize + _BEHIND_NAME.itemsize
+# One of all 65,536 channels is shorter.
+_MOST_BYTES = 2**20
+# So few are sooner made all at once than again and again some of them.
+_FEW_CHUNKS = 32
+_PARTS = (_BEFORE_MAP, _BEHIND_MAP, _BEHIND_NAME)
+_ROW = np.dtype(
+    [(name, "<u8") for part in _PARTS for name in part.names or () if part[name].itemsize == 8]
 )
 
 
@@ -49,13 +55,17 @@ def chunk_index_record(chunk: ChunkIndex) -> bytes:
         chunk.message_end_time,
         chunk.chunk_start_offset,
         chunk.chunk_length,
-        len(offsets) * _MAP_ENTRY.size,
+        len(offsets) * _MAP_ENTRY.itemsize,
     )
-    pairs = b"".join(itertools.starmap(_MAP_ENTRY.pack, offsets.items()))
+    pairs = b"".join(itertools.starmap(_PAIR.pack, offsets.items()))
     middle = struct.pack("<QI", chunk.message_index_length, len(name))
     end = _END.pack(chunk.compressed_size, chunk.uncompressed_size)
     content = b"".join((start, pairs, middle, name, end))
     return _HEAD.pack(Opcode.CHUNK_INDEX, len(content)) + content
+
+
+Indexes = tuple[NDArray[np.int64], NDArray[np.uint64]]
+"""Of a channel: numbers of chunks, and the bytes at which their indexes of it begin."""
 
 
 class ChunkTable:
@@ -80,7 +90,7 @@ class ChunkTable:
 
     @classmethod
     def read(cls, view: memoryview, runs: NDArray[np.int64]) -> Self:
-        """Read ChunkIndex records, those of one form at once.
+        """Read ChunkIndex records, all at once.
 
         Args:
             view: where they are.
@@ -90,24 +100,33 @@ class ChunkTable:
         Raises:
             CorruptLogError: a record is damaged.
         """
-        if not len(runs):
-            return cls.of([])
         counts = runs[:, 2]
-        starts, lengths = np.repeat(runs[:, :2], counts, axis=0).T
-        before = np.repeat(np.cumsum(counts) - counts, counts)
-        starts = starts + (np.arange(len(starts)) - before) * (lengths + _HEAD.size)
+        firsts, lengths = np.repeat(runs[:, :2], counts, axis=0).T
+        starts = firsts + _within(counts) * (lengths + _HEAD.size)
         if (lengths < _FIXED_BYTES).any() or (lengths > _MOST_BYTES).any():
             raise CorruptLogError("a chunk_index record is too short or too long")
-        map_bytes = windows(view, starts + _START.size - 4, _U4).astype(np.int64)
-        if (map_bytes > lengths - _FIXED_BYTES).any():
-            raise CorruptLogError("the map of a chunk_index record reaches beyond it")
-        name_bytes = windows(view, starts + _START.size + map_bytes + 8, _U4)
-        table = cls(map_bytes // _MAP_ENTRY.size)
-        forms = zip(lengths.tolist(), map_bytes.tolist(), name_bytes.tolist(), strict=True)
-        for form in set(forms):
-            size, in_map, in_name = form
-            alike = (lengths == size) & (map_bytes == in_map) & (name_bytes == in_name)
-            table._fill(np.flatnonzero(alike), windows(view, starts[alike], _record_dtype(*form)))
+        before_map = windows(view, starts, _BEFORE_MAP)
+        map_bytes = before_map["map_bytes"].astype(np.int64)
+        if (map_bytes > lengths - _FIXED_BYTES).any() or (map_bytes % _MAP_ENTRY.itemsize).any():
+            raise CorruptLogError("the map of a chunk_index record does not fit it")
+        maps = starts + _BEFORE_MAP.itemsize
+        behind_map = windows(view, maps + map_bytes, _BEHIND_MAP)
+        name_bytes = behind_map["name_bytes"].astype(np.int64)
+        # A later version of MCAP may have more fields behind these.
+        if (name_bytes > lengths - _FIXED_BYTES - map_bytes).any():
+            raise CorruptLogError("the name of a chunk_index record does not fit it")
+        names = maps + map_bytes + _BEHIND_MAP.itemsize
+        table = cls(map_bytes // _MAP_ENTRY.itemsize)
+        for part in (before_map, behind_map, windows(view, names + name_bytes, _BEHIND_NAME)):
+            for name in set(part.dtype.names or ()) & set(_ROW.names or ()):
+                table.rows[name] = part[name]
+        table._compression[:] = _texts(view, names, name_bytes)
+        if len(table._channel_ids):
+            places = np.repeat(maps, table.map_sizes)
+            places += _within(table.map_sizes) * _MAP_ENTRY.itemsize
+            entries = windows(view, places, _MAP_ENTRY)
+            table._channel_ids[:] = entries["channel_id"]
+            table._index_offsets[:] = entries["offset"]
         offsets = table.rows["offset"]
         if (offsets[1:] < offsets[:-1]).any():
             return cls.of(sorted(table.chunks, key=lambda chunk: chunk.chunk_start_offset))
@@ -142,7 +161,7 @@ class ChunkTable:
     @cached_property
     def chunks(self) -> list[ChunkIndex]:
         """All of them."""
-        return list(self.some(np.arange(len(self))))
+        return list(self._made(np.arange(len(self))))
 
     def stops(self, file_bytes: int) -> NDArray[np.uint64]:
         """(K,) uint64 where the MessageIndex records behind each chunk end.
@@ -166,6 +185,11 @@ class ChunkTable:
 
     def some(self, numbers: NDArray[np.int64]) -> Iterator[ChunkIndex]:
         """Those of these numbers."""
+        if len(self) <= _FEW_CHUNKS:
+            return map(self.chunks.__getitem__, numbers.tolist())
+        return self._made(numbers)
+
+    def _made(self, numbers: NDArray[np.int64]) -> Iterator[ChunkIndex]:
         rows = self.rows[numbers]
         # In the order of the class's fields: by name takes twice as long.
         return map(
@@ -190,7 +214,21 @@ class ChunkTable:
         for start, stop in zip((starts - first).tolist(), (stops - first).tolist(), strict=True):
             yield dict(zip(ids[start:stop], offsets[start:stop], strict=True))
 
-    def indexes_of(self, channel_id: int) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
+    @cached_property
+    def bare(self) -> NDArray[np.int64]:
+        """The numbers of the chunks that have no index."""
+        return np.flatnonzero(self.map_sizes == 0)
+
+    def unsure(self, *, is_complete: bool) -> NDArray[np.int64]:
+        """The numbers of the chunks whose indexes may not be there, or not all of them.
+
+        Args:
+            is_complete: whether the writer came to its end; one that was killed may have written
+                some of the last chunk's indexes.
+        """
+        return self.bare if is_complete else np.union1d(self.bare, np.arange(len(self))[-1:])
+
+    def indexes_of(self, channel_id: int) -> Indexes:
         """The numbers of the chunks that have an index of a channel, and where those indexes are.
 
         Raises:
@@ -202,43 +240,23 @@ class ChunkTable:
             raise CorruptLogError(f"a chunk_index record tells of channel {channel_id} twice")
         return numbers, self._index_offsets[found]
 
-    def _fill(self, numbers: NDArray[np.int64], rows: NDArray[Any]) -> None:
-        """Take up records of one form."""
-        for name in _ROW.names or ():
-            self.rows[name][numbers] = rows[name]
-        names = rows["name"].tolist()
-        try:
-            texts = {name: name.decode() for name in set(names)}
-        except UnicodeDecodeError as error:
-            raise CorruptLogError("the name of a chunk's compression is no text") from error
-        self._compression[numbers] = [texts[name] for name in names]
-        maps = rows["map"]
-        stops = self._map_stops[numbers]
-        entries = stops[:, None] - np.arange(maps.shape[1], 0, -1)
-        self._channel_ids[entries] = maps["channel_id"]
-        self._index_offsets[entries] = maps["offset"]
+
+def _within(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """0, 1, 2 ... for each count, one behind the other."""
+    stops = np.cumsum(counts)
+    return np.arange(int(counts.sum())) - np.repeat(stops - counts, counts)
 
 
-@lru_cache(maxsize=64)
-def _record_dtype(size: int, map_bytes: int, name_bytes: int) -> np.dtype[Any]:
-    """A whole ChunkIndex record's content with so long a map and name."""
-    entry = np.dtype([("channel_id", "<u2"), ("offset", "<u8")])
-    pairs, rest = divmod(map_bytes, _MAP_ENTRY.size)
-    fields = [
-        ("start_time", "<u8"),
-        ("end_time", "<u8"),
-        ("offset", "<u8"),
-        ("length", "<u8"),
-        ("map_bytes", "<u4"),
-        ("map", entry, (pairs,)),
-        ("index_bytes", "<u8"),
-        ("name_bytes", "<u4"),
-        ("name", f"V{name_bytes}"),
-        ("compressed_bytes", "<u8"),
-        ("raw_bytes", "<u8"),
-    ]
-    # A later version of MCAP may have more fields behind these.
-    behind = size - _FIXED_BYTES - map_bytes - name_bytes
-    if rest or behind < 0:
-        raise CorruptLogError("the map or the name of a chunk_index record does not fit it")
-    return np.dtype([*fields, ("behind", f"V{behind}")])
+def _texts(view: memoryview, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> list[str]:
+    """The texts that stand there.
+
+    Raises:
+        CorruptLogError: one is no text.
+    """
+    places = zip(starts.tolist(), lengths.tolist(), strict=True)
+    found = [bytes(view[start : start + length]) for start, length in places]
+    try:
+        known = {name: name.decode() for name in set(found)}
+    except UnicodeDecodeError as error:
+        raise CorruptLogError("the name of a chunk's compression is no text") from error
+    return [known[name] for name in found]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import lz4.frame
@@ -150,7 +151,11 @@ class Scratch:
         """Begin without memory."""
         self._memory = np.empty(0, np.uint8)
         self.kept = _NOTHING
-        self.zstd = zstandard.ZstdDecompressor()
+
+    @cached_property
+    def zstd(self) -> zstandard.ZstdDecompressor:
+        """What decompresses zstd into it."""
+        return zstandard.ZstdDecompressor()
 
     def take(self, size: int) -> memoryview:
         """So many bytes; what was taken before is overwritten."""

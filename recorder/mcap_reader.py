@@ -14,6 +14,7 @@ import struct
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ class McapReader:
             raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self._table = ChunkTable.of([])
+        self._table = ChunkTable(np.empty(0, np.int64))
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
         self._counts: dict[int, int] = {}
@@ -138,17 +139,19 @@ class McapReader:
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
-        told = self._counts.get(channel.id)
+        told, table = self._counts.get(channel.id), self._table
         with self._named():
-            spans = told_spans(self._table, channel.id, self._index_at)
-        if spans is not None and len(spans) and int(spans.counts.sum()) == told:
-            return spans
-        # A writer that was killed may have written some of the last chunk's indexes only.
-        indexed = max(0, len(self._table) - (not self.complete))
-        with self._named():
-            found = indexed_spans(self.view, self._table, indexed, channel.id, self._unindexed_span)
-        rest = self._table.some(np.arange(indexed, len(self._table)))
-        found += [span for chunk in rest if (span := self._unindexed_span(chunk, channel.id))]
+            indexes = table.indexes_of(channel.id)
+            spans = told_spans(table, indexes, partial(self._index_at, channel.id))
+            if spans is not None and int(spans.counts.sum()) == told:
+                return spans
+            unsure = table.unsure(is_complete=self.complete)
+            by_index = indexed_spans(self.view, table, indexes, unsure, channel.id)
+        for number, chunk in zip(unsure.tolist(), table.some(unsure), strict=True):
+            index = self._contents_of(chunk).indexes.get(channel.id)
+            if index is not None:
+                by_index[number] = Span.of_index(chunk, index)
+        found = [span for _, span in sorted(by_index.items())]
         loose = self._loose_indexes.get(channel.id)
         if loose is not None:
             found.append(Span.of_index(None, loose))
@@ -247,7 +250,7 @@ class McapReader:
         """
         return records_of(self.view, start)
 
-    def _index_at(self, offset: int, channel_id: int, count: int) -> memoryview:
+    def _index_at(self, channel_id: int, offset: int, count: int) -> memoryview:
         with self._named():
             entries = message_index(self.view, offset, channel_id)
             if len(entries) != count * INDEX_ENTRY.itemsize:
@@ -256,11 +259,6 @@ class McapReader:
                     " summary tells of"
                 )
             return entries
-
-    def _unindexed_span(self, chunk: ChunkIndex, channel_id: int) -> Span | None:
-        """Likewise, by going through the chunk."""
-        index = self._contents_of(chunk).indexes.get(channel_id)
-        return None if index is None else Span.of_index(chunk, index)
 
     def _contents_of(self, chunk: ChunkIndex) -> ChunkContents:
         start = chunk.chunk_start_offset
@@ -281,8 +279,9 @@ class McapReader:
             elif opcode in _SUMMARY:
                 for first in range(start, start + count * size, size):
                     self._keep(self._parse(opcode, self.view[first : first + length], first))
-        with self._named():
-            self._table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
+        if runs:
+            with self._named():
+                self._table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
 
     def _read_between_chunks(self) -> None:
         """Read what the summary does not tell of: everything, if there is none."""
@@ -346,8 +345,7 @@ class McapReader:
 
     def _find_topics_in_chunks(self) -> None:
         """Look into chunks for schemas and channels that stand nowhere else."""
-        is_bare = self._table.map_sizes == 0
-        if all(map(self._is_known, self._table.channel_ids)) and not is_bare.any():
+        if all(map(self._is_known, self._table.channel_ids)) and not len(self._table.bare):
             return
         for chunk in self.chunks:
             ids = chunk.message_index_offsets

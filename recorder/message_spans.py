@@ -11,7 +11,7 @@ import numpy as np
 from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
-from mcaprl.recorder.chunk_table import ChunkTable
+from mcaprl.recorder.chunk_table import ChunkTable, Indexes
 from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD, message_indexes
 
 # The indexes of smaller chunks stand so close that they are sooner read all at once.
@@ -124,9 +124,7 @@ def joined_spans(parts: Sequence[Spans]) -> Spans:
 
 
 def told_spans(
-    table: ChunkTable,
-    channel_id: int,
-    index_at: Callable[[int, int, int], memoryview],
+    table: ChunkTable, indexes: Indexes, index_at: Callable[[int, int], memoryview]
 ) -> Spans | None:
     """A channel's messages by the summary alone, if it has large chunks to itself; else None.
 
@@ -135,16 +133,14 @@ def told_spans(
 
     Args:
         table: the file's chunks.
-        channel_id: of the channel.
-        index_at: reads the entries of a channel's index at a byte, which must be so many.
-
-    Raises:
-        CorruptLogError: a chunk has several indexes of the channel.
+        indexes: those of the channel.
+        index_at: reads the entries of the channel's index at a byte, which must be so many.
     """
-    numbers, offsets = table.indexes_of(channel_id)
+    numbers, offsets = indexes
     rows, head_bytes = table.rows[numbers], np.uint64(INDEX_HEAD.itemsize)
-    is_alone = (table.map_sizes[numbers] == 1) & (rows["length"] >= _LARGE_CHUNK_BYTES)
-    if not is_alone.all():
+    if not len(numbers) or rows["length"].min() < _LARGE_CHUNK_BYTES:
+        return None
+    if (table.map_sizes[numbers] > 1).any():
         return None
     entries_bytes = np.maximum(rows["index_bytes"], head_bytes) - head_bytes
     counts = (entries_bytes // np.uint64(INDEX_ENTRY.itemsize)).astype(np.int64)
@@ -152,7 +148,7 @@ def told_spans(
     def some(of: NDArray[np.int64]) -> Iterator[Span]:
         places = zip(offsets[of].tolist(), counts[of].tolist(), strict=True)
         for chunk, (offset, count) in zip(table.some(numbers[of]), places, strict=True):
-            yield Span(chunk, count, partial(index_at, offset, channel_id, count))
+            yield Span(chunk, count, partial(index_at, offset, count))
 
     are_in_order = bool((rows["end_time"][:-1] <= rows["start_time"][1:]).all())
     return Spans(counts, some, are_in_order=are_in_order)
@@ -161,30 +157,26 @@ def told_spans(
 def indexed_spans(
     view: memoryview,
     table: ChunkTable,
-    count: int,
+    indexes: Indexes,
+    unsure: NDArray[np.int64],
     channel_id: int,
-    unindexed: Callable[[ChunkIndex, int], Span | None],
-) -> list[Span]:
-    """A channel's messages by the indexes that the file has of them.
+) -> dict[int, Span]:
+    """A channel's messages by the indexes that the file has of them: by the number of the chunk.
 
     Args:
         view: of the file.
         table: its chunks.
-        count: how many of these are looked at.
+        indexes: those of the channel.
+        unsure: numbers of chunks whose indexes are not looked at.
         channel_id: of the channel.
-        unindexed: finds a channel's messages in a chunk of which there are no indexes.
 
     Raises:
         CorruptLogError: an index is damaged.
     """
-    numbers, offsets = table.indexes_of(channel_id)
-    numbers, offsets = numbers[numbers < count], offsets[numbers < count]
+    numbers, offsets = indexes
+    if len(unsure):
+        is_sure = ~np.isin(numbers, unsure)
+        numbers, offsets = numbers[is_sure], offsets[is_sure]
     entries = message_indexes(view, offsets.tolist(), channel_id)
     spans = map(Span.of_entries, table.some(numbers), entries)
-    bare = np.flatnonzero(table.map_sizes[:count] == 0)
-    if not len(bare):
-        return list(spans)
-    by_number: dict[int, Span | None] = dict(zip(numbers.tolist(), spans, strict=True))
-    for number, chunk in zip(bare.tolist(), table.some(bare), strict=True):
-        by_number[number] = unindexed(chunk, channel_id)
-    return [span for _, span in sorted(by_number.items()) if span is not None]
+    return dict(zip(numbers.tolist(), spans, strict=True))
