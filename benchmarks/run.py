@@ -36,10 +36,10 @@ depend on the machine, so there are ratios only. Side by side with ours stand th
 memory; plain decompression of the same chunks by zstd, each into the place of the one before; and
 the least that a reader of columns must do: map the file, decompress into new memory, check CRCs.
 
-A goal that is not reached stays where it is. What keeps pictures and other writers' logs from theirs
-is that least work, and NumPy's pass over a chunk for each check and each column. What keeps a single
-episode from its goal is Python: most of its time goes into the summary, the metadata and the spaces,
-and a quarter into the chunk that it stands in.
+A goal that is not reached stays where it is. What keeps pictures and other writers' logs from it is
+that least work, and NumPy's pass over a chunk for each check and each column. What keeps a single
+episode from it is Python: most of its time goes into the summary, the metadata and the spaces, and
+a quarter into the chunk that it stands in.
 
 ```sh
 make bench

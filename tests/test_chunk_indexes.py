@@ -54,7 +54,9 @@ def contents(chunks: list[ChunkIndex], behind: bytes = b"") -> tuple[memoryview,
     return view, np.array(runs, np.int64).reshape(-1, 3)
 
 
-@given(st.lists(CHUNK_INDEXES, min_size=1, max_size=40), st.sampled_from([b"", b"of a later version"]))
+@given(
+    st.lists(CHUNK_INDEXES, min_size=1, max_size=40), st.sampled_from([b"", b"of later versions"])
+)
 def test_they_are_what_the_library_wrote(chunks: list[ChunkIndex], behind: bytes) -> None:
     chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
     for table in (ChunkTable.read(*contents(chunks, behind)), ChunkTable.of(chunks)):
