@@ -19,9 +19,9 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.mcap_records import RECORD_HEADER
 from mcaprl.recorder.message_records import windows
 
-_HEAD = struct.Struct("<BQ")
 _START, _PAIR, _END = struct.Struct("<QQQQI"), struct.Struct("<HQ"), struct.Struct("<QQ")
 # The content of a record: this, the map, this, the name of the compression, this.
 _BEFORE_MAP = np.dtype(
@@ -61,7 +61,7 @@ def chunk_index_record(chunk: ChunkIndex) -> bytes:
     middle = struct.pack("<QI", chunk.message_index_length, len(name))
     end = _END.pack(chunk.compressed_size, chunk.uncompressed_size)
     content = b"".join((start, pairs, middle, name, end))
-    return _HEAD.pack(Opcode.CHUNK_INDEX, len(content)) + content
+    return RECORD_HEADER.pack(Opcode.CHUNK_INDEX, len(content)) + content
 
 
 Indexes = tuple[NDArray[np.int64], NDArray[np.uint64]]
@@ -102,7 +102,7 @@ class ChunkTable:
         """
         counts = runs[:, 2]
         firsts, lengths = np.repeat(runs[:, :2], counts, axis=0).T
-        starts = firsts + _within(counts) * (lengths + _HEAD.size)
+        starts = firsts + _within(counts) * (lengths + RECORD_HEADER.size)
         if (lengths < _FIXED_BYTES).any() or (lengths > _MOST_BYTES).any():
             raise CorruptLogError("a chunk_index record is too short or too long")
         before_map = windows(view, starts, _BEFORE_MAP)

@@ -54,7 +54,7 @@ class Topic:
         self.spans = joined_spans([spans for _, spans in found])
         self._stops = np.cumsum(self.spans.counts)
         # Who asks for a column of a chunk may ask for another next.
-        self._scratch, self._is_read = Scratch(), threading.Lock()
+        self._scratch, self._reading = Scratch(), threading.Lock()
 
     def __len__(self) -> int:
         """Messages."""
@@ -146,7 +146,7 @@ class Topic:
                 records = self._reader.records_of(one.span, scratch)
                 one.decoder.fill(columns, records, one.span.index, one.rows)
 
-        with self._is_read:
+        with self._reading:
             columns = first.empty_columns(wanted, count, span, self._scratch)
             _for_each(fill, list(neighbors(parts)), threads)
         return {LOG_TIME: self.times if order is None else _times_of(parts, len(order)), **columns}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from operator import le
-from typing import Any, Self, overload
+from typing import Any, Self
 
 import numpy as np
 from mcap.records import ChunkIndex
@@ -66,7 +66,7 @@ def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
     return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
 
 
-class Spans(Sequence[Span]):
+class Spans(Iterable[Span]):
     """Where all messages of a channel are; each span is made when it is asked for.
 
     Attributes:
@@ -97,17 +97,6 @@ class Spans(Sequence[Span]):
             lambda numbers: (spans[number] for number in numbers.tolist()),
             are_in_order=len(chunks) == len(spans) and all(map(le, ends, starts)),
         )
-
-    @overload
-    def __getitem__(self, key: int) -> Span: ...
-
-    @overload
-    def __getitem__(self, key: slice) -> list[Span]: ...
-
-    def __getitem__(self, key: int | slice) -> Span | list[Span]:
-        """One, or some."""
-        spans = list(self.some(np.atleast_1d(np.arange(len(self))[key])))
-        return spans if isinstance(key, slice) else spans[0]
 
     def __iter__(self) -> Iterator[Span]:
         """All of them."""

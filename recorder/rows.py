@@ -319,13 +319,9 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
 
 def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
     """The sum in order, the same on every machine; `sum` and `np.sum` add in other ways."""
-    if not len(rewards):
-        return start
     if start:
         rewards = np.concatenate([[start], rewards])
-    with np.errstate(all="ignore"):
-        # Of nothing but -0.0, too, the sum from 0.0 on is 0.0.
-        return float(np.add.accumulate(rewards)[-1] + 0.0)
+    return add_up_each(rewards, [0], [len(rewards)])[0]
 
 
 def add_up_each(
@@ -333,6 +329,7 @@ def add_up_each(
 ) -> list[float]:
     """The sums, likewise, of several spans of rewards."""
     with np.errstate(all="ignore"):
+        # Of nothing but -0.0, too, the sum from 0.0 on is 0.0.
         return [
             float(np.add.accumulate(rewards[start:stop])[-1] + 0.0) if start < stop else 0.0
             for start, stop in zip(starts, stops, strict=True)

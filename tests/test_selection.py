@@ -31,7 +31,7 @@ def damage(path: Path, target: Path, topic: str, number: int = 0) -> None:
     reader = McapReader(path)
     channel = reader.channel_of(topic)
     assert channel is not None
-    chunk = reader.spans(channel)[number].chunk
+    chunk = list(reader.spans(channel))[number].chunk
     assert chunk is not None
     data = bytearray(path.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 1
@@ -202,7 +202,7 @@ def test_an_index_that_leads_to_fewer_messages_is_found_out(large: Path, tmp_pat
     reader = McapReader(large)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
-    chunk = reader.spans(channel)[2].chunk
+    chunk = list(reader.spans(channel))[2].chunk
     assert chunk is not None
     spoilt = bytearray(large.read_bytes())
     # Behind opcode, length and channel stands how many bytes of entries there are.
