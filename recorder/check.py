@@ -4,7 +4,7 @@
     its chunks   CRCs, indexes against contents, what the summary tells of them  (chunk_check)
     the log      metadata against schema, episodes, steps in order, pictures     (episode_check)
 
-Each chunk is decompressed once, and looked at as a whole: a check takes as long as reading does.
+Each chunk is decompressed once, and looked at as a whole; small ones together.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from itertools import islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunk_check import Contradiction, check_chunk, check_statistics, place
+from mcaprl.recorder.chunk_check import Contradiction, Piece, check_piece, check_statistics, place
 from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.episode_check import EpisodeCheck
+from mcaprl.recorder.joined import packed
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 
@@ -81,39 +81,52 @@ def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Co
     """Chunk by chunk: what stands in each, and what the log says with all of them."""
     found: list[Contradiction] = []
     log = EpisodeCheck(reader) if whole else None
-    for chunk, read in _decompressed(reader, threads):
+    for numbers, read in _decompressed(reader, threads):
         try:
-            records = read()
-            found += check_chunk(reader, chunk, records)
-        except CorruptLogError as error:
-            found.append(Contradiction(_without_path(error, reader.path), place(reader, chunk)))
+            piece = read()
+            found += check_piece(reader, piece)
+        except CorruptLogError:
+            found += _check_alone(reader, numbers)
             continue
         if log is not None and not found:
-            log.take(chunk, records)
+            log.take(piece)
     if log is not None and not found:
         found += [*check_statistics(reader), *log.finish()]
     return found
 
 
-def _decompressed(
-    reader: McapReader, threads: int
-) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
-    """Yield each chunk with what gives its records, which are there until the next one's are."""
+def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Contradiction]:
+    """Chunks of which one is damaged, each by itself."""
+    scratch = Scratch()
+    for number in range(numbers.start, numbers.stop):
+        try:
+            piece = Piece.read(reader, slice(number, number + 1), scratch)
+            yield from check_piece(reader, piece)
+        except CorruptLogError as error:
+            where = place(reader, reader.chunks[number])
+            yield Contradiction(_without_path(error, reader.path), where)
+
+
+def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Callable[[], Piece]]]:
+    """Yield numbers of chunks with what gives them, which are there until the next ones are."""
+    sizes = reader.table.rows["raw_bytes"].tolist()
+    several = packed(range(len(sizes)), sizes.__getitem__)
+    pieces = (slice(numbers[0], numbers[-1] + 1) for numbers in several)
     if threads == 1:
         scratch = Scratch()
-        for chunk in reader.chunks:
-            yield chunk, partial(reader.chunk_records, chunk, scratch)
+        for numbers in pieces:
+            yield numbers, partial(Piece.read, reader, numbers, scratch)
         return
     with ThreadPoolExecutor(threads) as pool:
-        chunks, ahead = iter(reader.chunks), deque[tuple[ChunkIndex, Future[memoryview]]]()
+        ahead = deque[tuple[slice, Future[Piece]]]()
         # One for each thread, and one at hand: memory does not grow with the file.
         while True:
-            for chunk in islice(chunks, threads + 1 - len(ahead)):
-                ahead.append((chunk, pool.submit(reader.chunk_records, chunk, Scratch())))
+            for numbers in islice(pieces, threads + 1 - len(ahead)):
+                ahead.append((numbers, pool.submit(Piece.read, reader, numbers, Scratch())))
             if not ahead:
                 return
-            chunk, future = ahead.popleft()
-            yield chunk, future.result
+            numbers, future = ahead.popleft()
+            yield numbers, future.result
 
 
 def _check_file(reader: McapReader) -> list[Contradiction]:

@@ -1,8 +1,10 @@
-"""Checks a chunk against its indexes, and the summary against all of them."""
+"""Checks chunks against their indexes, and the summary against all of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,21 +13,21 @@ from mcap.records import ChunkIndex, Statistics
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.chunks import chunk_header
+from mcaprl.recorder.chunks import CHUNK_HEAD, Scratch, chunk_header
+from mcaprl.recorder.joined import side_by_side
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import (
-    contents_of,
-    parse_record,
-    uniform_indexes,
-)
+from mcaprl.recorder.mcap_records import contents_of, parse_record
 from mcaprl.recorder.message_records import (
-    FEW,
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
-    gather,
     message_index,
+    message_indexes,
+    windows,
 )
+
+# What the header of a chunk and the summary both tell.
+_TOLD = ("start_time", "end_time", "raw_bytes")
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,49 @@ class Contradiction:
     where: str
 
 
+@dataclass(frozen=True)
+class Piece:
+    """K chunks that follow each other, decompressed side by side.
+
+    Attributes:
+        numbers: theirs, in the order of the file.
+        chunks: as the summary, or a scan, tells of them.
+        records: of all of them.
+        stops: where those of each end.
+    """
+
+    numbers: slice
+    chunks: list[ChunkIndex]
+    records: memoryview
+    stops: list[int]
+
+    @classmethod
+    def read(cls, reader: McapReader, numbers: slice, scratch: Scratch) -> Piece:
+        """Decompress them; the records are there until `scratch` is used again.
+
+        Raises:
+            CorruptLogError: a chunk is damaged.
+        """
+        chunks = reader.chunks[numbers]
+        if len(chunks) > 1:
+            return cls(numbers, chunks, *side_by_side(reader, chunks, scratch))
+        records = reader.chunk_records(chunks[0], scratch)
+        return cls(numbers, chunks, records, [len(records)])
+
+    def alone(self) -> Iterator[Piece]:
+        """Each chunk by itself."""
+        bounds = pairwise([0, *self.stops])
+        for place, (chunk, (start, stop)) in enumerate(zip(self.chunks, bounds, strict=True)):
+            number = self.numbers.start + place
+            records = self.records[start:stop]
+            yield Piece(slice(number, number + 1), [chunk], records, [len(records)])
+
+    @property
+    def bounds(self) -> NDArray[np.uint64]:
+        """(K + 1,) where the records of each chunk begin, and those of the last one end."""
+        return np.array([0, *self.stops], np.uint64)
+
+
 def place(reader: McapReader, chunk: ChunkIndex) -> str:
     """Where a chunk is, what is in it, and of when."""
     known = (reader.channels.get(channel_id) for channel_id in chunk.message_index_offsets)
@@ -49,17 +94,89 @@ def place(reader: McapReader, chunk: ChunkIndex) -> str:
     return f"chunk at byte {chunk.chunk_start_offset}, {topics}, {times}"
 
 
-def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Contradiction]:
-    """Compare a chunk with its own header, its message indexes, and what the summary tells of it.
-
-    Args:
-        reader: of the file.
-        chunk: as the summary, or a scan, tells of it.
-        records: of the chunk.
+def check_piece(reader: McapReader, piece: Piece) -> list[Contradiction]:
+    """Compare chunks with their own headers, message indexes, and what the summary tells of them.
 
     Raises:
         CorruptLogError: an index or a record is damaged.
     """
+    if _is_sound(reader, piece):
+        return []
+    if len(piece.chunks) > 1:
+        return [found for one in piece.alone() for found in check_piece(reader, one)]
+    return _check_chunk(reader, piece.chunks[0], piece.records)
+
+
+def _is_sound(reader: McapReader, piece: Piece) -> bool:
+    """Whether the chunks hold nothing but messages that touch each other, and all agrees on them.
+
+    What is not so may be right as well, but must be looked at record by record.
+    """
+    found, bounds = _joint_index(reader, piece), piece.bounds
+    if found is None or not len(found[0]):
+        return False
+    entries, ids, owners = found
+    starts, room = bounds[:-1], np.diff(bounds)
+    if (entries["offset"] >= room[owners]).any():
+        return False
+    offsets = entries["offset"] + starts[owners]
+    if (offsets[1:] < offsets[:-1]).any():
+        order = np.argsort(offsets, kind="stable")
+        entries, ids, offsets = entries[order], ids[order], offsets[order]
+    # None is shorter than its header, so no length below is beyond 2**64.
+    sizes = np.diff(offsets, append=bounds[-1:])
+    firsts = np.searchsorted(offsets, starts)
+    if (
+        (room == 0).any()
+        or (offsets[np.minimum(firsts, len(offsets) - 1)] != starts).any()
+        or (sizes < MESSAGE_HEADER.itemsize).any()
+    ):
+        return False
+    heads, times = _heads(piece.records, offsets, sizes), entries["log_time"]
+    told = reader.table.rows[piece.numbers]
+    headers = windows(reader.view, told["offset"], CHUNK_HEAD)
+    return bool(
+        (heads["length"] == sizes - np.uint64(RECORD_HEADER_BYTES)).all()
+        and (heads["opcode"] == Opcode.MESSAGE).all()
+        and (heads["channel_id"] == ids).all()
+        and (heads["log_time"] == times).all()
+        and (headers["start_time"] == np.minimum.reduceat(times, firsts)).all()
+        and (headers["end_time"] == np.maximum.reduceat(times, firsts)).all()
+        and all((headers[name] == told[name]).all() for name in _TOLD)
+    )
+
+
+def _joint_index(
+    reader: McapReader, piece: Piece
+) -> tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.int64]] | None:
+    """Entries of all indexes, whose channels, and in which of the chunks; None if one is damaged.
+
+    The offsets are those in the chunks.
+    """
+    ids, places = reader.table.places_of_indexes(piece.numbers)
+    try:
+        indexes = message_indexes(reader.view, places.tolist(), ids.tolist())
+    except CorruptLogError:
+        return None
+    joined = indexes[0] if len(indexes) == 1 else bytearray().join(indexes)
+    entries = np.frombuffer(joined, INDEX_ENTRY)
+    counts = np.array([len(index) // INDEX_ENTRY.itemsize for index in indexes], np.int64)
+    sizes = reader.table.map_sizes[piece.numbers]
+    owners = np.repeat(np.arange(len(sizes)), sizes)
+    return entries, np.repeat(ids, counts), np.repeat(owners, counts)
+
+
+def _heads(
+    records: memoryview, offsets: NDArray[np.uint64], sizes: NDArray[np.uint64]
+) -> NDArray[Any]:
+    """The headers of messages of these sizes that touch each other."""
+    if (sizes == sizes[0]).all():
+        return np.ndarray(len(sizes), MESSAGE_HEADER, records, strides=(int(sizes[0]),))
+    return windows(records, offsets, MESSAGE_HEADER)
+
+
+def _check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Contradiction]:
+    """Likewise, of one chunk, record by record."""
     found, view = [], reader.view
     header = chunk_header(view, chunk.chunk_start_offset)
     told = (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
@@ -69,8 +186,7 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
         channel_id: np.frombuffer(message_index(view, offset, channel_id), INDEX_ENTRY)
         for channel_id, offset in chunk.message_index_offsets.items()
     }
-    if not _is_complete(records, indexes):
-        found += _wrong_indexes(reader, indexes, contents_of(records).indexes)
+    found += _wrong_indexes(reader, indexes, contents_of(records).indexes)
     times = [index["log_time"] for index in indexes.values() if len(index)]
     if times:
         first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
@@ -89,7 +205,7 @@ def check_statistics(reader: McapReader) -> list[Contradiction]:
             continue
         told: Statistics = parse_record(opcode, content)
         counts = {
-            channel_id: sum(len(span) for span in reader.spans(channel))
+            channel_id: int(reader.spans(channel).counts.sum())
             for channel_id, channel in reader.channels.items()
         }
         pairs = [
@@ -108,38 +224,6 @@ def check_statistics(reader: McapReader) -> list[Contradiction]:
             if told_ != count
         ]
     return found
-
-
-def _is_complete(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Whether the indexes tell of every byte of a chunk: messages that touch each other."""
-    if not indexes or not len(records):
-        return False
-    are_few = sum(map(len, indexes.values())) < FEW
-    found = contents_of(records).indexes if are_few else uniform_indexes(records)
-    if found is not None:
-        return found.keys() == indexes.keys() and all(
-            np.array_equal(index.view("<u8"), found[channel_id].view("<u8"))
-            for channel_id, index in indexes.items()
-        )
-    entries = np.concatenate(list(indexes.values()))
-    ids = np.repeat(np.array(list(indexes), np.uint16), [len(index) for index in indexes.values()])
-    if len(indexes) > 1 or (np.diff(entries["offset"].astype(np.int64)) < 0).any():
-        order = np.argsort(entries["offset"], kind="stable")
-        entries, ids = entries[order], ids[order]
-    try:
-        heads = gather(records, entries, MESSAGE_HEADER)
-    except CorruptLogError:
-        return False
-    ends = entries["offset"] + heads["length"] + np.uint64(RECORD_HEADER_BYTES)
-    return bool(
-        len(entries)
-        and entries["offset"][0] == 0
-        and ends[-1] == len(records)
-        and (ends[:-1] == entries["offset"][1:]).all()
-        and (heads["opcode"] == Opcode.MESSAGE).all()
-        and (heads["channel_id"] == ids).all()
-        and (heads["log_time"] == entries["log_time"]).all()
-    )
 
 
 def _wrong_indexes(

@@ -228,6 +228,12 @@ class ChunkTable:
         """
         return self.bare if is_complete else np.union1d(self.bare, np.arange(len(self))[-1:])
 
+    def places_of_indexes(self, numbers: slice) -> tuple[NDArray[np.uint16], NDArray[np.uint64]]:
+        """Of what channel, and at what byte, the indexes of chunks are that follow each other."""
+        stops = self._map_stops[numbers]
+        entries = slice(int(stops[0] - self.map_sizes[numbers.start]), int(stops[-1]))
+        return self._channel_ids[entries], self._index_offsets[entries]
+
     def indexes_of(self, channel_id: int) -> Indexes:
         """The numbers of the chunks that have an index of a channel, and where those indexes are.
 

@@ -22,6 +22,16 @@ from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
+# Likewise, of many at once.
+CHUNK_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("content_bytes", "<u8"),
+        ("start_time", "<u8"),
+        ("end_time", "<u8"),
+        ("raw_bytes", "<u8"),
+    ]
+)
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # Of numbers, a record is most like those just before it, so a table that remembers little else is
 # faster than that of zstd's level 1 and finds more. What it does not find is the noise of floats'

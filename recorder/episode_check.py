@@ -8,11 +8,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
-from mcaprl.recorder.chunk_check import Contradiction
+from mcaprl.recorder.chunk_check import Contradiction, Piece
 from mcaprl.recorder.columns import LOG_TIME, Topic
 from mcaprl.recorder.decoder import Columns, Decoder
 from mcaprl.recorder.episode import Episode
@@ -20,7 +19,7 @@ from mcaprl.recorder.episodes import COUNTERS, Told, episode_lengths, summaries
 from mcaprl.recorder.log_reader import LogReader, described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.message_spans import Span
+from mcaprl.recorder.message_spans import Span, joined_index
 from mcaprl.recorder.rows import add_up
 from mcaprl.recorder.schema import step_schema
 from mcaprl.recorder.spaces import Leaf, observation_leaves
@@ -62,13 +61,27 @@ class EpisodeCheck:
         if self._has_our_form:
             self._prepare()
 
-    def take(self, chunk: ChunkIndex, records: memoryview) -> None:
-        """Look at a chunk of the log."""
-        for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
-            if isinstance(where, slice):
-                self._take_steps(decoder.alike(records, span.index, _FIELDS), where)
+    def take(self, piece: Piece) -> None:
+        """Look at chunks of the log."""
+        records, starts = piece.records, piece.bounds[:-1]
+        for decoder, places in self._places_in(piece).items():
+            numbers, spans, wheres = zip(*places, strict=True)
+            index = joined_index(spans)
+            index["offset"] += np.repeat(starts[list(numbers)], list(map(len, spans)))
+            first, last = wheres[0], wheres[-1]
+            if isinstance(first, slice):
+                rows = slice(first.start, last.stop)
+                self._take_steps(decoder.alike(records, index, _FIELDS), rows)
             else:
-                self._take_images(decoder.alike(records, span.index, _IMAGE_FIELDS), where)
+                self._take_images(decoder.alike(records, index, _IMAGE_FIELDS), first)
+
+    def _places_in(self, piece: Piece) -> dict[Decoder, list[tuple[int, Span, slice | Leaf]]]:
+        """Messages by what decodes them: in which of its chunks, and where they belong."""
+        found: dict[Decoder, list[tuple[int, Span, slice | Leaf]]] = defaultdict(list)
+        for number, chunk in enumerate(piece.chunks):
+            for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
+                found[decoder].append((number, span, where))
+        return found
 
     def finish(self) -> Iterator[Contradiction]:
         """Tell what contradicts each other.

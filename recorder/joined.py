@@ -7,10 +7,12 @@ piece of memory, and their messages are taken from there at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
@@ -22,6 +24,8 @@ from mcaprl.recorder.message_spans import Span, joined_index
 
 # So large a piece stays in a processor's cache from one pass over it to the next.
 _MOST_BYTES = 2**20
+
+_T = TypeVar("_T")
 
 
 class Chosen(NamedTuple):
@@ -41,18 +45,44 @@ class Chosen(NamedTuple):
 
 def neighbors(chosen: Iterable[Chosen]) -> Iterator[list[Chosen]]:
     """Bring together what is of one channel, follows each other, and is small."""
-    together: list[Chosen] = []
+    for _, of_one in groupby(chosen, key=lambda one: one.decoder):
+        yield from packed(of_one, lambda one: one.chunk_bytes)
+
+
+def packed(chunks: Iterable[_T], size_of: Callable[[_T], int]) -> Iterator[list[_T]]:
+    """Bring together chunks that follow each other and are small; a large one stands alone.
+
+    Args:
+        chunks: what stands for each.
+        size_of: tells how many bytes its records are.
+    """
+    together: list[_T] = []
     size = 0
-    for one in chosen:
-        more = one.chunk_bytes
-        is_other = bool(together) and one.decoder is not together[0].decoder
-        if together and (is_other or size + more > _MOST_BYTES):
+    for one in chunks:
+        more = size_of(one)
+        if together and size + more > _MOST_BYTES:
             yield together
             together, size = [], 0
         together.append(one)
         size += more
     if together:
         yield together
+
+
+def side_by_side(
+    reader: McapReader, chunks: Sequence[ChunkIndex], scratch: Scratch
+) -> tuple[memoryview, list[int]]:
+    """The records of several chunks, one behind the other, and where those of each end.
+
+    Raises:
+        CorruptLogError: a chunk is damaged.
+    """
+    offsets = [chunk.chunk_start_offset for chunk in chunks]
+    size = sum(chunk.uncompressed_size for chunk in chunks)
+    try:
+        return joined_records(reader.view, offsets, size, scratch)
+    except CorruptLogError as error:
+        raise CorruptLogError(f"{reader.path}: {error}") from error
 
 
 def join(
@@ -68,12 +98,7 @@ def join(
     """
     spans = [one.span for one in together]
     chunks = [span.chunk for span in spans if span.chunk is not None]
-    offsets = [chunk.chunk_start_offset for chunk in chunks]
-    size = sum(chunk.uncompressed_size for chunk in chunks)
-    try:
-        records, stops = joined_records(reader.view, offsets, size, scratch)
-    except CorruptLogError as error:
-        raise CorruptLogError(f"{reader.path}: {error}") from error
+    records, stops = side_by_side(reader, chunks, scratch)
     counts, index = list(map(len, spans)), joined_index(spans)
     starts = np.repeat(np.array([0, *stops[:-1]], np.uint64), counts)
     room = np.repeat(np.array(stops, np.uint64), counts) - starts

@@ -59,6 +59,7 @@ class McapReader:
         complete: whether the file ends as it should; if not, it was cut off or is being written.
         summary_start: where the summary begins; 0 if there is none.
         data_end: where the records that precede it end, as far as they were read.
+        table: its chunks.
         schemas: by id.
         channels: by id.
         metadata: metadata records, by name; of several with one name, the first.
@@ -78,7 +79,7 @@ class McapReader:
             raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self._table = ChunkTable(np.empty(0, np.int64))
+        self.table = ChunkTable(np.empty(0, np.int64))
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
         self._counts: dict[int, int] = {}
@@ -102,7 +103,7 @@ class McapReader:
     @property
     def chunks(self) -> list[ChunkIndex]:
         """Indexes of all chunks, in file order."""
-        return self._table.chunks
+        return self.table.chunks
 
     def channels_of(self, topic: str) -> list[Channel]:
         """The channels of a topic, by id; more than one where several writers took part."""
@@ -139,7 +140,7 @@ class McapReader:
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
-        told, table = self._counts.get(channel.id), self._table
+        told, table = self._counts.get(channel.id), self.table
         with self._named():
             indexes = table.indexes_of(channel.id)
             spans = told_spans(table, indexes, partial(self._index_at, channel.id))
@@ -281,11 +282,11 @@ class McapReader:
                     self._keep(self._parse(opcode, self.view[first : first + length], first))
         if runs:
             with self._named():
-                self._table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
+                self.table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
 
     def _read_between_chunks(self) -> None:
         """Read what the summary does not tell of: everything, if there is none."""
-        table = self._table
+        table = self.table
         with self._named():
             stops = table.stops(len(self.view))
         starts = np.concatenate([np.array([len(MCAP0_MAGIC)], np.uint64), stops])
@@ -297,7 +298,7 @@ class McapReader:
         self._read_records(int(starts[-1]), None, found, len(table) - 1)
         if found:
             every = {chunk.chunk_start_offset: chunk for chunk in table.chunks} | found
-            self._table = ChunkTable.of([every[offset] for offset in sorted(every)])
+            self.table = ChunkTable.of([every[offset] for offset in sorted(every)])
 
     def _read_records(
         self, start: int, stop: int | None, found: dict[int, ChunkIndex], before: int
@@ -320,7 +321,7 @@ class McapReader:
                     header = chunk_header(self.view, offset)
                 chunk = found[offset] = header.to_index(offset, len(content))
             elif opcode == Opcode.MESSAGE_INDEX and (chunk is not None or before >= 0):
-                chunk = chunk or next(self._table.some(np.arange(before, before + 1)))
+                chunk = chunk or next(self.table.some(np.arange(before, before + 1)))
                 (channel_id,) = struct.unpack_from("<H", content)
                 chunk.message_index_offsets[channel_id] = offset
                 found[chunk.chunk_start_offset] = chunk
@@ -345,7 +346,7 @@ class McapReader:
 
     def _find_topics_in_chunks(self) -> None:
         """Look into chunks for schemas and channels that stand nowhere else."""
-        if all(map(self._is_known, self._table.channel_ids)) and not len(self._table.bare):
+        if all(map(self._is_known, self.table.channel_ids)) and not len(self.table.bare):
             return
         for chunk in self.chunks:
             ids = chunk.message_index_offsets

@@ -8,7 +8,7 @@ structured array of `record_dtype(payload)`; the rows of a MessageIndex are one 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -112,19 +112,20 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> memoryview:
 
 
 def message_indexes(
-    file: memoryview, offsets: Sequence[int], channel_id: int
-) -> Iterable[memoryview]:
+    file: memoryview, offsets: Sequence[int], channel_ids: Sequence[int]
+) -> list[memoryview]:
     """Those of the MessageIndex records at several offsets, all looked at together; likewise."""
     if len(offsets) < FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
-        return [message_index(file, offset, channel_id) for offset in offsets]
+        return [message_index(file, *place) for place in zip(offsets, channel_ids, strict=True)]
     starts = np.array(offsets, np.int64)
     heads = windows(file, starts, INDEX_HEAD)
     starts += INDEX_HEAD.itemsize
     stops = starts + heads["entries_bytes"]
-    is_wrong = (heads["opcode"] != Opcode.MESSAGE_INDEX) | (heads["channel_id"] != channel_id)
+    is_wrong = (heads["opcode"] != Opcode.MESSAGE_INDEX) | (heads["channel_id"] != channel_ids)
     is_wrong |= (heads["entries_bytes"] % INDEX_ENTRY.itemsize != 0) | (stops > len(file))
     if is_wrong.any():
-        return [message_index(file, offsets[int(np.argmax(is_wrong))], channel_id)]
+        wrong = int(np.argmax(is_wrong))
+        return [message_index(file, offsets[wrong], channel_ids[wrong])]
     return [file[start:stop] for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
 
 

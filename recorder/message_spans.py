@@ -166,6 +166,6 @@ def indexed_spans(
     if len(unsure):
         is_sure = ~np.isin(numbers, unsure)
         numbers, offsets = numbers[is_sure], offsets[is_sure]
-    entries = message_indexes(view, offsets.tolist(), channel_id)
+    entries = message_indexes(view, offsets.tolist(), [channel_id] * len(offsets))
     spans = map(Span.of_entries, table.some(numbers), entries)
     return dict(zip(numbers.tolist(), spans, strict=True))
