@@ -87,6 +87,7 @@ class McapReader:
         # Who asks for a chunk's example asks for all of it next.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
+        self._spans: dict[int, Spans] = {}
         with self._named():
             footer = footer_of(self.view)
         self.complete = footer is not None
@@ -140,6 +141,11 @@ class McapReader:
         Raises:
             CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
         """
+        if channel.id not in self._spans:
+            self._spans[channel.id] = self._spans_of(channel)
+        return self._spans[channel.id]
+
+    def _spans_of(self, channel: Channel) -> Spans:
         told, table = self._counts.get(channel.id), self.table
         with self._named():
             indexes = table.indexes_of(channel.id)
