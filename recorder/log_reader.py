@@ -161,8 +161,8 @@ class LogReader:
         behind = len(self._steps) - int(lengths.sum()) - len(lengths)
         if behind or not self._reader.complete:
             warnings.warn(
-                f"{self.path} was cut off or is still being written: {len(lengths)} finished"
-                f" episodes are read, {behind} records behind them are not",
+                f"{self.path} was cut off or is still being written; finished episodes read:"
+                f" {len(lengths)}, records behind them left out: {behind}",
                 stacklevel=4,
             )
         return lengths

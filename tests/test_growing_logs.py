@@ -143,7 +143,7 @@ def test_killed_while_appending(log_path: Path) -> None:
         pass
     copy = log_path.with_name("copy.mcap")
     copy.write_bytes(log_path.read_bytes())
-    with pytest.warns(UserWarning, match="3 finished episodes"):
+    with pytest.warns(UserWarning, match="finished episodes read: 3"):
         assert len(mcaprl.open(copy).episodes) == 3
     env.close()
     assert check_log(log_path) == []
