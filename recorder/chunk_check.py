@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -112,33 +112,22 @@ def _is_sound(reader: McapReader, piece: Piece) -> bool:
 
     What is not so may be right as well, but must be looked at record by record.
     """
-    found, bounds = _joint_index(reader, piece), piece.bounds
-    if found is None or not len(found[0]):
+    index, bounds = _joint_index(reader, piece), piece.bounds
+    if index is None or (bounds[1:] == bounds[:-1]).any():
         return False
-    entries, ids, owners = found
-    starts, room = bounds[:-1], np.diff(bounds)
-    if (entries["offset"] >= room[owners]).any():
-        return False
-    offsets = entries["offset"] + starts[owners]
-    if (offsets[1:] < offsets[:-1]).any():
-        order = np.argsort(offsets, kind="stable")
-        entries, ids, offsets = entries[order], ids[order], offsets[order]
     # None is shorter than its header, so no length below is beyond 2**64.
-    sizes = np.diff(offsets, append=bounds[-1:])
-    firsts = np.searchsorted(offsets, starts)
-    if (
-        (room == 0).any()
-        or (offsets[np.minimum(firsts, len(offsets) - 1)] != starts).any()
-        or (sizes < MESSAGE_HEADER.itemsize).any()
-    ):
+    sizes = np.diff(index.offsets, append=bounds[-1:])
+    firsts = np.searchsorted(index.offsets, bounds[:-1])
+    begin_alike = firsts[-1] < len(sizes) and (index.offsets[firsts] == bounds[:-1]).all()
+    if not begin_alike or (sizes < MESSAGE_HEADER.itemsize).any():
         return False
-    heads, times = _heads(piece.records, offsets, sizes), entries["log_time"]
+    heads, times = _heads(piece.records, index.offsets, sizes), index.log_times
     told = reader.table.rows[piece.numbers]
     headers = windows(reader.view, told["offset"], CHUNK_HEAD)
     return bool(
         (heads["length"] == sizes - np.uint64(RECORD_HEADER_BYTES)).all()
         and (heads["opcode"] == Opcode.MESSAGE).all()
-        and (heads["channel_id"] == ids).all()
+        and (heads["channel_id"] == index.channel_ids).all()
         and (heads["log_time"] == times).all()
         and (headers["start_time"] == np.minimum.reduceat(times, firsts)).all()
         and (headers["end_time"] == np.maximum.reduceat(times, firsts)).all()
@@ -146,13 +135,22 @@ def _is_sound(reader: McapReader, piece: Piece) -> bool:
     )
 
 
-def _joint_index(
-    reader: McapReader, piece: Piece
-) -> tuple[NDArray[Any], NDArray[np.uint16], NDArray[np.int64]] | None:
-    """Entries of all indexes, whose channels, and in which of the chunks; None if one is damaged.
+class _JointIndex(NamedTuple):
+    """What the indexes of a piece tell of its N messages, in the order of the records.
 
-    The offsets are those in the chunks.
+    Attributes:
+        offsets: (N,) uint64, where each begins in the piece.
+        channel_ids: (N,) uint16.
+        log_times: (N,) uint64.
     """
+
+    offsets: NDArray[np.uint64]
+    channel_ids: NDArray[np.uint16]
+    log_times: NDArray[np.uint64]
+
+
+def _joint_index(reader: McapReader, piece: Piece) -> _JointIndex | None:
+    """All indexes of a piece as one; None if one is damaged, or points outside of its chunk."""
     ids, places = reader.table.places_of_indexes(piece.numbers)
     try:
         indexes = message_indexes(reader.view, places.tolist(), ids.tolist())
@@ -161,9 +159,16 @@ def _joint_index(
     joined = indexes[0] if len(indexes) == 1 else bytearray().join(indexes)
     entries = np.frombuffer(joined, INDEX_ENTRY)
     counts = np.array([len(index) // INDEX_ENTRY.itemsize for index in indexes], np.int64)
-    sizes = reader.table.map_sizes[piece.numbers]
-    owners = np.repeat(np.arange(len(sizes)), sizes)
-    return entries, np.repeat(ids, counts), np.repeat(owners, counts)
+    # First of each index, then of each of its entries.
+    chunks = np.arange(len(piece.chunks)).repeat(reader.table.map_sizes[piece.numbers])
+    chunks, ids, starts = chunks.repeat(counts), ids.repeat(counts), piece.bounds
+    if (entries["offset"] >= np.diff(starts)[chunks]).any():
+        return None
+    offsets, times = entries["offset"] + starts[chunks], entries["log_time"]
+    if (offsets[1:] < offsets[:-1]).any():
+        order = np.argsort(offsets, kind="stable")
+        offsets, ids, times = offsets[order], ids[order], times[order]
+    return _JointIndex(offsets, ids, times)
 
 
 def _heads(
