@@ -237,6 +237,7 @@ def _short_episodes(folder: Path) -> Table:
         [
             Side(OURS, lambda: mcaprl.open(path)),
             Side(PLAIN, _plain(path)),
+            Side("checking it", lambda: check_log(path)),
             Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(path)),
         ],
     )
@@ -288,6 +289,7 @@ def _interleaved(folder: Path, data: mcaprl.Dataset) -> Table:
             Side(OURS, lambda: mcaprl.open(path)),
             Side(PLAIN, _plain(path)),
             Side(LEAST_WORK, _least_work(path)),
+            Side("checking it", lambda: check_log(path)),
             Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         ],
         goal="70 % of plain zstd's speed",
