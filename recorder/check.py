@@ -28,6 +28,7 @@ from mcaprl.recorder.chunks import Scratch
 from mcaprl.recorder.episode_check import EpisodeCheck
 from mcaprl.recorder.joined import packed
 from mcaprl.recorder.mcap_reader import McapReader
+from mcaprl.recorder.mcap_records import is_intact_attachment
 from mcaprl.recorder.message_records import RECORD_HEADER_BYTES
 
 
@@ -141,7 +142,7 @@ def _check_file(reader: McapReader) -> list[Contradiction]:
         )
     end = None
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
-        if opcode == Opcode.ATTACHMENT and not _is_intact(content):
+        if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):
             found.append(Contradiction("an attachment does not match its CRC", f"byte {offset}"))
         if opcode == Opcode.DATA_END:
             end = offset
@@ -163,11 +164,6 @@ def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> lis
         where = f"bytes 0 to {offset}"
         return [Contradiction("the data section does not match its CRC", where)]
     return []
-
-
-def _is_intact(content: memoryview) -> bool:
-    (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
-    return not crc or crc32(content[:-4]) == crc
 
 
 def _recover(path: Path) -> str:

@@ -21,10 +21,12 @@ from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    index_bounds,
     message_index,
-    message_indexes,
+    parts_of,
     windows,
 )
+from mcaprl.recorder.message_spans import joined_index
 
 # What the header of a chunk and the summary both tell.
 _TOLD = ("start_time", "end_time", "raw_bytes")
@@ -153,12 +155,11 @@ def _joint_index(reader: McapReader, piece: Piece) -> _JointIndex | None:
     """All indexes of a piece as one; None if one is damaged, or points outside of its chunk."""
     ids, places = reader.table.places_of_indexes(piece.numbers)
     try:
-        indexes = message_indexes(reader.view, places.tolist(), ids.tolist())
+        begin_end = index_bounds(reader.view, places.tolist(), ids.tolist())
     except CorruptLogError:
         return None
-    joined = indexes[0] if len(indexes) == 1 else bytearray().join(indexes)
-    entries = np.frombuffer(joined, INDEX_ENTRY)
-    counts = np.array([len(index) // INDEX_ENTRY.itemsize for index in indexes], np.int64)
+    entries = joined_index(parts_of(reader.view, begin_end))
+    counts = (begin_end[:, 1] - begin_end[:, 0]) // INDEX_ENTRY.itemsize
     # First of each index, then of each of its entries.
     chunks = np.arange(len(piece.chunks)).repeat(reader.table.map_sizes[piece.numbers])
     chunks, ids, starts = chunks.repeat(counts), ids.repeat(counts), piece.bounds

@@ -6,6 +6,7 @@ them; the rest are decoded one by one. Which way a message went cannot be seen i
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,8 +23,8 @@ from mcaprl.recorder.joined import Chosen, join, neighbors
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.message_spans import Span, joined_index, joined_spans
 
-# Indexes of fewer entries are joined to so many: each by itself costs as much as some hundred.
-_ENTRIES_AT_ONCE = 2**12
+# Shorter indexes are joined to so much: each by itself costs as much as some hundred entries.
+_BYTES_AT_ONCE = 2**16
 LOG_TIME = "log_time"
 
 
@@ -64,8 +65,8 @@ class Topic:
     def times(self) -> NDArray[np.int64]:
         """(N,) log_time of each message in the order of its channels and of the file."""
         times, start = np.empty(len(self), np.int64), 0
-        for spans in _groups(self.spans):
-            index = spans[0].index if len(spans) == 1 else joined_index(spans)
+        for entries in _groups(self.spans.entries()):
+            index = joined_index(entries)
             times[start : start + len(index)] = index["log_time"]
             start += len(index)
         if (times < 0).any():
@@ -125,13 +126,14 @@ class Topic:
             CorruptLogError: a chunk is damaged, or a message does not fit its type.
             LogError: a field has not the same shape in all messages.
         """
-        parts = list(self._all() if order is None else self._chosen(order))
-        if not parts:
+        parts = self._all() if order is None else self._chosen(order)
+        first = next(parts, None)
+        if first is None:
             return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
         local = threading.local()
         local.scratch = self._scratch
         count = len(self) if order is None else len(order)
-        first, span, _ = parts[0]
+        times = self.times if order is None else np.empty(count, np.int64)
 
         def fill(together: list[Chosen]) -> None:
             if not hasattr(local, "scratch"):
@@ -146,10 +148,15 @@ class Topic:
                 records = self._reader.records_of(one.span, scratch)
                 one.decoder.fill(columns, records, one.span.index, one.rows)
 
+        def visit(together: list[Chosen]) -> None:
+            fill(together)
+            for one in together if order is not None else ():
+                times[one.rows] = one.span.index["log_time"]
+
         with self._reading:
-            columns = first.empty_columns(wanted, count, span, self._scratch)
-            _for_each(fill, list(neighbors(parts)), threads)
-        return {LOG_TIME: self.times if order is None else _times_of(parts, len(order)), **columns}
+            columns = first.decoder.empty_columns(wanted, count, first.span, self._scratch)
+            _for_each(visit, neighbors(itertools.chain([first], parts)), threads)
+        return {LOG_TIME: times, **columns}
 
     def _all(self) -> Iterator[Chosen]:
         stops = self._stops.tolist()
@@ -173,30 +180,25 @@ class Topic:
             yield Chosen(self._decoders[int(self._owners[number])], span, rows)
 
 
-def _groups(spans: Iterable[Span]) -> Iterator[list[Span]]:
-    """Spans that follow each other: one with many entries, or several."""
-    group: list[Span] = []
-    entries = 0
-    for span in spans:
-        group.append(span)
-        entries += len(span)
-        if entries >= _ENTRIES_AT_ONCE:
+def _groups(indexes: Iterable[memoryview]) -> Iterator[list[memoryview]]:
+    """Indexes that follow each other: one with many entries, or several."""
+    group: list[memoryview] = []
+    size = 0
+    for entries in indexes:
+        group.append(entries)
+        size += len(entries)
+        if size >= _BYTES_AT_ONCE:
             yield group
-            group, entries = [], 0
+            group, size = [], 0
     if group:
         yield group
 
 
-def _times_of(parts: list[Chosen], count: int) -> NDArray[np.int64]:
-    times = np.empty(count, np.int64)
-    for chosen in parts:
-        times[chosen.rows] = chosen.span.index["log_time"]
-    return times
-
-
-def _for_each(do: Callable[[list[Chosen]], None], parts: list[list[Chosen]], threads: int) -> None:
+def _for_each(
+    do: Callable[[list[Chosen]], None], parts: Iterable[list[Chosen]], threads: int
+) -> None:
     """Call for each part, `threads` at a time; the first error ends it."""
-    if threads <= 1 or len(parts) == 1:
+    if threads <= 1:
         for part in parts:
             do(part)
         return

@@ -66,7 +66,7 @@ class EpisodeCheck:
         records, starts = piece.records, piece.bounds[:-1]
         for decoder, places in self._places_in(piece).items():
             numbers, spans, wheres = zip(*places, strict=True)
-            index = joined_index(spans)
+            index = joined_index(span.entries for span in spans)
             index["offset"] += np.repeat(starts[list(numbers)], list(map(len, spans)))
             first, last = wheres[0], wheres[-1]
             if isinstance(first, slice):

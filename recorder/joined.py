@@ -99,7 +99,7 @@ def join(
     spans = [one.span for one in together]
     chunks = [span.chunk for span in spans if span.chunk is not None]
     records, stops = side_by_side(reader, chunks, scratch)
-    counts, index = list(map(len, spans)), joined_index(spans)
+    counts, index = list(map(len, spans)), joined_index(span.entries for span in spans)
     starts = np.repeat(np.array([0, *stops[:-1]], np.uint64), counts)
     room = np.repeat(np.array(stops, np.uint64), counts) - starts
     if (room < MESSAGE_HEADER.itemsize).any() or (

@@ -15,6 +15,7 @@ from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.checksum import crc32
@@ -32,6 +34,7 @@ from mcaprl.recorder.mcap_records import (
     RECORD_HEADER,
     ChunkContents,
     LooseMessages,
+    attachment_of,
     contents_of,
     footer_of,
     map_file,
@@ -153,22 +156,28 @@ class McapReader:
             if spans is not None and int(spans.counts.sum()) == told:
                 return spans
             unsure = table.unsure(is_complete=self.complete)
-            by_index = indexed_spans(self.view, table, indexes, unsure, channel.id)
-        for number, chunk in zip(unsure.tolist(), table.some(unsure), strict=True):
-            index = self._contents_of(chunk).indexes.get(channel.id)
-            if index is not None:
-                by_index[number] = Span.of_index(chunk, index)
-        found = [span for _, span in sorted(by_index.items())]
-        loose = self._loose_indexes.get(channel.id)
-        if loose is not None:
-            found.append(Span.of_index(None, loose))
-        count = sum(map(len, found))
+            numbers, spans = indexed_spans(self.view, table, indexes, unsure, channel.id)
+        others = list(self._unindexed(channel.id, unsure))
+        if others:
+            every = sorted([*zip(numbers.tolist(), spans, strict=True), *others], key=itemgetter(0))
+            spans = Spans.of([span for _, span in every])
+        count = int(spans.counts.sum())
         if told not in (None, count):
             raise CorruptLogError(
                 f"{self.path}: the summary tells of {told} messages of {channel.topic}, its indexes"
                 f" of {count}"
             )
-        return Spans.of(found)
+        return spans
+
+    def _unindexed(self, channel_id: int, unsure: NDArray[np.int64]) -> Iterator[tuple[int, Span]]:
+        """What is in chunks of these numbers, and behind that what is in none."""
+        for number, chunk in zip(unsure.tolist(), self.table.some(unsure), strict=True):
+            index = self._contents_of(chunk).indexes.get(channel_id)
+            if index is not None:
+                yield number, Span.of_index(chunk, index)
+        loose = self._loose_indexes.get(channel_id)
+        if loose is not None:
+            yield len(self.table), Span.of_index(None, loose)
 
     def records_of(self, span: Span, scratch: Scratch | None = None) -> memoryview:
         """The bytes that the offsets of a span's index point into; see `chunk_records`.
@@ -235,20 +244,10 @@ class McapReader:
         """The last attachment of a name; None if there is none.
 
         Raises:
-            CorruptLogError: it does not match its CRC.
+            CorruptLogError: it is damaged.
         """
-        found = None
-        for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
-            if opcode == Opcode.ATTACHMENT:
-                attachment = self._parse(opcode, content, offset)
-                if attachment.name == name:
-                    (crc,) = struct.unpack("<I", content[-4:])
-                    if crc and crc32(content[:-4]) != crc:
-                        raise CorruptLogError(f"{self.path}: attachment {name} is damaged")
-                    found = bytes(attachment.data)
-            if opcode == Opcode.DATA_END:
-                break
-        return found
+        with self._named():
+            return attachment_of(self.view, name)
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.

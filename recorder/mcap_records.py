@@ -132,6 +132,31 @@ def parse_record(opcode: int, content: memoryview) -> Any:
         raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
 
 
+def attachment_of(view: memoryview, name: str) -> bytes | None:
+    """The last attachment of a name in a file; None if there is none.
+
+    Raises:
+        CorruptLogError: it is damaged.
+    """
+    found = None
+    for offset, opcode, content in records_of(view, len(MCAP0_MAGIC)):
+        if opcode == Opcode.DATA_END:
+            break
+        if opcode == Opcode.ATTACHMENT:
+            attachment: Attachment = parse_record(opcode, content)
+            if attachment.name == name:
+                if not is_intact_attachment(content):
+                    raise CorruptLogError(f"the attachment {name} at byte {offset} is damaged")
+                found = bytes(attachment.data)
+    return found
+
+
+def is_intact_attachment(content: memoryview) -> bool:
+    """Whether an Attachment record matches its CRC, if it has one."""
+    (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
+    return not crc or crc32(content[:-4]) == crc
+
+
 @dataclass
 class LooseMessages:
     """Messages that were found without an index, by channel id, in the order of the file."""

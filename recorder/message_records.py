@@ -8,7 +8,7 @@ structured array of `record_dtype(payload)`; the rows of a MessageIndex are one 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -111,12 +111,28 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> memoryview:
     raise CorruptLogError(f"no message index of channel {channel_id} at byte {offset}")
 
 
-def message_indexes(
+def index_bounds(
     file: memoryview, offsets: Sequence[int], channel_ids: Sequence[int]
-) -> list[memoryview]:
-    """Those of the MessageIndex records at several offsets, all looked at together; likewise."""
+) -> NDArray[np.int64]:
+    """Where the entries of MessageIndex records at several offsets begin and end.
+
+    Args:
+        file: the bytes of the file.
+        offsets: N of them.
+        channel_ids: whose each must be.
+
+    Returns:
+        (N, 2).
+
+    Raises:
+        CorruptLogError: there is no such record.
+    """
     if len(offsets) < FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
-        return [message_index(file, *place) for place in zip(offsets, channel_ids, strict=True)]
+        found = []
+        for offset, channel_id in zip(offsets, channel_ids, strict=True):
+            start = offset + INDEX_HEAD.itemsize
+            found.append((start, start + len(message_index(file, offset, channel_id))))
+        return np.array(found, np.int64).reshape(-1, 2)
     starts = np.array(offsets, np.int64)
     heads = windows(file, starts, INDEX_HEAD)
     starts += INDEX_HEAD.itemsize
@@ -125,8 +141,14 @@ def message_indexes(
     is_wrong |= (heads["entries_bytes"] % INDEX_ENTRY.itemsize != 0) | (stops > len(file))
     if is_wrong.any():
         wrong = int(np.argmax(is_wrong))
-        return [message_index(file, offsets[wrong], channel_ids[wrong])]
-    return [file[start:stop] for start, stop in zip(starts.tolist(), stops.tolist(), strict=True)]
+        # Says what is wrong.
+        message_index(file, offsets[wrong], channel_ids[wrong])
+    return np.stack([starts, stops], axis=1)
+
+
+def parts_of(file: memoryview, bounds: NDArray[np.int64]) -> Iterator[memoryview]:
+    """The bytes between bounds (N, 2)."""
+    return (file[start:stop] for start, stop in bounds.tolist())
 
 
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.recorder.chunk_table import ChunkTable, Indexes
-from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD, message_indexes
+from mcaprl.recorder.message_records import INDEX_ENTRY, INDEX_HEAD, index_bounds, parts_of
 
 # The indexes of smaller chunks stand so close that they are sooner read all at once.
 _LARGE_CHUNK_BYTES = 2**16
@@ -60,10 +60,10 @@ class Span:
         return self._count
 
 
-def joined_index(spans: Iterable[Span]) -> NDArray[Any]:
-    """A copy of the entries of all spans: `message_records.INDEX_ENTRY`."""
+def joined_index(entries: Iterable[memoryview]) -> NDArray[Any]:
+    """A copy of the entries of several spans: `message_records.INDEX_ENTRY`."""
     # As bytes: to NumPy each array of structures is a negotiation about their fields.
-    return np.frombuffer(bytearray().join([span.entries for span in spans]), INDEX_ENTRY)
+    return np.frombuffer(bytearray().join(entries), INDEX_ENTRY)
 
 
 class Spans(Iterable[Span]):
@@ -74,17 +74,20 @@ class Spans(Iterable[Span]):
         are_in_order: whether all are in chunks, and none of these begins before the one in front
             of it ends.
         some: makes the spans of these numbers.
+        entries: gives those of all spans, which are not made for that.
     """
 
     def __init__(
         self,
         counts: NDArray[np.int64],
         some: Callable[[NDArray[np.int64]], Iterator[Span]],
+        entries: Callable[[], Iterator[memoryview]],
         *,
         are_in_order: bool,
     ) -> None:
         """Note how they are made."""
-        self.counts, self.some, self.are_in_order = counts, some, are_in_order
+        self.counts, self.some, self.entries = counts, some, entries
+        self.are_in_order = are_in_order
 
     @classmethod
     def of(cls, spans: Sequence[Span]) -> Self:
@@ -95,6 +98,7 @@ class Spans(Iterable[Span]):
         return cls(
             np.array(list(map(len, spans)), np.int64),
             lambda numbers: (spans[number] for number in numbers.tolist()),
+            lambda: (span.entries for span in spans),
             are_in_order=len(chunks) == len(spans) and all(map(le, ends, starts)),
         )
 
@@ -139,8 +143,10 @@ def told_spans(
         for chunk, (offset, count) in zip(table.some(numbers[of]), places, strict=True):
             yield Span(chunk, count, partial(index_at, offset, count))
 
-    are_in_order = bool((rows["end_time"][:-1] <= rows["start_time"][1:]).all())
-    return Spans(counts, some, are_in_order=are_in_order)
+    def entries() -> Iterator[memoryview]:
+        return map(index_at, offsets.tolist(), counts.tolist())
+
+    return Spans(counts, some, entries, are_in_order=_are_in_order(rows))
 
 
 def indexed_spans(
@@ -149,8 +155,8 @@ def indexed_spans(
     indexes: Indexes,
     unsure: NDArray[np.int64],
     channel_id: int,
-) -> dict[int, Span]:
-    """A channel's messages by the indexes that the file has of them: by the number of the chunk.
+) -> tuple[NDArray[np.int64], Spans]:
+    """A channel's messages by the indexes that the file has of them; the numbers of the chunks.
 
     Args:
         view: of the file.
@@ -166,6 +172,16 @@ def indexed_spans(
     if len(unsure):
         is_sure = ~np.isin(numbers, unsure)
         numbers, offsets = numbers[is_sure], offsets[is_sure]
-    entries = message_indexes(view, offsets.tolist(), [channel_id] * len(offsets))
-    spans = map(Span.of_entries, table.some(numbers), entries)
-    return dict(zip(numbers.tolist(), spans, strict=True))
+    bounds = index_bounds(view, offsets.tolist(), [channel_id] * len(offsets))
+
+    def some(of: NDArray[np.int64]) -> Iterator[Span]:
+        return map(Span.of_entries, table.some(numbers[of]), parts_of(view, bounds[of]))
+
+    counts = (bounds[:, 1] - bounds[:, 0]) // INDEX_ENTRY.itemsize
+    is_ordered = _are_in_order(table.rows[numbers])
+    return numbers, Spans(counts, some, partial(parts_of, view, bounds), are_in_order=is_ordered)
+
+
+def _are_in_order(rows: NDArray[Any]) -> bool:
+    """Whether no chunk begins before the one in front of it ends."""
+    return bool((rows["end_time"][:-1] <= rows["start_time"][1:]).all())

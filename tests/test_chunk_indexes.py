@@ -23,7 +23,7 @@ from mcaprl.recorder.chunk_table import ChunkTable
 from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import RECORD_HEADER, records_of, runs_of
 from mcaprl.recorder.mcap_summary import Summary
-from mcaprl.recorder.message_records import message_index, message_indexes
+from mcaprl.recorder.message_records import index_bounds, message_index, parts_of
 from tests.recordings import MIXED_SPACE, record
 
 _U8 = st.integers(0, 2**64 - 1)
@@ -154,7 +154,10 @@ def test_of_many_message_indexes_the_wrong_one_is_named() -> None:
     record = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(entries), 7, len(entries)) + entries
     data = bytearray(record * 20)
     places = [number * len(record) for number in range(20)]
-    assert [bytes(e) for e in message_indexes(memoryview(data), places, [7] * 20)] == [entries] * 20
+    view = memoryview(bytes(data))
+    for count in (3, 20):
+        bounds = index_bounds(view, places[:count], [7] * count)
+        assert [bytes(found) for found in parts_of(view, bounds)] == [entries] * count
     for offset, value in ((0, 9), (9, 8), (11, 31), (11, 255)):
         spoilt = bytearray(data)
         spoilt[places[13] + offset] = value
@@ -163,8 +166,8 @@ def test_of_many_message_indexes_the_wrong_one_is_named() -> None:
         with pytest.raises(CorruptLogError) as alone:
             message_index(view, places[13], 7)
         with pytest.raises(CorruptLogError) as together:
-            message_indexes(view, places[:14], [7] * 14)
+            index_bounds(view, places[:14], [7] * 14)
         assert str(together.value) == str(alone.value)
     for beyond in (5000, 2**63, 2**64 - 1):
         with pytest.raises(CorruptLogError, match=f"at byte {beyond}"):
-            message_indexes(memoryview(data), [*places, beyond], [7] * 21)
+            index_bounds(memoryview(data), [*places, beyond], [7] * 21)
