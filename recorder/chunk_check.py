@@ -21,9 +21,11 @@ from mcaprl.recorder.message_records import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    are_messages,
     index_bounds,
     message_index,
     parts_of,
+    record_dtype,
     windows,
 )
 from mcaprl.recorder.message_spans import joined_index
@@ -123,14 +125,10 @@ def _is_sound(reader: McapReader, piece: Piece) -> bool:
     begin_alike = firsts[-1] < len(sizes) and (index.offsets[firsts] == bounds[:-1]).all()
     if not begin_alike or (sizes < MESSAGE_HEADER.itemsize).any():
         return False
-    heads, times = _heads(piece.records, index.offsets, sizes), index.log_times
-    told = reader.table.rows[piece.numbers]
+    times, told = index.log_times, reader.table.rows[piece.numbers]
     headers = windows(reader.view, told["offset"], CHUNK_HEAD)
     return bool(
-        (heads["length"] == sizes - np.uint64(RECORD_HEADER_BYTES)).all()
-        and (heads["opcode"] == Opcode.MESSAGE).all()
-        and (heads["channel_id"] == index.channel_ids).all()
-        and (heads["log_time"] == times).all()
+        _are_told(piece.records, index, sizes)
         and (headers["start_time"] == np.minimum.reduceat(times, firsts)).all()
         and (headers["end_time"] == np.maximum.reduceat(times, firsts)).all()
         and all((headers[name] == told[name]).all() for name in _TOLD)
@@ -160,25 +158,33 @@ def _joint_index(reader: McapReader, piece: Piece) -> _JointIndex | None:
         return None
     entries = joined_index(parts_of(reader.view, begin_end))
     counts = (begin_end[:, 1] - begin_end[:, 0]) // INDEX_ENTRY.itemsize
-    # First of each index, then of each of its entries.
+    # In which chunk each index is; then, for each of its entries, where that begins and its length.
     chunks = np.arange(len(piece.chunks)).repeat(reader.table.map_sizes[piece.numbers])
-    chunks, ids, starts = chunks.repeat(counts), ids.repeat(counts), piece.bounds
-    if (entries["offset"] >= np.diff(starts)[chunks]).any():
+    starts = piece.bounds[:-1][chunks].repeat(counts)
+    room = np.diff(piece.bounds)[chunks].repeat(counts)
+    if (entries["offset"] >= room).any():
         return None
-    offsets, times = entries["offset"] + starts[chunks], entries["log_time"]
+    offsets, ids, times = entries["offset"] + starts, ids.repeat(counts), entries["log_time"]
     if (offsets[1:] < offsets[:-1]).any():
         order = np.argsort(offsets, kind="stable")
         offsets, ids, times = offsets[order], ids[order], times[order]
     return _JointIndex(offsets, ids, times)
 
 
-def _heads(
-    records: memoryview, offsets: NDArray[np.uint64], sizes: NDArray[np.uint64]
-) -> NDArray[Any]:
-    """The headers of messages of these sizes that touch each other."""
-    if (sizes == sizes[0]).all():
-        return np.ndarray(len(sizes), MESSAGE_HEADER, records, strides=(int(sizes[0]),))
-    return windows(records, offsets, MESSAGE_HEADER)
+def _are_told(records: memoryview, index: _JointIndex, sizes: NDArray[np.uint64]) -> bool:
+    """Whether what is there are messages of these sizes, as the index tells of them."""
+    ids, times, size = index.channel_ids, index.log_times, int(sizes[0])
+    if (sizes == size).all() and (ids == ids[0]).all():
+        payload = np.dtype((np.void, size - MESSAGE_HEADER.itemsize))
+        heads = np.frombuffer(records, record_dtype(payload))
+        return are_messages(heads, int(ids[0])) and bool((heads["log_time"] == times).all())
+    heads = windows(records, index.offsets, MESSAGE_HEADER)
+    return bool(
+        (heads["length"] == sizes - np.uint64(RECORD_HEADER_BYTES)).all()
+        and (heads["opcode"] == Opcode.MESSAGE).all()
+        and (heads["channel_id"] == ids).all()
+        and (heads["log_time"] == times).all()
+    )
 
 
 def _check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Contradiction]:

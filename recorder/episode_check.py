@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from mcaprl.recorder.chunk_check import Contradiction, Piece
 from mcaprl.recorder.columns import LOG_TIME, Topic
 from mcaprl.recorder.decoder import Columns, Decoder
 from mcaprl.recorder.episode import Episode
-from mcaprl.recorder.episodes import COUNTERS, Told, episode_lengths, summaries
+from mcaprl.recorder.episodes import COUNTERS, Told, episode_lengths, of_records, summaries
 from mcaprl.recorder.log_reader import LogReader, described
 from mcaprl.recorder.log_writer import EPISODE_TOPIC, STEP_TOPIC, EpisodeSummary
 from mcaprl.recorder.mcap_reader import McapReader
@@ -168,22 +169,24 @@ class EpisodeCheck:
         if len(told) not in (0, len(lengths)):
             yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
         whole = summaries(self._reader.path, columns, lengths, told)
-        for number, (final, summary) in enumerate(zip(finals.tolist(), whole, strict=True)):
-            rows = slice(final - summary.length, final)
-            yield from _check_summary(summary, number, {n: c[rows] for n, c in columns.items()})
+        actual = of_records(columns, finals, lengths)
+        for number, summary_and_actual in enumerate(zip(whole, actual, strict=True)):
+            yield from _check_summary(number, *summary_and_actual)
 
 
-def _check_summary(summary: EpisodeSummary, number: int, rows: Columns) -> Iterator[Contradiction]:
+def _check_summary(
+    number: int, told: EpisodeSummary, actual: EpisodeSummary
+) -> Iterator[Contradiction]:
     pairs = [
-        ("a return", summary.total_reward, add_up(rows["reward"])),
-        ("a start", summary.start_time_ns, int(rows[LOG_TIME][0])),
-        ("terminated", summary.terminated, bool(rows["terminated"][-1])),
-        ("truncated", summary.truncated, bool(rows["truncated"][-1])),
+        ("a return", told.total_reward, actual.total_reward),
+        ("a start", told.start_time_ns, actual.start_time_ns),
+        ("terminated", told.terminated, actual.terminated),
+        ("truncated", told.truncated, actual.truncated),
     ]
-    for name, told, actual in pairs:
-        if told != actual and not np.isnan(actual):
+    for name, claim, fact in pairs:
+        if claim != fact and not math.isnan(fact):
             yield Contradiction(
-                f"{EPISODE_TOPIC} tells {name} of {told}, its records {actual}", f"episode {number}"
+                f"{EPISODE_TOPIC} tells {name} of {claim}, its records {fact}", f"episode {number}"
             )
 
 

@@ -145,7 +145,7 @@ def summaries(
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()
     untold = np.array([end not in by_end for end in ends], bool)
-    summed_up = _of_records(columns, finals[untold], lengths[untold])
+    summed_up = of_records(columns, finals[untold], lengths[untold])
     found = []
     for end, length in zip(ends, lengths.tolist(), strict=True):
         summary = by_end[end] if end in by_end else next(summed_up)
@@ -158,10 +158,10 @@ def summaries(
     return tuple(found)
 
 
-def _of_records(
+def of_records(
     columns: Columns, finals: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[EpisodeSummary]:
-    """Summaries of the episodes that end with these records."""
+    """Summaries of the episodes that end with these records, as far as records tell."""
     firsts = finals - lengths
     lasts = np.maximum(finals - 1, firsts)
     rewards = columns["reward"].astype(np.float64, copy=False)
