@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import cycle, islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -121,9 +121,10 @@ def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Cal
     with ThreadPoolExecutor(threads) as pool:
         ahead = deque[tuple[slice, Future[Piece]]]()
         # One for each thread, and one at hand: memory does not grow with the file.
+        scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
             for numbers in islice(pieces, threads + 1 - len(ahead)):
-                ahead.append((numbers, pool.submit(Piece.read, reader, numbers, Scratch())))
+                ahead.append((numbers, pool.submit(Piece.read, reader, numbers, next(scratches))))
             if not ahead:
                 return
             numbers, future = ahead.popleft()

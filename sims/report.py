@@ -59,7 +59,9 @@ def comparison_figure(
             label += f"   score {score.normalized_score:.2f}"
         # Behind the longest of bar, interval and dots.
         end = max(high, 0.0, float(means.max()))
-        axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
+        text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
+        # The line of the behavior in the log may run through it.
+        text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
     axes.set_yticks(range(len(scores)), [score.policy for score in scores])
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
