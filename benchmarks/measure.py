@@ -13,6 +13,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
+# Sides that go message by message do this share of it, and are scaled up: a turn of each takes some
+# tenths of a second, so that all have many, and a disturbance spoils but one.
+SLOW_SHARE = 0.1
+SLOWEST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -109,3 +113,17 @@ def compare(
     table.ratios = {name: taken / times[ours] for name, taken in times.items()}
     print(table.to_markdown(), flush=True)
     return table
+
+
+def after(prepare: Callable[[], object], run: Callable[[], object]) -> Callable[[], object]:
+    """A run that needs something prepared; an ImportError there is told when it runs."""
+    try:
+        prepare()
+    except ImportError as error:
+        reason = str(error)
+
+        def fail() -> object:
+            raise ImportError(reason)
+
+        return fail
+    return run

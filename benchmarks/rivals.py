@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,16 @@ from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
-from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import ChunkHeader, chunk_header
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import map_file
 from mcaprl.recorder.schema import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)
-COLUMNS = ("observation", "action", "reward")
+Fields = dict[str, tuple[str, ...]]
+"""What is read, by topic."""
+Span = tuple[int | None, int | None]
+"""First log_time, and the one behind the last, in nanoseconds; None for all."""
+DEPTH = "/rl/observation/depth"
+VECTOR_FIELDS: Fields = {"/rl/step": ("observation", "action", "reward")}
+IMAGE_FIELDS: Fields = {"/rl/step": ("observation_state", "action", "reward"), DEPTH: ("data",)}
 
 
 def messages(data: mcaprl.Dataset) -> list[bytes]:
@@ -98,34 +99,48 @@ def write_rosbags(encoded: list[bytes], folder: Path) -> None:
 
 
 def read_mcap(
-    path: Path, start_ns: int | None = None, stop_ns: int | None = None
+    path: Path, fields: Fields = VECTOR_FIELDS, span_ns: Span = (None, None)
 ) -> dict[str, NDArray[Any]]:
     """By mcap and mcap-ros2-support, message by message."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    columns, (start, stop) = _empty(fields), span_ns
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        found = reader.iter_decoded_messages(["/rl/step"], start_time=start_ns, end_time=stop_ns)
-        for _, _, _, message in found:
-            for name, values in columns.items():
-                values.append(getattr(message, name))
-    return {name: np.array(values) for name, values in columns.items()}
+        found = reader.iter_decoded_messages(list(fields), start_time=start, end_time=stop)
+        for _, channel, _, message in found:
+            for name in fields[channel.topic]:
+                columns[name].append(getattr(message, name))
+    return _as_arrays(columns)
 
 
-def read_rosbags(path: Path) -> dict[str, NDArray[Any]]:
+def read_rosbags(
+    path: Path, fields: Fields = VECTOR_FIELDS, span_ns: Span = (None, None)
+) -> dict[str, NDArray[Any]]:
     """By rosbags, message by message."""
     from rosbags.highlevel import AnyReader
 
-    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    columns, (start, stop) = _empty(fields), span_ns
     with AnyReader([path]) as bag:
-        wanted = [connection for connection in bag.connections if connection.topic == "/rl/step"]
-        for connection, _, raw in bag.messages(connections=wanted):
+        wanted = [connection for connection in bag.connections if connection.topic in fields]
+        for connection, _, raw in bag.messages(wanted, start, stop):
             message = bag.deserialize(raw, connection.msgtype)
-            for name, values in columns.items():
-                values.append(getattr(message, name))
-    return {name: np.array(values) for name, values in columns.items()}
+            for name in fields[connection.topic]:
+                columns[name].append(getattr(message, name))
+    return _as_arrays(columns)
+
+
+def _empty(fields: Fields) -> dict[str, list[Any]]:
+    return {name: [] for names in fields.values() for name in names}
+
+
+def _as_arrays(columns: dict[str, list[Any]]) -> dict[str, NDArray[Any]]:
+    # mcap-ros2-support gives pictures as bytes.
+    return {
+        name: np.array([np.frombuffer(v, np.uint8) if isinstance(v, bytes) else v for v in values])
+        for name, values in columns.items()
+    }
 
 
 class MinariFolder:
@@ -155,12 +170,12 @@ class MinariFolder:
         import minari
         from minari.data_collector import EpisodeBuffer
 
-        name = f"bench/write-{data_format}-v0"
+        name = self.name(data, data_format)
         shutil.rmtree(self._folder / name, ignore_errors=True)
         buffers = [
             EpisodeBuffer(
                 id=episode.index,
-                observations=np.concatenate([episode.observations, episode.next_observations[-1:]]),
+                observations=_frames(episode.observations, episode.next_observations),
                 actions=episode.actions,
                 rewards=episode.rewards,
                 terminations=episode.terminated,
@@ -172,21 +187,39 @@ class MinariFolder:
         minari.create_dataset_from_buffers(
             name,
             buffers,
-            observation_space=OBSERVATION,
-            action_space=ACTION,
+            observation_space=data.observation_space,
+            action_space=data.action_space,
             data_format=data_format,
         )
         return name
 
-    def read(self, name: str) -> list[NDArray[Any]]:
-        """Read all observations, actions and rewards into arrays."""
+    def name(self, data: mcaprl.Dataset, data_format: str) -> str:
+        """Of a dataset that `write` writes."""
+        what = "images" if isinstance(data.observations, dict) else "vectors"
+        return f"bench/{what}-{data_format}-v0"
+
+    def read(self, name: str, episodes: list[int] | None = None) -> list[Any]:
+        """Read observations, actions and rewards into arrays; default: of all episodes."""
         import minari
 
-        episodes = list(minari.load_dataset(name).iterate_episodes())
+        found = list(minari.load_dataset(name).iterate_episodes(episodes))
         return [
-            np.concatenate([getattr(episode, column) for episode in episodes])
+            _joined([getattr(episode, column) for episode in found])
             for column in ("observations", "actions", "rewards")
         ]
+
+
+def _frames(observations: Any, following: Any) -> Any:
+    """As Minari has them: one more than steps."""
+    if isinstance(observations, dict):
+        return {name: _frames(observations[name], following[name]) for name in observations}
+    return np.concatenate([observations, following[-1:]])
+
+
+def _joined(parts: list[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return np.concatenate(parts)
 
 
 class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
@@ -198,8 +231,9 @@ class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
     """What the table formats store: the next observations are the next rows'."""
+    here = data.observations
     return {
-        "observation": data.observations,
+        **(here if isinstance(here, dict) else {"observation": here}),
         "action": data.actions,
         "reward": data.rewards,
         "terminated": data.terminated,
@@ -218,12 +252,12 @@ def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
             )
 
 
-def read_h5py(path: Path) -> dict[str, NDArray[Any]]:
+def read_h5py(path: Path, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
     """By h5py."""
     import h5py
 
     with h5py.File(path) as file:
-        return {name: file[name][:] for name in file}
+        return {name: file[name][rows] for name in file}
 
 
 def write_parquet(data: mcaprl.Dataset, path: Path) -> None:
@@ -258,85 +292,14 @@ def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
 
 def write_npz(data: mcaprl.Dataset, path: Path) -> None:
     """By NumPy, compressed."""
-    columns = columns_of(data)
-    np.savez_compressed(
-        path,
-        observation=columns["observation"],
-        action=columns["action"],
-        reward=columns["reward"],
-        terminated=columns["terminated"],
-        truncated=columns["truncated"],
-    )
+    columns: dict[str, Any] = columns_of(data)
+    np.savez_compressed(path, **columns)
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """By NumPy."""
     with np.load(path) as file:
         return {name: file[name] for name in file.files}
-
-
-def compressed_chunks(
-    path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
-) -> list[memoryview]:
-    """The bytes of the chunks that hold a topic in a time, as they stand in the file."""
-    reader = McapReader(path)
-    ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
-    found = []
-    for chunk in reader.chunks:
-        is_then = chunk.message_start_time < stop_ns and chunk.message_end_time >= start_ns
-        if ids & set(chunk.message_index_offsets) and is_then:
-            start = chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size
-            found.append(reader.view[start : start + chunk.compressed_size])
-    return found
-
-
-def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
-    """Decompress chunks, and nothing else: what no reader can do without."""
-    import zstandard
-
-    for data in chunks:
-        zstandard.decompress(data)
-
-
-def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
-    """Of the chunks that hold a topic."""
-    reader = McapReader(path)
-    ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
-    found = [chunk for chunk in reader.chunks if ids & set(chunk.message_index_offsets)]
-    return [chunk_header(reader.view, chunk.chunk_start_offset) for chunk in found]
-
-
-def least_work(path: Path, headers: Sequence[ChunkHeader]) -> NDArray[np.uint8]:
-    """Map a file, decompress these chunks into new memory, and check them against their CRCs.
-
-    No reader of columns can do without: what it does to find, check and sort messages comes on top.
-    """
-    import zstandard
-
-    decompressor, view = zstandard.ZstdDecompressor(), map_file(path)
-    memory, start = np.empty(sum(header.uncompressed_bytes for header in headers), np.uint8), 0
-    for header in headers:
-        records = memory.data[start : start + header.uncompressed_bytes]
-        with decompressor.stream_reader(view[header.data]) as reader:
-            read = reader.readinto(records)
-        assert (read, crc32(records)) == (len(records), header.crc)
-        start += read
-    return memory
-
-
-def raw_chunks(path: Path, topic: str) -> list[bytes]:
-    """The records of a topic's chunks."""
-    import zstandard
-
-    return [zstandard.decompress(data) for data in compressed_chunks(path, (topic,))]
-
-
-def level_1_chunks(chunks: list[bytes]) -> list[bytes]:
-    """Chunks as zstd's level 1 packs them."""
-    import zstandard
-
-    compressor = zstandard.ZstdCompressor(level=1)
-    return [compressor.compress(records) for records in chunks]
 
 
 def record_bare(episodes: int) -> None:
