@@ -11,12 +11,18 @@ import mcaprl
 from benchmarks import limits, rivals
 from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
-from benchmarks.workloads import EPISODE_STEPS, Constant, images, run_env, vectors
+from benchmarks.workloads import (
+    EPISODE_STEPS,
+    IMAGE_STEPS,
+    Constant,
+    images,
+    run_env,
+    vectors,
+)
 from mcaprl.recorder.check import check_log
 from mcaprl.recorder.log_writer import STEP_TOPIC
 from mcaprl.recorder.schema import message_dtype
 
-IMAGE_STEPS = 20_000
 DEPTH = rivals.DEPTH
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from benchmarks import growth, logs, sims
 from benchmarks.measure import Table
+from benchmarks.workloads import IMAGE_STEPS
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -89,7 +90,7 @@ def write_results(tables: list[Table], transitions: int) -> None:
     versions = ", ".join(f"{name} {_version(name)}" for name in LIBRARIES)
     about = (
         f"The log of vectors has {transitions:,} transitions of 19 float32 in episodes of 1,000;"
-        f" that of images {logs.IMAGE_STEPS:,} of 84x84. Python {platform.python_version()},"
+        f" that of images {IMAGE_STEPS:,} of 84x84. Python {platform.python_version()},"
         f" {versions}.\n\n"
     )
     page = _PAGE + about + "\n".join(table.to_markdown() for table in tables)

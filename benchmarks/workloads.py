@@ -13,7 +13,7 @@ import mcaprl
 OBSERVATION = spaces.Box(-np.inf, np.inf, (19,), np.float32)
 ACTION = spaces.Discrete(9)
 EPISODE_STEPS = 1000
-IMAGE_SHAPE = (84, 84)
+IMAGE_STEPS, IMAGE_SHAPE = 20_000, (84, 84)
 
 
 class Constant(gym.Env[Any, Any]):
