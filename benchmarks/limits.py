@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.recorder.checksum import crc32
 from mcaprl.recorder.chunks import ChunkHeader, chunk_header
@@ -15,7 +14,7 @@ from mcaprl.recorder.mcap_reader import McapReader
 from mcaprl.recorder.mcap_records import map_file
 
 PLAIN = "plain zstd of the same chunks"
-LEAST_WORK = "likewise from the file into new memory, CRCs checked"
+LEAST_WORK = "likewise from the file, CRCs checked"
 
 
 def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
@@ -67,22 +66,20 @@ def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
     return [chunk_header(reader.view, chunk.chunk_start_offset) for chunk in found]
 
 
-def least_work(path: Path, headers: Sequence[ChunkHeader]) -> NDArray[np.uint8]:
-    """Map a file, decompress these chunks into new memory, and check them against their CRCs.
+def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
+    """Map a file, decompress these chunks one after the other, check them against their CRCs.
 
-    No reader of columns can do without: what it does to find, check and sort messages comes on top.
+    No reader can do without: columns in new memory come on top, and finding and checking messages.
     """
     import zstandard
 
     decompressor, view = zstandard.ZstdDecompressor(), map_file(path)
-    memory, start = np.empty(sum(header.uncompressed_bytes for header in headers), np.uint8), 0
+    memory = np.empty(max(header.uncompressed_bytes for header in headers), np.uint8)
     for header in headers:
-        records = memory.data[start : start + header.uncompressed_bytes]
+        records = memory.data[: header.uncompressed_bytes]
         with decompressor.stream_reader(view[header.data]) as reader:
             read = reader.readinto(records)
         assert (read, crc32(records)) == (len(records), header.crc)
-        start += read
-    return memory
 
 
 def raw_chunks(path: Path, topic: str) -> list[bytes]:

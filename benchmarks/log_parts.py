@@ -92,12 +92,14 @@ def _interleaved(folder: Path, data: mcaprl.Dataset) -> Table:
     rivals.write_interleaved(encoded, path)
     rivals.write_interleaved(encoded[: int(len(encoded) * SLOWEST_SHARE)], small)
     del encoded
+    columns = rivals.columns_of(mcaprl.open(path))
     return compare(
         "Reading another writer's log, topics interleaved",
         [
             Side(OURS, lambda: mcaprl.open(path)),
             Side(PLAIN, limits.plain(path)),
             Side(LEAST_WORK, limits.least(path)),
+            Side("memcpy of the columns", lambda: [c.copy() for c in columns.values()]),
             Side("checking it", lambda: check_log(path)),
             Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
             Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),

@@ -35,10 +35,11 @@ Measured by the command below, which also writes this page. All sides of a table
 in turns, on the same data, in one thread; CPU time counts, and the best of several turns. Seconds
 depend on the machine, so there are ratios only. Side by side with ours stand the limits: copies in
 memory; plain decompression of the same chunks by zstd, each into the place of the one before; and
-the least that a reader of columns must do: map the file, decompress into new memory, check CRCs.
+the least that any reader must do: map the file, decompress, check CRCs. Columns in new memory come
+on top of that, for which the copies of them stand.
 
 A goal that is not reached stays where it is. What keeps pictures and other writers' logs from it is
-that least work, and NumPy's pass over a chunk for each check and each column. What keeps a single
+both of these, and NumPy's pass over a chunk for each check and each column. What keeps a single
 episode from it is Python, which finds out what the log holds and where: unpacking its chunk is but
 an eighth of the time. Minari reads one sooner: it is told where each is by HDF5 or Arrow, and
 checks no CRC. foxglove-sdk writes files, and reads none.
