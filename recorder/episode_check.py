@@ -54,7 +54,6 @@ class EpisodeCheck:
             )
             if leaf.encoding is not None
         ]
-        self._found: list[Contradiction] = []
         # What is not of the form in which this library writes is read as any reader does.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
@@ -96,7 +95,6 @@ class EpisodeCheck:
                 dataset = LogReader(self._reader.path).read()
             yield from (found for e in dataset.episodes for found in _check_return(e))
             return
-        yield from self._found
         columns, path = self._columns, str(self._reader.path)
         lengths = episode_lengths(columns, path)
         frames = int(lengths.sum()) + len(lengths)
