@@ -13,8 +13,8 @@ from benchmarks.workloads import vectors
 _READ = """
 import json, sys, time, tracemalloc
 import mcaprl
-from mcaprl.recorder.check import check_log
-from mcaprl.recorder.recover import recover_log
+from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder.repair.recover import recover_log
 path, best = sys.argv[1], {}
 tasks = {
     "seconds": lambda: mcaprl.open(path),

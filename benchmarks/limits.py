@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaprl.recorder.checksum import crc32
-from mcaprl.recorder.chunks import ChunkHeader, chunk_header
-from mcaprl.recorder.log_writer import STEP_TOPIC
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.mcap_records import map_file
+from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.chunks import ChunkHeader, chunk_header
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import map_file
+from mcaprl.recorder.format.topics import STEP_TOPIC
 
 PLAIN = "plain zstd of the same chunks"
 LEAST_WORK = "likewise from the file, CRCs checked"

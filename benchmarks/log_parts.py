@@ -19,9 +19,9 @@ from benchmarks.workloads import (
     run_env,
     vectors,
 )
-from mcaprl.recorder.check import check_log
-from mcaprl.recorder.log_writer import STEP_TOPIC
-from mcaprl.recorder.schema import message_dtype
+from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.repair.check import check_log
 
 DEPTH = rivals.DEPTH
 

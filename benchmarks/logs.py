@@ -12,9 +12,9 @@ from benchmarks import limits, log_parts, rivals
 from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
 from benchmarks.workloads import EPISODE_STEPS, Constant, run_env, vectors
-from mcaprl.recorder.check import check_log
-from mcaprl.recorder.log_writer import STEP_TOPIC
-from mcaprl.recorder.recover import recover_log
+from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder.repair.recover import recover_log
 
 
 def tables(folder: Path, transitions: int) -> list[Table]:

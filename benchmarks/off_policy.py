@@ -5,7 +5,7 @@
 Importance sampling: the six estimators on the same logs as SCOPE-RL's, to the last digits. Fitted Q
 evaluation: beside d3rlpy's DiscreteFQE on the same log, policy and settings, and beside the returns
 that the policy really has in the sim. Coverage: how many of `--logs` logs' 95 % intervals hold the
-true value, on a task whose value follows from linear equations (tests/two_state_task.py).
+true value, on a task whose value follows from linear equations (tests/support/two_state_task.py).
 
 Needs d3rlpy and SCOPE-RL for the first two (`make bench-learning` installs them); what is not
 installed is left out, and said.
@@ -25,10 +25,10 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from mcaprl.offline.fqe import FQEConfig
-from mcaprl.offline.importance import ESTIMATORS, EpisodeTable
-from mcaprl.offline.off_policy import OffPolicyEvaluator
-from tests import two_state_task as task
+from mcaprl.offline.estimate.fqe import FQEConfig
+from mcaprl.offline.estimate.importance import ESTIMATORS, EpisodeTable
+from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+from tests.support import two_state_task as task
 
 SCOPE_RL_NAMES: Final = {
     "TIS": "TrajectoryWiseImportanceSampling",

@@ -27,16 +27,16 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from mcaprl.offline.fqe import FQEConfig
-from mcaprl.offline.off_policy import OffPolicyEvaluator
-from mcaprl.offline.ranking import rank_correlation, regret_at_1
+from mcaprl.offline.estimate.fqe import FQEConfig
+from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+from mcaprl.offline.estimate.ranking import rank_correlation, regret_at_1
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.policy import OnlinePolicy, describe_run, load_policy, save_policy
 from mcaprl.online.task import Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sims
-from mcaprl.sims.rollout import episode_seed
+from mcaprl.sims.evaluation.rollout import episode_seed
 
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8

@@ -31,9 +31,9 @@ from mcaprl.online.task import Task
 from mcaprl.online.train import train as train_online
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sim
-from mcaprl.sims.lane import LaneKeepingEnv
-from mcaprl.sims.pilots import make_pilot
-from mcaprl.sims.rollout import EpsilonGreedy, rollout
+from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
+from mcaprl.sims.lane.env import LaneKeepingEnv
 
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")

@@ -26,15 +26,15 @@ import mcaprl
 from benchmarks.page import write_section
 from benchmarks.sim_data import NAMES, make_logs
 from mcaprl.files import write_json
-from mcaprl.offline.algorithms import ALGORITHMS
-from mcaprl.offline.config import BootstrapConfig
-from mcaprl.offline.dqn import DQNConfig
+from mcaprl.offline.algorithms.config import BootstrapConfig
+from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.policy import load_policies
-from mcaprl.offline.train import train
+from mcaprl.offline.training.train import train
 from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.evaluate import PolicyScore, evaluate, normalize
-from mcaprl.sims.pilots import make_pilot
-from mcaprl.sims.rollout import Policy
+from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize
+from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.evaluation.rollout import Policy
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
 ALGOS: dict[str, tuple[str, dict[str, Any]]] = {

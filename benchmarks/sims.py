@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.measure import Side, Table, compare
 from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.depth import encode_depth
+from mcaprl.sims.drawing.depth import encode_depth
 
 CARS, DRONES, RACERS = 1024, 64, 256
 QUADROTOR_STEPS = 5

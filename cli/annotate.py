@@ -12,9 +12,9 @@ from mcaprl.cli.policies import policy_names, trained_policy
 from mcaprl.cli.replay import sim_of
 from mcaprl.cli.show import counted, progress
 from mcaprl.errors import UsageError
-from mcaprl.recorder.annotate import AnnotatedCopy, values_topics
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.reader import open_logs
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.viewer.annotate import AnnotatedCopy, values_topics
 
 
 @click.command()
@@ -54,7 +54,7 @@ def annotate(
 
 def _values(dataset: Dataset, name: str, gamma: float | None) -> list[tuple[Any, Any]]:
     """Each episode with what the first policy of a run thinks of it."""
-    from mcaprl.offline.values import gamma_of_run, value_columns
+    from mcaprl.offline.estimate.values import gamma_of_run, value_columns
 
     policy: Any = trained_policy(name, dataset)
     discount = gamma_of_run(Path(name)) if gamma is None else gamma

@@ -27,7 +27,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
     for folder in folders:
         if folder in online:
             continue
-        from mcaprl.offline.curves import curve_figures
+        from mcaprl.offline.training.curves import curve_figures
 
         figures += [
             Figure.of(f"{folder.name}: {term}", drawn) for term, drawn in curve_figures(folder)

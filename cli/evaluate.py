@@ -18,12 +18,12 @@ from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.show import counted, print_json, print_table, progress, write_json
 from mcaprl.errors import UsageError, import_extra
-from mcaprl.recorder.reader import find_logs, open_logs
-from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.evaluate import Improvement, PolicyScore, improvements, normalize
-from mcaprl.sims.evaluate import evaluate as evaluate_policy
-from mcaprl.sims.statistics import bootstrap_interval, interquartile_mean
+from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
+from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.statistics import bootstrap_interval, interquartile_mean
 
 RESULT_NAME = "evaluation.json"
 
@@ -229,7 +229,7 @@ def _write_report(
     recorded: tuple[Path, int] | None,
     names: Sequence[str],
 ) -> None:
-    from mcaprl.sims.report import evaluation_page
+    from mcaprl.sims.evaluation.report import evaluation_page
 
     write_json(folder / RESULT_NAME, result)
     logged = result["behavior"]

@@ -13,17 +13,17 @@ import click
 
 from mcaprl.cli.show import counted, print_facts, print_json, size, write_json
 from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
-from mcaprl.recorder.calibration import calibration
-from mcaprl.recorder.check import Problem, check_log
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.lint import Finding, lint
-from mcaprl.recorder.log_layout import attached_layout
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.moments import moments_of
-from mcaprl.recorder.reader import find_logs, open_logs
-from mcaprl.recorder.recover import recover_log
-from mcaprl.recorder.scene import DepthSource
-from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.lint import Finding, lint
+from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.scene import DepthSource
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.recorder.repair.check import Problem, check_log
+from mcaprl.recorder.repair.recover import recover_log
+from mcaprl.recorder.viewer.log_layout import attached_layout
+from mcaprl.recorder.viewer.surprises import moments_of
 from mcaprl.sims import SIMS, make_sim
 
 # What `recover` exits with when something of the old file is missing in the new one.
@@ -66,7 +66,7 @@ def info(
     moments = [moment for path in paths for moment in moments_of(path)]
     facts["moments"] = [asdict(moment) for moment in moments]
     if report is not None:
-        from mcaprl.recorder.report import dataset_page, dataset_picture
+        from mcaprl.recorder.viewer.report import dataset_page, dataset_picture
 
         title = _title(dataset.sources)
         write_json(report / "dataset.json", facts)

@@ -10,12 +10,12 @@ import click
 
 from mcaprl.cli.policies import policy_names, trained_policies
 from mcaprl.cli.show import counted, print_table, progress
-from mcaprl.recorder.calibration import calibration
-from mcaprl.recorder.reader import open_logs
+from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.dataset.open import open_logs
 
 if TYPE_CHECKING:
-    from mcaprl.offline.off_policy import PolicyEstimates, StochasticPolicy
-    from mcaprl.recorder.dataset import Dataset
+    from mcaprl.offline.estimate.off_policy import PolicyEstimates, StochasticPolicy
+    from mcaprl.recorder.dataset.dataset import Dataset
 
 
 def evaluate_from_log(
@@ -42,9 +42,9 @@ def evaluate_from_log(
     Returns:
         What `--json` prints.
     """
-    from mcaprl.offline.fqe import FQEConfig
-    from mcaprl.offline.off_policy import OffPolicyEvaluator
-    from mcaprl.offline.ranking import ranking
+    from mcaprl.offline.estimate.fqe import FQEConfig
+    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+    from mcaprl.offline.estimate.ranking import ranking
 
     dataset = open_logs(data, threads=threads)
     policies = _policies(names, dataset)

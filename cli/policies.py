@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 
 from mcaprl.errors import PolicyError, UnknownNameError, UsageError
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.sims.rollout import Policy, check_fit
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.sims.evaluation.rollout import Policy, check_fit
 
 SCRIPTED = ("pilot", "random")
 
@@ -30,7 +30,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     if name == "random":
         return [None]
     if name == "pilot":
-        from mcaprl.sims.pilots import make_pilot
+        from mcaprl.sims.evaluation.pilots import make_pilot
 
         try:
             return [make_pilot(env)]

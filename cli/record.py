@@ -20,10 +20,10 @@ from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import policies_of, policy_names
 from mcaprl.cli.show import counted, progress, size
 from mcaprl.errors import OutputExistsError, UsageError
-from mcaprl.recorder.mcap_writer import COMPRESSIONS
-from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.recorder.format.writing import COMPRESSIONS
+from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim
-from mcaprl.sims.rollout import EpisodeResult, EpsilonGreedy, rollout
+from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
 
 
 @dataclass(frozen=True)

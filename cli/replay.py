@@ -15,14 +15,14 @@ import gymnasium as gym
 
 from mcaprl.cli.show import counted, progress
 from mcaprl.errors import UsageError
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.live import LiveServer
-from mcaprl.recorder.log_layout import attached_layout
-from mcaprl.recorder.mcap_reader import McapReader
-from mcaprl.recorder.playback import Player, Track
-from mcaprl.recorder.prefix import prefixes_of, side_by_side
-from mcaprl.recorder.reader import find_logs, open_logs
-from mcaprl.recorder.verify import verify
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.viewer.log_layout import attached_layout
+from mcaprl.recorder.viewer.playback import Player, Track
+from mcaprl.recorder.viewer.player_server import LiveServer
+from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
+from mcaprl.recorder.viewer.verify import verify
 from mcaprl.sims import make_sim
 
 
@@ -70,7 +70,7 @@ def replay(
         same = [_verify(path, episode, sim) for path in paths]
         return int(not all(same))
     if video or contact_sheet:
-        from mcaprl.cli.film import make_film
+        from mcaprl.cli.video import make_film
 
         if len(paths) > 1:
             raise UsageError("a film shows one file; give each a film of its own")

@@ -17,7 +17,7 @@ class _TrainCommand(click.Command):
     """Has an option for each setting of the algorithms; loads them when it is asked for options."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        from mcaprl.offline.algorithms import ALGORITHMS
+        from mcaprl.offline.algorithms.registry import ALGORITHMS
 
         configs = [learner.config_type() for learner in ALGORITHMS.values()]
         return [*super().get_params(ctx), *setting_options(configs)]
@@ -76,13 +76,13 @@ def train_offline(
     """
     import torch
 
-    from mcaprl.offline.algorithms import choose_algorithm
-    from mcaprl.offline.curves import draw_curves
-    from mcaprl.offline.follow import GrowingLogs
-    from mcaprl.offline.run_folder import CONFIG_NAME, read_config
-    from mcaprl.offline.sources import open_weighted
-    from mcaprl.offline.summary import describe_seeds
-    from mcaprl.offline.train import train
+    from mcaprl.offline.algorithms.registry import choose_algorithm
+    from mcaprl.offline.batches.sources import open_weighted
+    from mcaprl.offline.training.curves import draw_curves
+    from mcaprl.offline.training.follow import GrowingLogs
+    from mcaprl.offline.training.run_folder import CONFIG_NAME, read_config
+    from mcaprl.offline.training.summary import describe_seeds
+    from mcaprl.offline.training.train import train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}

@@ -15,9 +15,9 @@ from mcaprl.cli.policies import is_policy, load_trained
 from mcaprl.cli.settings import setting_options
 from mcaprl.cli.show import print_table
 from mcaprl.errors import UsageError
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.reader import open_logs
-from mcaprl.sims.rollout import Policy
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.sims.evaluation.rollout import Policy
 
 if TYPE_CHECKING:
     from mcaprl.online.live import LiveTraining
@@ -149,7 +149,7 @@ def train_online(
 def _shown(task: Task, out: Path, port: int) -> Iterator[LiveTraining]:
     """Listen for viewers, and tell the user where."""
     from mcaprl.online.live import LiveTraining
-    from mcaprl.recorder.layout import LAYOUT_NAME
+    from mcaprl.recorder.record.layout import LAYOUT_NAME
 
     with closing(LiveTraining(task, port=port)) as live:
         click.echo(f"open {live.stream.app_url}")

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from mcaprl.cli import cli
 from mcaprl.cli.policies import SCRIPTED
 from mcaprl.sims import make_sim
-from mcaprl.sims.pilots import make_pilot
+from mcaprl.sims.evaluation.pilots import make_pilot
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"

@@ -22,12 +22,12 @@ import numpy as np
 import mcaprl
 from mcaprl.errors import PolicyError
 from mcaprl.figures import COLORS, INK, new_figure, save_png
-from mcaprl.offline.curves import read_curve
+from mcaprl.offline.training.curves import read_curve
 from mcaprl.online.curve import CurvePoint
 from mcaprl.online.curve import read_curve as read_online_curve
 from mcaprl.online.evaluation import SELECTION_SEED, measure_scale
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluate import evaluate
+from mcaprl.sims.evaluation.evaluate import evaluate
 
 SIM = "powerline"
 EPISODES = 10

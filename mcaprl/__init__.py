@@ -7,19 +7,27 @@
 Importing this package loads neither torch nor numba; what needs them imports them when called.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
 from mcaprl.errors import McaprlError
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.episode import Episode
-from mcaprl.recorder.reader import open_logs as open
-from mcaprl.recorder.vector_wrapper import RecordVecMcap
-from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.open import open_logs as open
 
 if TYPE_CHECKING:
     from mcaprl.offline.policy import load_policy
+    from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
+    from mcaprl.recorder.record.wrapper import RecordMcap
+
+# Imported on first use, because they load torch or the writer.
+_LAZY = {
+    "RecordMcap": "mcaprl.recorder.record.wrapper",
+    "RecordVecMcap": "mcaprl.recorder.record.vector_wrapper",
+    "load_policy": "mcaprl.offline.policy",
+}
 
 __all__ = [
     "Dataset",
@@ -34,9 +42,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import what needs torch only when it is asked for."""
-    if name == "load_policy":
-        from mcaprl.offline.policy import load_policy
-
-        return load_policy
-    raise AttributeError(f"module 'mcaprl' has no attribute '{name}'")
+    """Import a public name on first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module 'mcaprl' has no attribute '{name}'")
+    value = getattr(import_module(_LAZY[name]), name)
+    globals()[name] = value
+    return value

@@ -1,6 +1,6 @@
 """Settings of whatever trains: frozen dataclasses, checked when made, each field with its help.
 
-A string under a field, as `TrainingConfig` in `offline/config.py` has them, says what the field is
+A string under a field, as `TrainingConfig` in `offline/algorithms/config.py` has them, says what the field is
 for; the command line prints it as the help of the field's option.
 """
 

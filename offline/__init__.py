@@ -2,7 +2,7 @@
 
 Importing this package loads no torch; its modules do.
 
-    from mcaprl.offline.train import train
+    from mcaprl.offline.training.train import train
     from mcaprl.offline.policy import load_policy
 
     train(dataset, "cql", Path("runs/lane"))

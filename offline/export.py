@@ -21,7 +21,7 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, import_extra
-from mcaprl.offline.observations import Observations
+from mcaprl.offline.batches.observations import Observations
 from mcaprl.offline.policy import Policy
 
 

@@ -25,12 +25,12 @@ from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.files import write_json
-from mcaprl.offline.buffer import discrete_actions
-from mcaprl.offline.learner import ActsBy, Learner
-from mcaprl.offline.losses import allowed_only, likely_actions, mean_values
-from mcaprl.offline.networks import Architecture, Network
-from mcaprl.offline.observations import ImageInput, ObservationEncoder, Observations
-from mcaprl.recorder.spaces import space_from_json, space_to_json
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
+from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
+from mcaprl.offline.algorithms.networks import Architecture, Network
+from mcaprl.offline.batches.buffer import discrete_actions
+from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+from mcaprl.recorder.format.spaces import space_from_json, space_to_json
 from mcaprl.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = 2

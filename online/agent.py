@@ -31,8 +31,8 @@ from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.sims.rollout import episode_seed
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.sims.evaluation.rollout import episode_seed
 
 LOG_INTERVAL = 1_000
 """Environment steps between two rows of scalars, and two signs of life."""

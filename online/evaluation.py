@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import UnknownNameError
 from mcaprl.online.curve import CurvePoint
-from mcaprl.sims.evaluate import evaluate
-from mcaprl.sims.pilots import make_pilot
+from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.sims.evaluation.pilots import make_pilot
 
 SELECTION_SEED: Final = 3_000_000
 """Of the episodes that choose the best checkpoint and make the curve."""

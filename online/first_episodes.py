@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.dataset.dataset import Dataset
 
 
 class _Step(NamedTuple):

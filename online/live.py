@@ -23,15 +23,15 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from mcaprl.online.recording import behavior_probabilities, exploration
 from mcaprl.online.task import Task
-from mcaprl.recorder.live_stream import LiveStep, LiveStream, Pace
-from mcaprl.recorder.log_writer import EpisodeSummary
-from mcaprl.recorder.metadata import LogMetadata
-from mcaprl.recorder.recording import reason_of
-from mcaprl.recorder.viewer_server import DEFAULT_PORT
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.record.session import reason_of
+from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
+from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream, Pace
 from mcaprl.sims import make_sim
-from mcaprl.sims.batched import BatchedEnv
-from mcaprl.sims.fleet import Fleet
-from mcaprl.sims.vehicle import VehicleEnv
+from mcaprl.sims.vehicle.batched import BatchedEnv
+from mcaprl.sims.vehicle.env import VehicleEnv
+from mcaprl.sims.vehicle.fleet import Fleet
 
 TRAINING_NAMES = (
     "loss",

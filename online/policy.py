@@ -27,7 +27,7 @@ from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
 from mcaprl.online.sb3_data import description_of
 from mcaprl.online.zip_file import read_model, write_model
-from mcaprl.recorder.spaces import space_from_json, space_to_json
+from mcaprl.recorder.format.spaces import space_from_json, space_to_json
 
 BEST_NAME = "best_model.zip"
 FORMAT_VERSION = 1

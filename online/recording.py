@@ -19,8 +19,8 @@ from torch import nn
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.online.double_dqn import WarmDQN
-from mcaprl.recorder.recover import recover_log
-from mcaprl.recorder.vector_wrapper import RecordVecMcap
+from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
+from mcaprl.recorder.repair.recover import recover_log
 
 
 def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from mcaprl.errors import PolicyError
-from mcaprl.recorder.spaces import space_to_json
+from mcaprl.recorder.format.spaces import space_to_json
 
 _KNOWN_KWARGS = {"net_arch", "activation_fn", "optimizer_kwargs", "optimizer_class", "use_sde"}
 

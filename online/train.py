@@ -36,10 +36,10 @@ from mcaprl.online.policy import BEST_NAME, load_policy
 from mcaprl.online.recording import log_paths
 from mcaprl.online.task import CONFIG_NAME, Task, read_config
 from mcaprl.progress import ProgressCallback, terminal_progress
-from mcaprl.recorder.dataset import Dataset
-from mcaprl.recorder.layout import LAYOUT_NAME
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluate import evaluate
+from mcaprl.sims.evaluation.evaluate import evaluate
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from mcaprl.sims.rollout import episode_seed
+from mcaprl.sims.evaluation.rollout import episode_seed
 
 
 class BatchedVecEnv(VecEnv):

@@ -18,7 +18,7 @@ from mcaprl.online.centering import take_plain_weights
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.frames import joined, parts_of, parts_of_space, stacked_space, whole_of
 from mcaprl.online.policy import channels_first
-from mcaprl.recorder.dataset import Dataset
+from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
 """Observations on which weights that were taken over must give the same values."""

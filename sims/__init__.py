@@ -32,29 +32,29 @@ ENGINES: Final[dict[str, str]] = dict.fromkeys(SIMS.values(), "numba") | {
 # The checker that Gymnasium would wrap around these takes time in each step; the tests run it.
 gym.register(
     id=SIMS["lane"],
-    entry_point="mcaprl.sims.lane:LaneKeepingEnv",
-    vector_entry_point="mcaprl.sims.lane:BatchedLaneKeepingEnv",
+    entry_point="mcaprl.sims.lane.env:LaneKeepingEnv",
+    vector_entry_point="mcaprl.sims.lane.env:BatchedLaneKeepingEnv",
     max_episode_steps=400,
     disable_env_checker=True,
 )
 gym.register(
     id=SIMS["racer"],
-    entry_point="mcaprl.sims.racer:RacerEnv",
-    vector_entry_point="mcaprl.sims.racer:BatchedRacerEnv",
+    entry_point="mcaprl.sims.racer.env:RacerEnv",
+    vector_entry_point="mcaprl.sims.racer.env:BatchedRacerEnv",
     # The classic rules' limit; the default ones end sooner by themselves.
     max_episode_steps=10_000,
     disable_env_checker=True,
 )
 gym.register(
     id=SIMS["powerline"],
-    entry_point="mcaprl.sims.powerline:PowerlineEnv",
-    vector_entry_point="mcaprl.sims.powerline:BatchedPowerlineEnv",
+    entry_point="mcaprl.sims.powerline.env:PowerlineEnv",
+    vector_entry_point="mcaprl.sims.powerline.env:BatchedPowerlineEnv",
     max_episode_steps=400,
     disable_env_checker=True,
 )
 gym.register(
     id=SIMS["highway-lane"],
-    entry_point="mcaprl.sims.highway_lane:HighwayLaneEnv",
+    entry_point="mcaprl.sims.highway.env:HighwayLaneEnv",
     max_episode_steps=700,
     disable_env_checker=True,
 )

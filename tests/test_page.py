@@ -17,14 +17,14 @@ from mcaprl.cli.curves import learning_curves
 from mcaprl.figures import new_figure, to_svg
 from mcaprl.online.curve import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page
-from mcaprl.recorder.lint import lint
-from mcaprl.recorder.report import dataset_page
-from mcaprl.recorder.tracks import tracks_of
-from mcaprl.recorder.wrapper import RecordMcap
+from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.recorder.viewer.report import dataset_page
+from mcaprl.recorder.viewer.tracks import tracks_of
 from mcaprl.sims import make_sim
-from mcaprl.sims.evaluate import PolicyScore
-from mcaprl.sims.report import evaluation_page
-from mcaprl.sims.rollout import EpisodeResult
+from mcaprl.sims.evaluation.evaluate import PolicyScore
+from mcaprl.sims.evaluation.report import evaluation_page
+from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

@@ -21,9 +21,9 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import mcaprl
-from mcaprl.recorder.recover import recover_log
-from tests.faults import Told, play
-from tests.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
+from mcaprl.recorder.repair.recover import recover_log
+from tests.support.faults import Told, play
+from tests.support.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
 
 FOLDER = Path(__file__).parent
 CONTENTS = FOLDER / "contents.json"

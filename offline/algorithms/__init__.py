@@ -1,0 +1,1 @@
+"""The offline algorithms, their losses and networks."""

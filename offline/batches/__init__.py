@@ -1,0 +1,1 @@
+"""Datasets as minibatches of tensors."""

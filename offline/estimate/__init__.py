@@ -1,0 +1,1 @@
+"""The value of a policy, estimated from a log alone."""

@@ -1,0 +1,171 @@
+"""Estimates of a policy's value from another's log, by importance sampling: pure functions.
+
+Each takes episodes side by side and gives quotients of means over them, and so a value for every
+resampling, and an interval:
+
+    TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
+    WIS     weighted                               the same, over the sum of all rho
+    PDIS    per-decision importance sampling       sum_t gamma^t rho_t r_t
+    WPDIS   weighted                               each step's rho_t over their sum at that step
+    DR      doubly robust                          PDIS of what a model Q leaves to explain
+    WDR     weighted doubly robust                 WPDIS of the same
+
+with rho_t the product of pi(a|s) / mu(a|s) up to step t, pi the policy in question and mu the one
+that acted. TIS, PDIS and DR are unbiased and swing; the weighted ones are a little biased and calm.
+
+    Precup, Sutton and Singh, "Eligibility traces for off-policy policy evaluation", ICML 2000
+    Jiang and Li, "Doubly robust off-policy value evaluation", https://arxiv.org/abs/1511.03722
+    Thomas and Brunskill, "Data-efficient off-policy policy evaluation for reinforcement learning",
+    https://arxiv.org/abs/1604.00923
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mcaprl.offline.estimate.quotients import Floats, Quotients, quotient
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTable:
+    """E episodes side by side, padded to T columns: one more than the longest has steps.
+
+    Attributes:
+        rewards: (E, T) r of step t; 0 past the end.
+        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end.
+        q: (E, T) the model's Q(s, a) of the action taken; 0 past the end.
+        v: (E, T) its value of the state before step t, sum_a pi(a|s) Q(s, a). Past the end 0, but
+            right behind a truncated episode the value of its last state.
+        gamma: the discount.
+    """
+
+    rewards: Floats
+    ratios: Floats
+    q: Floats
+    v: Floats
+    gamma: float
+
+    def __post_init__(self) -> None:
+        """Make sure that all columns are of the same episodes and steps."""
+        shapes = {array.shape for array in (self.rewards, self.ratios, self.q, self.v)}
+        assert len(shapes) == 1, f"columns of different shapes: {shapes}"
+
+    @property
+    def discounts(self) -> Floats:
+        """(T,) gamma^t."""
+        powers: Floats = self.gamma ** np.arange(self.rewards.shape[1], dtype=np.float64)
+        return powers
+
+    @property
+    def rho(self) -> Floats:
+        """(E, T) the product of the ratios up to and with step t."""
+        return np.cumprod(self.ratios, axis=1, dtype=np.float64)
+
+    @property
+    def rho_before(self) -> Floats:
+        """(E, T) the product of the ratios before step t."""
+        return np.hstack([np.ones((len(self.ratios), 1)), self.rho[:, :-1]])
+
+
+def trajectory(episodes: EpisodeTable) -> Quotients:
+    """TIS: the mean of rho_T sum_t gamma^t r_t."""
+    return Quotients.mean(episodes.rho[:, -1] * _returns(episodes))
+
+
+def weighted_trajectory(episodes: EpisodeTable) -> Quotients:
+    """WIS: the mean of the returns, weighted by rho_T."""
+    rho = episodes.rho[:, -1:]
+    return Quotients(np.ones(1), ((rho * _returns(episodes)[:, None], rho),))
+
+
+def per_decision(episodes: EpisodeTable) -> Quotients:
+    """PDIS: the mean of sum_t gamma^t rho_t r_t."""
+    return Quotients.mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1))
+
+
+def weighted_per_decision(episodes: EpisodeTable) -> Quotients:
+    """WPDIS: sum_t gamma^t of the mean reward at t, weighted by rho_t."""
+    rho = episodes.rho
+    return Quotients(episodes.discounts, ((rho * episodes.rewards, rho),))
+
+
+def doubly_robust(episodes: EpisodeTable) -> Quotients:
+    """DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
+
+    Jiang and Li, equation 10, written out. With a model of zeros it is PDIS.
+    """
+    unexplained = episodes.rho * (episodes.rewards - episodes.q)
+    per_step = unexplained + episodes.rho_before * episodes.v
+    return Quotients.mean((episodes.discounts * per_step).sum(1))
+
+
+def weighted_doubly_robust(episodes: EpisodeTable) -> Quotients:
+    """WDR: DR with rho_t over its sum at that step.
+
+    Thomas and Brunskill, equation 10.
+    """
+    rho, before = episodes.rho, episodes.rho_before
+    unexplained = rho * (episodes.rewards - episodes.q)
+    return Quotients(episodes.discounts, ((unexplained, rho), (before * episodes.v, before)))
+
+
+ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], Quotients]]] = {
+    "TIS": trajectory,
+    "WIS": weighted_trajectory,
+    "PDIS": per_decision,
+    "WPDIS": weighted_per_decision,
+    "DR": doubly_robust,
+    "WDR": weighted_doubly_robust,
+}
+"""Short names, as tables show them."""
+
+WHOLE_EPISODE: Final = ("TIS", "WIS")
+"""Those whose weights are of whole episodes; the others weigh each step."""
+
+
+def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
+    """(T,) how many episodes of the policy itself step t of the log is worth.
+
+    (sum rho_t)^2 / sum rho_t^2, Kish's effective sample size: E if all weights are equal, 1 if one
+    episode has all the weight, 0 if none has any.
+    """
+    rho = episodes.rho
+    return quotient(rho.sum(0) ** 2, (rho**2).sum(0))
+
+
+def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
+    """The effective number of episodes behind an estimate.
+
+    For TIS and WIS that of whole episodes; for the others its harmonic mean over steps, weighted
+    with their discount: variances add up, and what is far off counts little.
+    """
+    sizes = effective_sample_sizes(episodes)
+    if estimator in WHOLE_EPISODE:
+        return float(sizes[-1])
+    discounts = episodes.discounts
+    with np.errstate(divide="ignore"):
+        return float(discounts.sum() / (discounts @ (1 / sizes)))
+
+
+def mean_weight(estimator: str, episodes: EpisodeTable) -> Quotients | None:
+    """The mean of an unbiased estimator's weights, over steps with their discounts: 1 is right.
+
+    It is clearly less where the log lacks whole episodes that the policy would make: the few that
+    could stand for them would have huge weights, and none happened to be logged. None for the
+    estimators that divide by it.
+    """
+    if estimator == "TIS":
+        return Quotients.mean(episodes.rho[:, -1])
+    if estimator in ("PDIS", "DR"):
+        return Quotients.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
+    return None
+
+
+def _returns(episodes: EpisodeTable) -> Floats:
+    """(E,) discounted."""
+    returns: Floats = (episodes.discounts * episodes.rewards).sum(1)
+    return returns

@@ -1,0 +1,156 @@
+"""What a policy thinks of logged steps: values, surprises, doubts, and what else it would do.
+
+T is the number of an episode's steps and A that of actions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import PolicyError, UsageError
+from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.losses import q_learning_target
+from mcaprl.offline.training.run_folder import CONFIG_NAME
+from mcaprl.recorder.dataset.episode import Episode
+
+Columns = dict[str, NDArray[Any]]
+
+
+class ValuePolicy(Protocol):
+    """A trained policy with discrete actions; B is the number of observations."""
+
+    @property
+    def name(self) -> str:
+        """What to call it."""
+
+    def q_values(self, observations: Any) -> NDArray[np.float32]:
+        """(B, A); raises PolicyError if it has none."""
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
+        """(B, A)."""
+
+
+def value_columns(
+    policy: ValuePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
+) -> Columns:
+    """What a policy thinks of an episode: the fields of `recorder.schema.values_schema`.
+
+    Args:
+        policy: with or without Q-values; without, all that comes of them is NaN. One that stacks
+            frames is given each observation with those before it.
+        episode: of T steps.
+        action_space: of the log.
+        gamma: the discount that the policy learned with.
+
+    Returns:
+        Arrays of length T.
+
+    Raises:
+        UsageError: the actions are not discrete.
+        PolicyError: the policy does not take these observations.
+    """
+    if not isinstance(action_space, spaces.Discrete):
+        raise UsageError(f"values are of discrete actions; the log's are {action_space}")
+    seen = _with_last(episode.observations, episode.next_observations)
+    observations = _in_a_row(seen, getattr(policy, "frame_stack", 1))
+    taken = episode.actions - int(action_space.start)
+    try:
+        q = policy.q_values(observations)
+    except PolicyError:
+        preference = policy.action_probabilities(observations)
+        q = np.full_like(preference, np.nan)
+    else:
+        preference = softmax(q)
+    best = preference[:-1].argmax(1)
+    value = q[:-1].max(1)
+    return {
+        "q": q[:-1],
+        "preference": preference[:-1],
+        "value": value,
+        "advantage": q[np.arange(len(taken)), taken] - value,
+        "td_error": td_errors(q, taken, episode.rewards, episode.terminated, gamma),
+        "entropy": normalized_entropy(preference[:-1]),
+        "policy_action": best + int(action_space.start),
+        "agrees": best == taken,
+    }
+
+
+def td_errors(
+    q: NDArray[np.float32],
+    actions: NDArray[np.int64],
+    rewards: NDArray[np.float64],
+    terminated: NDArray[np.bool_],
+    gamma: float,
+) -> NDArray[np.float32]:
+    """(T,) how much better each step was than its value: the Q-learning error.
+
+    Args:
+        q: (T + 1, A) values at each observation, the last one included.
+        actions: (T,) taken, counted from 0.
+        rewards: (T,)
+        terminated: (T,); nothing comes behind such a step.
+        gamma: the discount.
+    """
+    target = q_learning_target(
+        torch.from_numpy(rewards.astype(np.float32)),
+        torch.from_numpy(np.where(terminated, 0.0, gamma).astype(np.float32)),
+        torch.from_numpy(q[1:]),
+    )
+    error: NDArray[np.float32] = target.numpy() - q[np.arange(len(actions)), actions]
+    return error
+
+
+def softmax(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of each row: the Boltzmann policy at temperature 1."""
+    odds = np.exp(values - values.max(1, keepdims=True))
+    return cast(NDArray[np.float32], odds / odds.sum(1, keepdims=True))
+
+
+def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(T,) -sum p log p over log A, of rows (T, A): from 0, sure, to 1, all alike."""
+    actions = probabilities.shape[1]
+    if actions == 1:
+        return np.zeros(len(probabilities), np.float32)
+    logs = np.log(probabilities, where=probabilities > 0, out=np.zeros_like(probabilities))
+    entropy: NDArray[np.float32] = -(probabilities * logs).sum(1) / math.log(actions)
+    return entropy
+
+
+def gamma_of_run(path: Path) -> float:
+    """The discount in a run's settings, of a run or of one of its seeds; else our default."""
+    for folder in (path, path.parent):
+        config = folder / CONFIG_NAME
+        if config.is_file():
+            try:
+                return float(json.loads(config.read_text())["config"]["gamma"])
+            except (ValueError, KeyError, TypeError):
+                break
+    return DQNConfig().gamma
+
+
+def _with_last(observations: Any, next_observations: Any) -> Any:
+    """(T + 1, ...) the observations of all steps, and the one behind the last."""
+    if isinstance(observations, dict):
+        return {k: _with_last(observations[k], next_observations[k]) for k in observations}
+    return np.concatenate([observations, next_observations[-1:]])
+
+
+def _in_a_row(observations: Any, count: int) -> Any:
+    """(T + 1, count, ...) each observation with those before it, oldest first; the first repeats.
+
+    One alone stays as it is, (T + 1, ...).
+    """
+    if count == 1:
+        return observations
+    if isinstance(observations, dict):
+        return {key: _in_a_row(part, count) for key, part in observations.items()}
+    rows = np.arange(len(observations))[:, None] - np.arange(count)[::-1]
+    return observations[np.maximum(rows, 0)]

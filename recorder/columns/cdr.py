@@ -1,0 +1,237 @@
+"""Where the fields of CDR messages are: any ROS 2 type, read by columns or one by one.
+
+Messages of one type and one length nearly always have one form: all their strings and sequences
+have the lengths of the first. The form of an example is a `Layout`, a NumPy structured dtype, and
+the lengths in it are words that every other message is compared with. Those that agree are read as
+one array; any other is decoded by rosbags, with the same values.
+
+CDR begins with an encapsulation header of 4 bytes, whose second says the byte order. Behind it
+each number is aligned to its own size, counted from there; a string is a uint32 length and that
+many bytes, the last of them 0; a sequence is a uint32 count and its elements. Up to three bytes of
+padding may follow.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from mcap.records import Schema
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.columns.ros_types import ENCAPSULATION_BYTES, ROS_TO_NUMPY
+
+MAX_PADDING_BYTES = 3
+# The encapsulation headers of plain CDR; the two bytes behind them are options without effect.
+BIG_ENDIAN, LITTLE_ENDIAN = b"\0\0", b"\0\1"
+# A message of more nested parts than this is not worth a layout of its own.
+_MAX_PARTS = 256
+_MAX_LAYOUTS = 64
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where wanted fields are in messages of one form.
+
+    Attributes:
+        dtype: of a message, padding included: the wanted fields, and those of `constants`.
+        constants: what is the same in all messages of the form: the byte order, and the length of
+            each string and sequence.
+    """
+
+    dtype: np.dtype[Any]
+    constants: dict[str, int]
+
+    def fits(self, payloads: NDArray[Any]) -> bool:
+        """Whether all messages have this form."""
+        return all(bool((payloads[name] == told).all()) for name, told in self.constants.items())
+
+
+class MessageType:
+    """A message type, from the schema that stands in a log."""
+
+    def __init__(self, name: str, text: str) -> None:
+        """Parse a ROS 2 message definition, with the types that it nests.
+
+        Raises:
+            LogError: it does not parse.
+        """
+        self.name = name
+        self._layouts: dict[tuple[object, ...], Layout | None] = {}
+        self._store = get_typestore(Stores.EMPTY)
+        try:
+            types = get_types_from_msg(text, name)
+            own = {key: value for key, value in types.items() if key not in self._store.fielddefs}
+            self._store.register(own)
+            self._fields = dict(self._store.fielddefs[name][1])
+            self._store.get_msgdef(name)
+        # The library raises whatever its parsing meets; none of it is more than "does not parse".
+        except Exception as error:
+            raise LogError(f"the definition of {name} does not parse: {error}") from error
+
+    @cached_property
+    def dtypes(self) -> dict[str, np.dtype[Any]]:
+        """The message's own fields: of numbers or arrays their dtype, of all else `object`."""
+        return {name: _dtype_of(description) for name, description in self._fields.items()}
+
+    def decode(self, data: bytes) -> Any:
+        """One message as an object with an attribute for each field.
+
+        Raises:
+            CorruptLogError: the bytes do not fit the type.
+        """
+        try:
+            return self._store.deserialize_cdr(data, self.name)
+        # As above: "does not fit".
+        except Exception as error:
+            raise CorruptLogError(f"{len(data)} bytes are no {self.name}: {error}") from error
+
+    def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
+        """The form of the last example of that length; None if there was none."""
+        return self._layouts.get((length, *wanted))
+
+    def layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
+        """The form of an example; None if it has none that could be told."""
+        # Making one takes as long as decoding a few messages.
+        key = (len(example), *wanted)
+        known = self._layouts.get(key)
+        if known is None or not known.fits(np.frombuffer(example, known.dtype)):
+            known = self._new_layout(example, wanted)
+            if len(self._layouts) >= _MAX_LAYOUTS:
+                self._layouts.clear()
+            self._layouts[key] = known
+        return known
+
+    def _new_layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
+        if example[:2] not in (BIG_ENDIAN, LITTLE_ENDIAN):
+            return None
+        walk = _Walk(example)
+        try:
+            for name, description in self._fields.items():
+                self._pass(walk, description, name if name in wanted else None)
+        except (struct.error, _NoLayout):
+            return None
+        if not walk.position <= len(example) <= walk.position + MAX_PADDING_BYTES:
+            return None
+        return walk.layout()
+
+    def _pass(self, walk: _Walk, description: Any, name: str | None) -> None:
+        """Go past one field, and note where it is if it has a name."""
+        kind, what = description
+        match kind:
+            case Nodetype.BASE if what[0] == "string":
+                walk.take(f"S{walk.length()}", 1, name, scalar=True)
+            case Nodetype.BASE:
+                walk.take(_number(what[0]), 1, name, scalar=True)
+            case Nodetype.NAME:
+                self._refuse(name)
+                for inner in self._store.fielddefs[what][1]:
+                    self._pass(walk, inner[1], None)
+            case Nodetype.ARRAY | Nodetype.SEQUENCE:
+                element, count = what
+                if kind == Nodetype.SEQUENCE:
+                    count = walk.length()
+                if element[0] == Nodetype.BASE and element[1][0] != "string":
+                    walk.take(_number(element[1][0]), count, name)
+                    return
+                self._refuse(name)
+                for _ in range(count):
+                    self._pass(walk, element, None)
+
+    def _refuse(self, name: str | None) -> None:
+        """Nested messages and lists of texts make no column."""
+        if name is not None:
+            raise LogError(f"field {name} of {self.name} is neither a number, array nor text")
+
+
+class _Walk:
+    """Goes through one message and notes where fields are."""
+
+    def __init__(self, data: bytes) -> None:
+        """Stand behind the encapsulation header."""
+        self.position = ENCAPSULATION_BYTES
+        self._data = data
+        self._order: Literal["<", ">"] = "<" if data[:2] == LITTLE_ENDIAN else ">"
+        self._parts = 0
+        self._constants = {"_encapsulation": int.from_bytes(data[:2], "little")}
+        self._fields: dict[str, tuple[Any, int]] = {"_encapsulation": ("<u2", 0)}
+
+    def take(self, code: str, count: int, name: str | None, *, scalar: bool = False) -> None:
+        """Pass `count` numbers, or a text."""
+        self._parts += 1
+        if self._parts > _MAX_PARTS:
+            raise _NoLayout
+        dtype = np.dtype(code).newbyteorder(self._order)
+        alignment = 1 if dtype.kind == "S" else dtype.itemsize
+        # An empty sequence is not aligned.
+        if count:
+            self.position += -(self.position - ENCAPSULATION_BYTES) % alignment
+        if self.position + count * dtype.itemsize > len(self._data):
+            raise _NoLayout
+        if name is not None:
+            self._fields[name] = (dtype if scalar else (dtype, (count,)), self.position)
+        self.position += count * dtype.itemsize
+
+    def length(self) -> int:
+        """Pass the length of a string or sequence, which other messages have to share."""
+        name = f"_length_{len(self._constants)}"
+        self.take("u4", 1, name, scalar=True)
+        (told,) = struct.unpack_from(f"{self._order}I", self._data, self.position - 4)
+        self._constants[name] = told
+        return int(told)
+
+    def layout(self) -> Layout:
+        """What was noted."""
+        formats, offsets = zip(*self._fields.values(), strict=True)
+        dtype = np.dtype(
+            {
+                "names": list(self._fields),
+                "formats": list(formats),
+                "offsets": list(offsets),
+                "itemsize": len(self._data),
+            }
+        )
+        return Layout(dtype, self._constants)
+
+
+class _NoLayout(Exception):
+    """A message is too short for its type, or of too many parts."""
+
+
+def message_type(schema: Schema) -> MessageType:
+    """The type that a schema defines, parsed once.
+
+    Raises:
+        LogError: its encoding is not `ros2msg`, or it does not parse.
+    """
+    if schema.encoding != "ros2msg":
+        raise LogError(f"its schema {schema.name} is {schema.encoding!r}; known is 'ros2msg'")
+    return _parsed(schema.name, schema.data.decode(errors="replace"))
+
+
+@lru_cache(maxsize=64)
+def _parsed(name: str, text: str) -> MessageType:
+    return MessageType(name, text)
+
+
+def _dtype_of(description: Any) -> np.dtype[Any]:
+    kind, what = description
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        kind, what = what[0]
+    if kind != Nodetype.BASE:
+        return np.dtype(object)
+    return np.dtype(ROS_TO_NUMPY.get(what[0], object))
+
+
+def _number(ros_name: str) -> str:
+    code = ROS_TO_NUMPY.get(ros_name)
+    if code is None:
+        raise _NoLayout
+    return code

@@ -1,0 +1,192 @@
+"""Decodes the messages of one channel: where all have one form as arrays, else one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.columns.cdr import Layout, MessageType, message_type
+from mcaprl.recorder.columns.chunks import Scratch
+from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, are_messages, gather, record_dtype
+from mcaprl.recorder.columns.message_spans import Span
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import RECORD_HEADER
+
+# Messages of a chunk that are of more lengths than this are decoded one by one.
+_MAX_LENGTHS = 16
+
+Columns = dict[str, NDArray[Any]]
+"""Arrays of one length, by field name; texts are arrays of `str` objects."""
+Rows = slice | NDArray[np.int64]
+"""Which rows of a column."""
+
+
+class Decoder:
+    """Makes columns of a channel's messages.
+
+    Attributes:
+        channel: whose.
+        type: of the messages.
+    """
+
+    def __init__(self, reader: McapReader, channel: Channel) -> None:
+        """Look up their type.
+
+        Raises:
+            LogError: they are encoded in a way that is not known.
+        """
+        self.channel, self.type = channel, _type_of(reader, channel)
+        self._reader = reader
+
+    def empty_columns(
+        self, wanted: Collection[str], count: int, span: Span, scratch: Scratch | None = None
+    ) -> Columns:
+        """Columns with the dtypes and shapes of a span's first message."""
+        records = self._reader.records_of(span, scratch)
+        example = self._values(records, span.index[0], wanted)
+        return {
+            name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
+        }
+
+    def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
+        """Put copies of the messages that an index points at into rows of the columns."""
+        if self._put_alike(columns, records, index, rows):
+            return
+        if isinstance(rows, slice):
+            rows = np.arange(rows.start, rows.stop)
+        index, rows = self._put_by_length(columns, records, index, rows)
+        for entry, row in zip(index, rows.tolist(), strict=True):
+            for name, value in self._values(records, entry, columns).items():
+                self._check_shape(name, value, columns[name], entry)
+                # A text out of its array: a column of objects would keep that.
+                columns[name][row] = value[()]
+
+    def _put_by_length(
+        self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Put the messages of one length after the other; gives back those that are of no form."""
+        if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
+            return index, rows
+        lengths = gather(records, index, MESSAGE_HEADER)["length"]
+        several = np.unique(lengths)
+        for length in several if len(several) <= _MAX_LENGTHS else ():
+            alike = lengths == length
+            if self._put_alike(columns, records, index[alike], rows[alike]):
+                index, rows, lengths = index[~alike], rows[~alike], lengths[~alike]
+        return index, rows
+
+    def _put_alike(
+        self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
+    ) -> bool:
+        """Put messages that have the form of the first; does nothing if one has not."""
+        found = self.alike(records, index, columns)
+        if found is None:
+            return False
+        if any(found[name].shape[1:] != column.shape[1:] for name, column in columns.items()):
+            return False
+        for name, column in columns.items():
+            if column.dtype.kind == "O":
+                column[rows] = self._texts(found[name])
+            else:
+                _put(column, rows, found[name])
+        return True
+
+    def alike(
+        self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
+    ) -> NDArray[Any] | None:
+        """The messages as one structured array; None if they have not one form."""
+        # Mostly they have the form of those before them.
+        known = self.type.known_layout(self._length(records, index), wanted)
+        found = None if known is None else self._laid_out(records, index, known)
+        if found is not None:
+            return found
+        layout = self.type.layout(self._message(records, index[0]), wanted)
+        if layout is None or layout is known:
+            return None
+        return self._laid_out(records, index, layout)
+
+    def _length(self, records: memoryview, index: NDArray[Any]) -> int:
+        """Bytes of the first message, as its record tells; -1 if there is none."""
+        offset = int(index["offset"][0])
+        if offset + MESSAGE_HEADER.itemsize > len(records):
+            return -1
+        _, length = RECORD_HEADER.unpack_from(records, offset)
+        return int(length) + RECORD_HEADER.size - MESSAGE_HEADER.itemsize
+
+    def _laid_out(
+        self, records: memoryview, index: NDArray[Any], layout: Layout
+    ) -> NDArray[Any] | None:
+        dtype = record_dtype(layout.dtype)
+        try:
+            rows = gather(records, index, dtype)
+        except CorruptLogError:
+            # The last ones may be shorter than this form.
+            return None
+        are_told = are_messages(rows, self.channel.id) and bool(
+            (rows["log_time"] == index["log_time"]).all()
+        )
+        payloads: NDArray[Any] = rows["payload"]
+        return payloads if are_told and layout.fits(payloads) else None
+
+    def _message(self, records: memoryview, entry: Any) -> bytes:
+        return self._reader.message(
+            records, self.channel, int(entry["log_time"]), int(entry["offset"])
+        )
+
+    def _values(self, records: memoryview, entry: Any, wanted: Collection[str]) -> Columns:
+        """Fields of one message, decoded by itself."""
+        data = self._message(records, entry)
+        try:
+            message = self.type.decode(data)
+        except CorruptLogError as error:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} at log_time {entry['log_time']}:"
+                f" {error}"
+            ) from error
+        return {name: np.asarray(getattr(message, name), self.type.dtypes[name]) for name in wanted}
+
+    def _texts(self, values: NDArray[Any]) -> list[str]:
+        try:
+            # Often all are the same.
+            if (values == values[0]).all():
+                return [bytes(values[0]).decode()] * len(values)
+            return [text.decode() for text in values.tolist()]
+        except UnicodeDecodeError as error:
+            raise CorruptLogError(
+                f"{self._reader.path}: {self.channel.topic} has a text that is no UTF-8"
+            ) from error
+
+    def _check_shape(
+        self, name: str, value: NDArray[Any], column: NDArray[Any], entry: Any
+    ) -> None:
+        if value.shape != column.shape[1:]:
+            raise LogError(
+                f"{self._reader.path}: {name} of {self.channel.topic} has shape {value.shape} at"
+                f" log_time {entry['log_time']} and {column.shape[1:]} elsewhere; all must have one"
+            )
+
+
+def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
+    """Set rows of a column. Vectors are moved as a whole, not number by number."""
+    if values.ndim == 2 and values.size and values.dtype == column.dtype:
+        row = np.dtype((np.void, values.shape[1] * values.itemsize))
+        column, values = column.view(row)[:, 0], values.view(row)[:, 0]
+    column[rows] = values
+
+
+def _type_of(reader: McapReader, channel: Channel) -> MessageType:
+    if channel.message_encoding != "cdr":
+        raise LogError(
+            f"{reader.path}: messages of {channel.topic} are {channel.message_encoding!r};"
+            " known is 'cdr'"
+        )
+    schema = reader.schema_of(channel)
+    try:
+        return message_type(schema)
+    except LogError as error:
+        raise LogError(f"{reader.path}: {channel.topic}: {error}") from error

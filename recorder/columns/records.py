@@ -1,0 +1,272 @@
+"""The records of an MCAP file, one by one: opcode, length, content."""
+
+from __future__ import annotations
+
+import io
+import mmap
+import struct
+from array import array
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.message_rows import (
+    INDEX_ENTRY,
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+)
+
+RECORD_HEADER = struct.Struct("<BQ")
+# Of a message behind its record header: channel, sequence number, log_time.
+MESSAGE_START = struct.Struct("<HIQ")
+_FOOTER_BYTES = RECORD_HEADER_BYTES + 20
+_PARSERS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.DATA_END: DataEnd,
+    Opcode.STATISTICS: Statistics,
+}
+
+
+def map_file(path: Path) -> memoryview:
+    """The bytes of a file, mapped into memory.
+
+    Raises:
+        NotMcapError: it is empty.
+        LogError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if not file.seek(0, io.SEEK_END):
+                raise NotMcapError(f"{path} is no MCAP file: it is empty")
+            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror}") from error
+
+
+def records_of(
+    view: memoryview, start: int, stop: int | None = None
+) -> Iterator[tuple[int, int, memoryview]]:
+    """Yield offset, opcode and content of each record from `start` on.
+
+    Ends before a record that reaches beyond `stop`, or the end of the view.
+    """
+    offset, stop = start, len(view) if stop is None else stop
+    while offset + RECORD_HEADER.size <= stop:
+        opcode, length = RECORD_HEADER.unpack_from(view, offset)
+        content = offset + RECORD_HEADER.size
+        if opcode == 0 or length > stop - content:
+            return
+        yield offset, opcode, view[content : content + length]
+        offset = content + length
+
+
+def runs_of(view: memoryview, start: int) -> Iterator[tuple[int, int, int, int]]:
+    """Likewise, but of records of one kind and length that follow each other, the first.
+
+    Yields:
+        Its offset and opcode, the length of its content, and how many they are.
+    """
+    offset, end = start, len(view)
+    while offset + RECORD_HEADER.size <= end:
+        head = RECORD_HEADER.unpack_from(view, offset)
+        opcode, length = head
+        size = RECORD_HEADER.size + length
+        following = offset + size
+        if opcode == 0 or following > end:
+            return
+        count, room = 1, end - RECORD_HEADER.size
+        # Mostly there is one, or there are very many.
+        if following <= room and RECORD_HEADER.unpack_from(view, following) == head:
+            count = _run_length(view, offset, size)
+        yield offset, opcode, length, count
+        offset += count * size
+
+
+def _run_length(view: memoryview, offset: int, size: int) -> int:
+    """How many records like that at `offset`, of so many bytes, follow each other."""
+    count, most = 1, (len(view) - offset) // size
+    while count < most:
+        look_at = min(8 * count, most)
+        heads = np.ndarray(look_at, f"V{RECORD_HEADER.size}", view, offset, (size,))
+        others = np.flatnonzero(heads != heads[0])
+        if len(others):
+            return int(others[0])
+        count = look_at
+    return count
+
+
+def parse_record(opcode: int, content: memoryview) -> Any:
+    """A record of the `mcap` library from its content.
+
+    Raises:
+        CorruptLogError: the content is no such record.
+    """
+    try:
+        return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
+    # The library raises whatever its parsing meets; none of it is more than "damaged".
+    except Exception as error:
+        raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
+
+
+def attachment_of(view: memoryview, name: str) -> bytes | None:
+    """The last attachment of a name in a file; None if there is none.
+
+    Raises:
+        CorruptLogError: it is damaged.
+    """
+    found = None
+    for offset, opcode, content in records_of(view, len(MCAP0_MAGIC)):
+        if opcode == Opcode.DATA_END:
+            break
+        if opcode == Opcode.ATTACHMENT:
+            attachment: Attachment = parse_record(opcode, content)
+            if attachment.name == name:
+                if not is_intact_attachment(content):
+                    raise CorruptLogError(f"the attachment {name} at byte {offset} is damaged")
+                found = bytes(attachment.data)
+    return found
+
+
+def is_intact_attachment(content: memoryview) -> bool:
+    """Whether an Attachment record matches its CRC, if it has one."""
+    (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
+    return not crc or crc32(content[:-4]) == crc
+
+
+@dataclass
+class LooseMessages:
+    """Messages that were found without an index, by channel id, in the order of the file."""
+
+    _times: dict[int, array[int]] = field(default_factory=dict)
+    _offsets: dict[int, array[int]] = field(default_factory=dict)
+
+    def add(self, offset: int, content: memoryview) -> None:
+        """Note the Message record at `offset`.
+
+        Raises:
+            CorruptLogError: it is shorter than its header.
+        """
+        if len(content) < MESSAGE_HEADER.itemsize - RECORD_HEADER_BYTES:
+            raise CorruptLogError(f"the message at byte {offset} is shorter than its header")
+        channel_id, _, log_time = MESSAGE_START.unpack_from(content)
+        self._times.setdefault(channel_id, array("Q")).append(log_time)
+        self._offsets.setdefault(channel_id, array("Q")).append(offset)
+
+    def indexes(self) -> dict[int, NDArray[Any]]:
+        """What a MessageIndex would tell, by channel id: arrays of `INDEX_ENTRY`."""
+        found = {}
+        for channel_id, times in self._times.items():
+            index = np.empty(len(times), INDEX_ENTRY)
+            index["log_time"], index["offset"] = times, self._offsets[channel_id]
+            found[channel_id] = index
+        return found
+
+
+@dataclass
+class ChunkContents:
+    """What stands in a chunk: schemas and channels, and indexes of its messages by channel id."""
+
+    topics: list[Schema | Channel]
+    indexes: dict[int, NDArray[Any]]
+
+
+def contents_of(chunk: memoryview) -> ChunkContents:
+    """Go through the records of a chunk, for one whose index is missing or not enough.
+
+    Raises:
+        CorruptLogError: a record is damaged, or reaches beyond the chunk.
+    """
+    uniform = uniform_indexes(chunk)
+    if uniform is not None:
+        return ChunkContents([], uniform)
+    topics, loose, end = [], LooseMessages(), 0
+    for offset, opcode, content in records_of(chunk, 0):
+        if opcode == Opcode.MESSAGE:
+            loose.add(offset, content)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            topics.append(parse_record(opcode, content))
+        end = offset + RECORD_HEADER_BYTES + len(content)
+    if end != len(chunk):
+        raise CorruptLogError("a record reaches beyond its chunk")
+    return ChunkContents(topics, loose.indexes())
+
+
+def only(
+    records: memoryview, indexes: Mapping[int, NDArray[Any]]
+) -> tuple[memoryview, dict[int, NDArray[Any]]]:
+    """Copies of those records that indexes lead to, one behind the other, and their indexes."""
+    kept, new = bytearray(), {}
+    for channel_id, index in indexes.items():
+        entries = []
+        for time_ns, offset in index.tolist():
+            _, length = RECORD_HEADER.unpack_from(records, offset)
+            entries.append((time_ns, len(kept)))
+            kept += records[offset : offset + RECORD_HEADER_BYTES + length]
+        new[channel_id] = np.array(entries, INDEX_ENTRY)
+    return memoryview(kept), new
+
+
+def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
+    """Indexes of a chunk of nothing but messages of one length; None if it is another."""
+    if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
+        return None
+    size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]
+    if size < MESSAGE_HEADER.itemsize or len(chunk) % size:
+        return None
+    heads = np.ndarray(len(chunk) // size, MESSAGE_HEADER, chunk, strides=(size,))
+    if (heads["opcode"] != Opcode.MESSAGE).any() or (heads["length"] != heads["length"][0]).any():
+        return None
+    entries = np.empty(len(heads), INDEX_ENTRY)
+    entries["log_time"] = heads["log_time"]
+    entries["offset"] = np.arange(len(heads), dtype=np.uint64) * np.uint64(size)
+    ids = heads["channel_id"]
+    if (ids == ids[0]).all():
+        return {int(ids[0]): entries}
+    return {int(channel_id): entries[ids == channel_id] for channel_id in np.unique(ids)}
+
+
+def footer_of(view: memoryview) -> Footer | None:
+    """The footer, if a file ends with one.
+
+    Raises:
+        CorruptLogError: the summary that it points at is not there, or does not match its CRC.
+    """
+    start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
+    if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
+        return None
+    opcode, length = RECORD_HEADER.unpack_from(view, start)
+    if opcode != Opcode.FOOTER or length != _FOOTER_BYTES - RECORD_HEADER_BYTES:
+        return None
+    footer: Footer = parse_record(opcode, view[start + RECORD_HEADER_BYTES :])
+    if footer.summary_start == 0:
+        return footer
+    if not len(MCAP0_MAGIC) <= footer.summary_start <= start:
+        raise CorruptLogError("the footer points outside the file")
+    covered = view[footer.summary_start : start + _FOOTER_BYTES - 4]
+    if footer.summary_crc and crc32(covered) != footer.summary_crc:
+        raise CorruptLogError("the summary does not match its CRC")
+    return footer

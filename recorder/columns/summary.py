@@ -1,0 +1,122 @@
+"""What the end of an MCAP file tells of the rest: gathered while it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.chunk_table import chunk_index_record
+
+
+@dataclass
+class Summary:
+    """Of a file.
+
+    Attributes:
+        schemas: by id.
+        channels: by id.
+        counts: messages of each channel, by its id.
+        chunks: in the order of the file.
+        metadata: likewise.
+        attachments: likewise.
+    """
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+
+    def note(self, record: McapRecord, offset: int, length: int) -> None:
+        """Take up a record that was written outside of chunks."""
+        match record:
+            case Schema():
+                self.schemas[record.id] = record
+            case Channel():
+                self.channels[record.id] = record
+                self.counts.setdefault(record.id, 0)
+            case Metadata():
+                self.metadata.append(MetadataIndex(offset, length, record.name))
+            case Attachment():
+                self.attachments.append(
+                    AttachmentIndex(
+                        offset=offset,
+                        length=length,
+                        log_time=record.log_time,
+                        create_time=record.create_time,
+                        data_size=len(record.data),
+                        name=record.name,
+                        media_type=record.media_type,
+                    )
+                )
+
+    def to_bytes(self, start: int) -> bytes:
+        """All that stands behind the data section; `start` is where it will stand."""
+        builder = RecordBuilder()
+        groups: list[SummaryOffset] = []
+        for opcode, records in self._groups():
+            group_start = builder.count
+            for record in records:
+                # A log of short episodes has very many of these.
+                if isinstance(record, ChunkIndex):
+                    builder.write(chunk_index_record(record))
+                else:
+                    record.write(builder)
+            if builder.count > group_start:
+                length = builder.count - group_start
+                groups.append(
+                    SummaryOffset(
+                        group_opcode=opcode, group_start=start + group_start, group_length=length
+                    )
+                )
+        offsets_start = start + builder.count
+        for group in groups:
+            group.write(builder)
+        summary = builder.end()
+        Footer(start, offsets_start, 0).write(builder)
+        footer = builder.end()
+        crc = crc32(footer[:-4], crc32(summary))
+        return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
+
+    def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:
+        return [
+            (Opcode.SCHEMA, self.schemas.values()),
+            (Opcode.CHANNEL, self.channels.values()),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self.chunks),
+            (Opcode.ATTACHMENT_INDEX, self.attachments),
+            (Opcode.METADATA_INDEX, self.metadata),
+        ]
+
+    def _statistics(self) -> Statistics:
+        chunks = self.chunks
+        return Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=self.counts,
+            chunk_count=len(chunks),
+            message_count=sum(self.counts.values()),
+            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )

@@ -1,0 +1,188 @@
+"""Arrays of transitions become columns of episodes, with spaces made up where none are given."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import SpaceError
+from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
+
+
+def columns_of_arrays(
+    *,
+    observations: Any,
+    actions: Any,
+    rewards: Any,
+    terminated: Any,
+    truncated: Any,
+    next_observations: Any,
+    behavior_probs: Any,
+    env_id: str,
+    observation_space: spaces.Space[Any] | None,
+    action_space: spaces.Space[Any] | None,
+) -> tuple[Transitions, LogMetadata]:
+    """See `Dataset.from_arrays`, whose arguments these are.
+
+    Raises:
+        SpaceError: lengths or shapes do not agree with each other or with the spaces.
+    """
+    description = LogMetadata(
+        observation_space=observation_space or _space_of(observations),
+        action_space=action_space or action_space_of(np.asarray(actions)),
+        env_id=env_id,
+        versions=installed_versions(),
+    )
+    steps = len(np.atleast_1d(np.asarray(rewards)))
+    if steps == 0:
+        raise SpaceError("no transitions: the arrays are empty")
+    leaves = observation_leaves(description.observation_space)
+    here = [_leaf_array("observations", observations, leaf, steps) for leaf in leaves]
+    there = [_leaf_array("next_observations", next_observations, leaf, steps) for leaf in leaves]
+    action = action_leaf(description.action_space)
+    unknown = np.full(steps, np.nan, np.float32)
+    probs = unknown if behavior_probs is None else behavior_probs
+    columns = {
+        "actions": _leaf_array("actions", actions, action, steps),
+        "rewards": _scalars("rewards", rewards, np.float64, steps),
+        "terminated": _scalars("terminated", terminated, np.bool_, steps),
+        "truncated": _scalars("truncated", truncated, np.bool_, steps),
+        "behavior_probs": _scalars("behavior_probs", probs, np.float32, steps),
+    }
+    lasts = _last_steps(columns["terminated"] | columns["truncated"], here, there)
+    transitions = _assemble(columns, here, there, lasts, description.step_duration_ns)
+    return transitions, description
+
+
+def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
+    """The same columns with log_times that rise by one step from frame to frame."""
+    times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
+    first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
+    episodes = tuple(
+        episode._replace(start_time_ns=int(times[start]), end_time_ns=int(times[start + length]))
+        for episode, start, length in zip(columns.episodes, first, lengths, strict=True)
+    )
+    return dataclasses.replace(columns, log_time_ns=times, episodes=episodes)
+
+
+def _reason(terminated: bool, truncated: bool) -> str:
+    """Why an episode ended, as far as its flags tell."""
+    return "terminated" if terminated else "truncated" if truncated else ""
+
+
+def _space_of(observations: Any) -> spaces.Space[Any]:
+    if isinstance(observations, Mapping):
+        return spaces.Dict([(key, _space_of(part)) for key, part in observations.items()])
+    array = np.asarray(observations)
+    return box_of(array)
+
+
+def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
+    """Discrete up to the largest of integers, an unbounded Box for all else.
+
+    Raises:
+        SpaceError: an integer is negative, or the array is of no number type.
+    """
+    if actions.ndim == 1 and actions.dtype.kind in "iu" and actions.size:
+        if actions.min() < 0:
+            raise SpaceError(f"action {actions.min()} is negative; give action_space")
+        return spaces.Discrete(int(actions.max()) + 1)
+    return box_of(actions)
+
+
+def box_of(array: NDArray[Any]) -> spaces.Box:
+    """A Box without bounds: the whole range of an integer, infinity for a float."""
+    kind = array.dtype.kind
+    if kind in "iu":
+        low, high = int(np.iinfo(array.dtype).min), int(np.iinfo(array.dtype).max)
+        return spaces.Box(low, high, array.shape[1:], array.dtype.type)
+    if kind != "f":
+        raise SpaceError(f"an array of {array.dtype} has no Box; give the space")
+    return spaces.Box(-np.inf, np.inf, array.shape[1:], array.dtype.type)
+
+
+def _leaf_array(role: str, values: Any, leaf: Leaf, steps: int) -> NDArray[Any]:
+    where = role + "".join(f"['{key}']" for key in leaf.path)
+    try:
+        array = np.asarray(leaf.of(values))
+    except (KeyError, IndexError, TypeError) as error:
+        raise SpaceError(f"{where} is missing") from error
+    if array.shape != (steps, *leaf.shape):
+        raise SpaceError(f"{where} has shape {array.shape}, expected {(steps, *leaf.shape)}")
+    return _exactly(where, array, leaf.dtype)
+
+
+def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
+    array = np.asarray(values)
+    if array.shape != (steps,):
+        raise SpaceError(f"{role} has shape {array.shape}, expected {(steps,)}")
+    if array.dtype.kind not in "biuf" or (dtype is np.bool_ and not np.isin(array, (0, 1)).all()):
+        raise SpaceError(f"{role} are not {'flags' if dtype is np.bool_ else 'numbers'}")
+    return array.astype(dtype)
+
+
+def _exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Cast without losing anything."""
+    if array.dtype == dtype:
+        return array.copy()
+    with np.errstate(all="ignore"):
+        cast = array.astype(dtype)
+    if not np.array_equal(cast, array, equal_nan=dtype.kind == "f" and array.dtype.kind == "f"):
+        raise SpaceError(f"{where} is {array.dtype} and does not fit the space's {dtype} exactly")
+    return cast
+
+
+def _last_steps(
+    ends: NDArray[np.bool_], here: list[NDArray[Any]], there: list[NDArray[Any]]
+) -> NDArray[np.int64]:
+    """The last transition of each episode."""
+    last = ends.copy()
+    last[-1] = True
+    for observation, following in zip(here, there, strict=True):
+        differ = _bytes_of(observation)[1:] != _bytes_of(following)[:-1]
+        last[:-1] |= differ.any(axis=1)
+    return np.flatnonzero(last)
+
+
+def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """Rows as bytes, so that NaN equals itself."""
+    return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)
+
+
+def _assemble(
+    columns: dict[str, NDArray[Any]],
+    here: list[NDArray[Any]],
+    there: list[NDArray[Any]],
+    lasts: NDArray[np.int64],
+    step_ns: int,
+) -> Transitions:
+    behind = lasts + 1
+    frames = tuple(
+        np.insert(observation, behind, following[lasts], axis=0)
+        for observation, following in zip(here, there, strict=True)
+    )
+    starts = np.concatenate([[0], behind[:-1]])
+    episodes = tuple(
+        EpisodeSummary(
+            episode=number,
+            length=int(last - start + 1),
+            total_reward=add_up(columns["rewards"][start : last + 1]),
+            terminated=bool(columns["terminated"][last]),
+            truncated=bool(columns["truncated"][last]),
+            start_time_ns=0,
+            end_time_ns=0,
+            reason=_reason(columns["terminated"][last], columns["truncated"][last]),
+        )
+        for number, (start, last) in enumerate(zip(starts, lasts, strict=True))
+    )
+    times = np.empty(len(columns["rewards"]) + len(episodes), np.int64)
+    transitions = Transitions(frames=frames, log_time_ns=times, episodes=episodes, **columns)
+    return with_fresh_times(transitions, 0, step_ns)

@@ -1,0 +1,167 @@
+"""Image observations: the pictures of a topic that belong to the records of `/rl/step`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.dataset.episodes import time_order
+from mcaprl.recorder.dataset.image_cache import IMAGE_TYPE, Storage, image_cache, is_mapped
+from mcaprl.recorder.dataset.mapped import Frames, MappedImages, PictureFile
+from mcaprl.recorder.format.reading import (
+    MESSAGE_HEADER,
+    Columns,
+    Decoder,
+    McapReader,
+    Span,
+    Topic,
+    chunk_header,
+)
+from mcaprl.recorder.format.spaces import Leaf
+from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK, STEP_TOPIC
+
+_FIELDS = ("height", "width", "encoding", "step", "data")
+
+
+def read_images(
+    reader: McapReader,
+    leaf: Leaf,
+    times: NDArray[np.int64],
+    *,
+    storage: Storage,
+    threads: int = 1,
+) -> Frames:
+    """(F, *shape) pictures of an image leaf, one for each of `times`.
+
+    Raises:
+        CorruptLogError: one is missing, or is of another size or encoding.
+    """
+    images = _Images(reader, leaf)
+    if not is_mapped(storage, len(times) * leaf.size):
+        return images.read(images.order_at(times), threads)
+    if not images.are_mappable:
+        cache = image_cache(reader, images.topic, images.blocks())
+        images = _Images(cache, leaf)
+    return images.mapped(images.order_at(times))
+
+
+class _Images:
+    """The topic of an image leaf in a file."""
+
+    def __init__(self, reader: McapReader, leaf: Leaf) -> None:
+        self.topic = Topic(reader, leaf.topic)
+        self._reader, self._leaf = reader, leaf
+        if not len(self.topic):
+            raise CorruptLogError(f"{reader.path}: no images on {leaf.topic}")
+        if not set(_FIELDS) <= set(self.topic.fields):
+            raise CorruptLogError(f"{reader.path}: messages of {leaf.topic} are no {IMAGE_TYPE}")
+
+    @property
+    def are_mappable(self) -> bool:
+        """Whether all pictures stand in the file as they are."""
+        chunks = [span.chunk for span in self.topic.spans]
+        return all(chunk is not None and not chunk.compression for chunk in chunks)
+
+    def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Which message is that of each time.
+
+        Raises:
+            CorruptLogError: there is none, or there are several.
+        """
+        by_time = time_order(self.topic)
+        rising = self.topic.times if by_time is None else self.topic.times[by_time]
+        place = np.searchsorted(rising, times)
+        found = rising[np.minimum(place, len(rising) - 1)] == times
+        where = f"{self._reader.path}: {self.topic.name}"
+        if not found.all():
+            missing = times[~found]
+            raise CorruptLogError(
+                f"{where} has no image for {len(missing)} records of {STEP_TOPIC}, the first at"
+                f" log_time {missing[0]}"
+            )
+        if (rising[1:] == rising[:-1]).any():
+            raise CorruptLogError(f"{where} has two images of one log_time")
+        return place if by_time is None else by_time[place]
+
+    def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
+        """(F, *shape) the pictures in memory."""
+        is_all = len(order) == len(self.topic) and bool((np.diff(order) == 1).all())
+        columns = self.topic.read(_FIELDS, None if is_all else order, threads=threads)
+        self._check(columns)
+        return columns["data"].reshape(-1, *self._leaf.shape)
+
+    def blocks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+        """All pictures in the order of their times, some at a time."""
+        order = time_order(self.topic)
+        order = np.arange(len(self.topic)) if order is None else order
+        for start in range(0, len(order), IMAGES_PER_CHUNK):
+            part = order[start : start + IMAGES_PER_CHUNK]
+            yield self.topic.times[part], self.read(part)
+
+    def mapped(self, order: NDArray[np.int64]) -> MappedImages:
+        """(F, *shape) the pictures on disk, each checked when it is asked for."""
+        places = np.empty((len(self.topic), 3), np.int64)
+        checks, start = [], 0
+        first = self._data_offset()
+        for number, (decoder, span) in enumerate(self.topic.parts):
+            chunk, index = span.chunk, span.index
+            assert chunk is not None, "pictures outside of chunks are not mapped"
+            data = chunk_header(self._reader.view, chunk.chunk_start_offset).data
+            stop = start + len(index)
+            places[start:stop, 0], places[start:stop, 1] = 0, number
+            places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
+            checks.append(self._check_of(decoder, span, first))
+            start = stop
+        name = str(self._reader.path)
+        file = PictureFile(name, self._reader.view, self._leaf.size, checks)
+        return MappedImages([file], self._leaf.shape, places[order])
+
+    def _data_offset(self) -> int:
+        """Where the first message's picture is, counted from its record."""
+        decoder, span = next(self.topic.parts)
+        found = decoder.alike(self._reader.records_of(span), span.index[:1], _FIELDS)
+        if found is None:
+            raise CorruptLogError(f"{self._reader.path}: an image on {self.topic.name} is damaged")
+        return _offset_of_data(found.dtype)
+
+    def _check_of(self, decoder: Decoder, span: Span, data_offset: int) -> Callable[[], None]:
+        def check() -> None:
+            found = decoder.alike(self._reader.records_of(span), span.index, _FIELDS)
+            if found is None or _offset_of_data(found.dtype) != data_offset:
+                raise CorruptLogError(
+                    f"{self._reader.path}: images on {self.topic.name} are not all of one form;"
+                    " open the log with images='memory'"
+                )
+            self._check({name: found[name] for name in _FIELDS})
+
+        return check
+
+    def _check(self, columns: Columns) -> None:
+        """Make sure that pictures are of the leaf's size and encoding.
+
+        Raises:
+            CorruptLogError: one is not.
+        """
+        height, width = self._leaf.shape[:2]
+        encoding = self._leaf.encoding or ""
+        as_stored = encoding.encode() if columns["encoding"].dtype.kind == "S" else encoding
+        expected = (height, width, as_stored, self._leaf.size // height)
+        found = [columns[name] for name in _FIELDS[:-1]]
+        wrong = np.logical_or.reduce([a != b for a, b in zip(found, expected, strict=True)])
+        if wrong.any() or columns["data"].shape[1:] != (self._leaf.size,):
+            row = int(np.argmax(wrong))
+            told = ", ".join(
+                f"{name} {column[row]}" for name, column in zip(_FIELDS, found, strict=False)
+            )
+            raise CorruptLogError(
+                f"{self._reader.path}: an image on {self.topic.name} has {told} and"
+                f" {columns['data'].shape[1]} bytes; the space says {height}x{width} {encoding}"
+            )
+
+
+def _offset_of_data(message: np.dtype[np.void]) -> int:
+    assert message.fields is not None
+    return MESSAGE_HEADER.itemsize + int(message.fields["data"][1])

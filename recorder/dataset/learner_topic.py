@@ -1,0 +1,43 @@
+"""Reads `/rl/learner`: how the policy that acted learned meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.topics import LEARNER_TOPIC
+
+
+@dataclass(frozen=True, eq=False)
+class LearnerColumns:
+    """One row for each transition of a log, in the log's order.
+
+    Attributes:
+        log_time_ns: (N,) when its observation was made.
+        epsilon: (N,) probability of a random action; NaN if unknown.
+        policy_version: (N,) updates that the policy had seen; -1 if unknown.
+    """
+
+    log_time_ns: NDArray[np.int64]
+    epsilon: NDArray[np.float64]
+    policy_version: NDArray[np.int64]
+
+
+def read_learner(path: str | Path) -> LearnerColumns:
+    """Read what `RecordVecMcap(..., policy_version=...)` wrote beside the transitions.
+
+    Raises:
+        LogError: the file has no such topic, or is damaged.
+    """
+    topic = Topic(McapReader(path), LEARNER_TOPIC)
+    if not topic.fields:
+        raise LogError(
+            f"{path} has no topic {LEARNER_TOPIC}: it was recorded without a policy version"
+        )
+    columns = topic.read(("epsilon", "policy_version"))
+    return LearnerColumns(topic.times, columns["epsilon"], columns["policy_version"])

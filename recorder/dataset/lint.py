@@ -1,0 +1,277 @@
+"""What in a dataset will spoil learning, or may: each finding with its place and its effect."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from typing import Any, Final, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+
+Severity = Literal["problem", "note"]
+
+GAP: Final = 1.5
+"""A pause between two steps that is longer than so many usual ones is a gap."""
+_SHOWN = 3
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something a learner should know of its data.
+
+    Attributes:
+        severity: `problem` for what is wrong, `note` for what may well be meant.
+        what: is the matter.
+        where: in the data.
+        effect: on learning.
+    """
+
+    severity: Severity
+    what: str
+    where: str
+    effect: str
+
+    def __str__(self) -> str:
+        """On one line."""
+        return f"{self.what} ({self.where}): {self.effect}"
+
+
+def lint(dataset: Dataset) -> list[Finding]:
+    """Look for everything that this module knows; problems come first."""
+    found = [finding for look in _LOOKS for finding in look(dataset)]
+    return sorted(found, key=lambda finding: finding.severity != "problem")
+
+
+def _not_finite(dataset: Dataset) -> Iterator[Finding]:
+    effect = "one such number in a batch makes every weight NaN; training refuses it"
+    counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
+    for leaf in _leaves(dataset):
+        if counts[leaf.name]:
+            places = _places(dataset, functools.partial(_frames, leaf))
+            what = f"{counts[leaf.name]} values of {leaf.name} are NaN or infinite"
+            yield Finding("problem", what, places, effect)
+    bad = int((~np.isfinite(dataset.rewards)).sum())
+    if bad:
+        places = _places(dataset, lambda episode: episode.rewards)
+        yield Finding("problem", f"{bad} rewards are NaN or infinite", places, effect)
+
+
+def _out_of_range(dataset: Dataset) -> Iterator[Finding]:
+    for leaf in _leaves(dataset):
+        space: Any = dataset.observation_space
+        for key in leaf.path:
+            space = space[key]
+        if not isinstance(space, spaces.Box) or leaf.encoding is not None:
+            continue
+        column = dataset.statistics.observations[leaf.name]
+        low, high = space.low.reshape(-1), space.high.reshape(-1)
+        wrong = np.flatnonzero((column.low < low) | (column.high > high))
+        if len(wrong):
+            first = int(wrong[0])
+            yield Finding(
+                "problem",
+                f"{_count(len(wrong), 'number')} of {leaf.name} leave their space",
+                f"{_name(dataset, leaf, first)} is {column.low[first]:.4g} to"
+                f" {column.high[first]:.4g}, its space {low[first]:.4g} to {high[first]:.4g}",
+                "what scales observations by their space gets numbers that it was not made for",
+            )
+
+
+def _constant(dataset: Dataset) -> Iterator[Finding]:
+    if len(dataset) < 2:
+        return
+    for leaf in _leaves(dataset):
+        column = dataset.statistics.observations[leaf.name]
+        same = np.flatnonzero(column.low == column.high)
+        if len(same):
+            names = ", ".join(_name(dataset, leaf, int(index)) for index in same[:_SHOWN])
+            yield Finding(
+                "note",
+                f"{_count(len(same), 'number')} of {leaf.name} never change",
+                names + (", ..." if len(same) > _SHOWN else ""),
+                "they say nothing here, and a network has not learned to ignore other values",
+            )
+
+
+def _duplicates(dataset: Dataset) -> Iterator[Finding]:
+    alike: dict[bytes, list[int]] = defaultdict(list)
+    for episode in dataset.episodes:
+        digest = sha256()
+        for part in (*_arrays(episode.observations), episode.actions, episode.rewards):
+            digest.update(np.ascontiguousarray(part).data)
+        alike[digest.digest()].append(episode.index)
+    copies = [indexes for indexes in alike.values() if len(indexes) > 1]
+    if copies:
+        extra = sum(len(indexes) - 1 for indexes in copies)
+        yield Finding(
+            "problem",
+            f"{_count(extra, 'episode')} repeat others, step by step",
+            "; ".join(_listed(indexes) for indexes in copies[:_SHOWN]),
+            "they count twice, and held-out episodes are not held out",
+        )
+
+
+def _actions_never_taken(dataset: Dataset) -> Iterator[Finding]:
+    space = dataset.action_space
+    if not isinstance(space, spaces.Discrete) or not dataset.statistics.action_counts:
+        return
+    every = range(int(space.start), int(space.start + space.n))
+    missing = [action for action in every if action not in dataset.statistics.action_counts]
+    if missing:
+        names = [dataset.action_names.get(action, str(action)) for action in missing[:_SHOWN]]
+        yield Finding(
+            "note",
+            f"{_count(len(missing), 'action')} of {int(space.n)} were never taken",
+            ", ".join(names) + (", ..." if len(missing) > _SHOWN else ""),
+            "their values are guesses: choose an algorithm that keeps to the data (cql, bcq, bc)",
+        )
+
+
+def _rewards(dataset: Dataset) -> Iterator[Finding]:
+    rewards = dataset.rewards
+    if len(rewards) and not rewards.any():
+        yield Finding(
+            "problem", "no reward differs from 0", "all steps", "there is nothing to learn from"
+        )
+        return
+    last = np.zeros(len(rewards), dtype=bool)
+    last[np.cumsum(dataset.statistics.lengths) - 1] = True
+    if not rewards[~last].any():
+        yield Finding(
+            "note",
+            "rewards are paid on the last steps of episodes only",
+            f"{int((rewards != 0).sum())} of {len(dataset.episodes)} episodes",
+            "it takes many updates until the first steps hear of them: n-step returns help",
+        )
+        return
+    cut, others = rewards[dataset.truncated], rewards[~last]
+    if len(cut) and len(others):
+        beyond = (cut < others.min()) | (cut > others.max())
+        if beyond.any():
+            yield Finding(
+                "problem",
+                f"{_count(int(beyond.sum()), 'truncated episode')} end with a reward that no"
+                " other step has",
+                f"{cut[beyond][0]:.4g}, elsewhere {others.min():.4g} to {others.max():.4g}",
+                "truncated episodes count as going on: this reward belongs to a terminal state",
+            )
+
+
+def _time_gaps(dataset: Dataset) -> Iterator[Finding]:
+    pauses = [np.diff(episode.log_time_ns) for episode in dataset.episodes]
+    if not pauses:
+        return
+    usual_ns = float(np.median(np.concatenate(pauses)))
+    gaps = [
+        (index, int(step), int(pause[step]))
+        for index, pause in enumerate(pauses)
+        for step in np.flatnonzero(pause > GAP * usual_ns)
+    ]
+    if gaps:
+        index, step, longest_ns = max(gaps, key=lambda gap: gap[2])
+        yield Finding(
+            "problem",
+            f"{_count(len(gaps), 'gap')} in time, where steps are {usual_ns / 1e9:.4g} s apart",
+            f"the longest is {longest_ns / 1e9:.4g} s, episode {index} step {step}",
+            "steps are missing, or took longer: their rewards and next observations do not compare",
+        )
+
+
+def _mixed_policies(dataset: Dataset) -> Iterator[Finding]:
+    policies = Counter(episode.policy or "unknown" for episode in dataset.episodes)
+    if len(policies) > 1:
+        yield Finding(
+            "note",
+            f"{len(policies)} policies acted",
+            ", ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
+            "behavior cloning learns their average, and no single one of them",
+        )
+
+
+def _unknown_probabilities(dataset: Dataset) -> Iterator[Finding]:
+    unknown = int(np.isnan(dataset.behavior_probs).sum())
+    if unknown:
+        yield Finding(
+            "note",
+            f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
+            _places(dataset, lambda episode: episode.behavior_probs),
+            "off-policy evaluation by importance sampling is not possible",
+        )
+
+
+def _wrong_probabilities(dataset: Dataset) -> Iterator[Finding]:
+    found = calibration(dataset.behavior_probs, dataset.action_space)
+    if found is not None and not found.possible:
+        yield Finding(
+            "problem",
+            f"behavior_prob cannot be right: it speaks of {found}",
+            "over all steps",
+            "off-policy evaluation weighs steps by it, and its estimates are off",
+        )
+
+
+_LOOKS: Final[tuple[Callable[[Dataset], Iterator[Finding]], ...]] = (
+    _not_finite,
+    _out_of_range,
+    _duplicates,
+    _time_gaps,
+    _rewards,
+    _constant,
+    _actions_never_taken,
+    _mixed_policies,
+    _unknown_probabilities,
+    _wrong_probabilities,
+)
+
+
+def _leaves(dataset: Dataset) -> tuple[Leaf, ...]:
+    return observation_leaves(dataset.observation_space)
+
+
+def _frames(leaf: Leaf, episode: Episode) -> NDArray[Any]:
+    """(T + 1, *shape) all observations of an episode."""
+    last = leaf.of(episode.next_observations)[-1:]
+    return np.concatenate([leaf.of(episode.observations), last])
+
+
+def _name(dataset: Dataset, leaf: Leaf, index: int) -> str:
+    """Of one number of a leaf."""
+    names = dataset.observation_names
+    return names[index] if len(names) == leaf.size else f"{leaf.name}[{index}]"
+
+
+def _arrays(observations: Any) -> list[NDArray[Any]]:
+    if isinstance(observations, dict):
+        return [array for part in observations.values() for array in _arrays(part)]
+    return [observations]
+
+
+def _places(dataset: Dataset, column: Callable[[Episode], NDArray[Any]]) -> str:
+    """The first steps whose numbers are not finite."""
+    found: list[str] = []
+    for episode in dataset.episodes:
+        values = column(episode)
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
+        found += [f"episode {episode.index} step {step}" for step in np.flatnonzero(bad)[:_SHOWN]]
+        if len(found) >= _SHOWN:
+            break
+    return ", ".join(found[:_SHOWN])
+
+
+def _listed(indexes: list[int]) -> str:
+    more = f" and {len(indexes) - _SHOWN} more" if len(indexes) > _SHOWN else ""
+    return f"episodes {', '.join(map(str, indexes[:_SHOWN]))}{more}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' if number != 1 else ''}"

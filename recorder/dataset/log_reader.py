@@ -1,0 +1,294 @@
+"""Reads one log of format version 1, or what is asked for of it: chunks -> columns -> episodes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, SpaceError
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episodes import (
+    COUNTERS,
+    Told,
+    episode_lengths,
+    step_order,
+    summaries,
+)
+from mcaprl.recorder.dataset.foreign import inferred_metadata, observation_fields
+from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.images import read_images
+from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.transitions import Transitions, spans
+from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
+from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
+from mcaprl.recorder.format.schema import is_intact, stored_dtype
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves, restricted, select
+from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
+
+# Steps; see `_without`.
+_LONG_EPISODE = 100
+REQUIRED_FIELDS = ("reward", "action", "terminated", "truncated", *COUNTERS)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of a log is to be read, and how; see `reader.open_logs`."""
+
+    columns: tuple[str, ...] | None = None
+    images: Storage = "memory"
+    threads: int = 1
+
+
+class LogReader:
+    """One log, open for reading."""
+
+    def __init__(self, path: Path, selection: Selection | None = None) -> None:
+        """Open the file. Only its summary is read.
+
+        Raises:
+            LogError: it is no MCAP, has no steps, or its metadata is damaged.
+        """
+        self.path = path
+        self._selection = selection or Selection()
+        self._reader = McapReader(path)
+        self._steps = _steps_of(self._reader)
+        self._metadata = described(self._reader)
+        self._told = Told(Topic(self._reader, EPISODE_TOPIC))
+
+    @cached_property
+    def lengths(self) -> NDArray[np.int64]:
+        """(E,) transitions of each finished episode.
+
+        Raises:
+            CorruptLogError: records are missing, doubled or out of order.
+            NoEpisodesError: there is no finished episode.
+        """
+        # What is told is believed only as far as it agrees with what is read then.
+        told = self._told.lengths if self._reader.complete else np.empty(0, np.int64)
+        if self._steps.chunks_rise and int(told.sum()) + len(told) == len(self._steps):
+            return told
+        self._check_fields(COUNTERS)
+        return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self._name))
+
+    def read(self, episodes: NDArray[np.int64] | None = None) -> Dataset:
+        """Read whole episodes.
+
+        Args:
+            episodes: their numbers, rising; default: all.
+
+        Raises:
+            LogError: chunks are damaged, records are missing, or fields are.
+        """
+        wanted = self._wanted()
+        self._check_fields(wanted)
+        if episodes is None:
+            columns = self._steps.read(wanted, self._order, threads=self._selection.threads)
+            lengths = self._finished(episode_lengths(columns, self._name))
+            frames = int(lengths.sum()) + len(lengths)
+            columns = {name: column[:frames] for name, column in columns.items()}
+        else:
+            columns, lengths = self._read_some(episodes, wanted)
+        metadata = self._metadata or inferred_metadata(self._reader, columns)
+        return self._dataset(metadata, columns, lengths)
+
+    @property
+    def _name(self) -> str:
+        return str(self.path)
+
+    @cached_property
+    def _order(self) -> NDArray[np.int64] | None:
+        return step_order(self._steps)
+
+    def _read_some(
+        self, episodes: NDArray[np.int64], wanted: Sequence[str]
+    ) -> tuple[Columns, NDArray[np.int64]]:
+        lengths = self.lengths
+        firsts = np.cumsum(lengths + 1) - (lengths + 1)
+        rows = spans(firsts[episodes], lengths[episodes] + 1)
+        # The order is found in the indexes of all chunks, or need not be.
+        if not self._steps.chunks_rise and self._order is not None:
+            rows = self._order[rows]
+        columns = self._steps.read(wanted, rows, threads=self._selection.threads)
+        if not np.array_equal(episode_lengths(columns, self._name), lengths[episodes]):
+            raise CorruptLogError(
+                f"{self.path}: {EPISODE_TOPIC} and {STEP_TOPIC} do not agree on the episodes"
+            )
+        return columns, lengths[episodes]
+
+    def _wanted(self) -> list[str]:
+        """The fields of `/rl/step` that are to be read."""
+        fields = self._steps.fields
+        wanted = [*REQUIRED_FIELDS, *(name for name in ("behavior_prob",) if name in fields)]
+        if self._metadata is None:
+            return wanted + observation_fields(fields)
+        return wanted + [leaf.name for leaf in self._leaves(self._metadata) if not leaf.encoding]
+
+    def _leaves(self, metadata: LogMetadata) -> list[Leaf]:
+        """The observations that are to be read, by their names in the file."""
+        every = observation_leaves(metadata.observation_space)
+        return select(every, self._selection.columns)
+
+    def _check_fields(self, wanted: Sequence[str]) -> None:
+        if not len(self._steps):
+            raise NoEpisodesError(f"{self.path} has no finished episode")
+        fields = self._steps.fields
+        missing = [name for name in wanted if name not in fields]
+        if missing:
+            raise LogError(f"{self.path}: {STEP_TOPIC} has no field {', '.join(missing)}")
+        odd = [name for name in wanted if fields[name].kind == "O"]
+        if odd:
+            raise LogError(
+                f"{self.path}: {', '.join(odd)} of {STEP_TOPIC} is neither number nor array"
+            )
+
+    def _finished(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Tell of records behind the last finished episode.
+
+        Raises:
+            NoEpisodesError: there is no finished one.
+        """
+        if not len(lengths):
+            raise NoEpisodesError(f"{self.path} has no finished episode")
+        behind = len(self._steps) - int(lengths.sum()) - len(lengths)
+        if behind or not self._reader.complete:
+            warnings.warn(
+                f"{self.path} was cut off or is still being written; finished episodes read:"
+                f" {len(lengths)}, records behind them left out: {behind}",
+                stacklevel=4,
+            )
+        return lengths
+
+    def _dataset(
+        self, metadata: LogMetadata, columns: Columns, lengths: NDArray[np.int64]
+    ) -> Dataset:
+        leaves = self._leaves(metadata)
+        finals = np.cumsum(lengths + 1) - 1
+        told = self._told.summaries(columns[LOG_TIME][finals])
+        episodes = summaries(self.path, columns, lengths, told)
+        action = action_leaf(metadata.action_space)
+        probs = columns.get("behavior_prob")
+        if probs is None:
+            probs = np.full(len(columns["final"]), np.nan, np.float32)
+        transitions = Transitions(
+            frames=tuple(self._frames(leaf, columns) for leaf in leaves),
+            log_time_ns=columns[LOG_TIME],
+            episodes=episodes,
+            actions=_without(_as_leaf(self.path, columns, action), finals),
+            rewards=_without(columns["reward"].astype(np.float64, copy=False), finals),
+            terminated=_without(_flags(columns["terminated"]), finals),
+            truncated=_without(_flags(columns["truncated"]), finals),
+            behavior_probs=_without(probs.astype(np.float32, copy=False), finals),
+        )
+        if self._selection.columns is not None:
+            metadata = replace(
+                metadata, observation_space=restricted(metadata.observation_space, leaves)
+            )
+        return Dataset(transitions, metadata, sources=(self.path,))
+
+    def _frames(self, leaf: Leaf, columns: Columns) -> Frames:
+        if leaf.encoding is None:
+            return _as_leaf(self.path, columns, leaf)
+        return read_images(
+            self._reader,
+            leaf,
+            columns[LOG_TIME],
+            storage=self._selection.images,
+            threads=self._selection.threads,
+        )
+
+
+def describe(reader: McapReader) -> LogMetadata:
+    """The metadata of a log.
+
+    Raises:
+        NoStepsError: the file has no steps.
+        LogError: its metadata is missing, of a later version, or damaged.
+    """
+    _steps_of(reader)
+    return described(reader) or LogMetadata.from_strings({})
+
+
+def described(reader: McapReader) -> LogMetadata | None:
+    """The metadata of a log; None if it has none, for it is not one of ours.
+
+    Raises:
+        LogError: it is of a later version, or damaged.
+    """
+    record = reader.metadata.get(METADATA_NAME)
+    copies = [
+        # The channel's copy stands in the summary, too, under its CRC.
+        channel.metadata
+        for channel in reader.channels_of(STEP_TOPIC)
+        if "format_version" in channel.metadata
+    ]
+    copies += [record] if record is not None else []
+    if not copies:
+        return None
+    if any(copy != copies[0] for copy in copies):
+        raise CorruptLogError(
+            f"{reader.path}: the metadata record and the metadata of {STEP_TOPIC} differ"
+        )
+    try:
+        return LogMetadata.from_strings(copies[0])
+    except (LogError, SpaceError) as error:
+        raise LogError(f"{reader.path}: {error}") from error
+
+
+def _steps_of(reader: McapReader) -> Topic:
+    channels = reader.channels_of(STEP_TOPIC)
+    if not channels:
+        topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
+        raise NoStepsError(
+            f"{reader.path} has no topic {STEP_TOPIC}, so no transitions (topics: {topics})"
+        )
+    for schema in map(reader.schema_of, channels):
+        if not is_intact(schema.name, schema.data):
+            raise CorruptLogError(f"{reader.path}: the schema of {STEP_TOPIC} is damaged")
+    return Topic(reader, STEP_TOPIC)
+
+
+def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
+    """A field's column with the shape and dtype of its leaf.
+
+    Raises:
+        CorruptLogError: it does not fit the leaf without loss.
+    """
+    column = columns[leaf.name]
+    if column[0].size == leaf.size:
+        shaped = column.reshape(len(column), *leaf.shape)
+        if column.dtype == stored_dtype(leaf.dtype):
+            return shaped.astype(leaf.dtype, copy=False)
+        with np.errstate(all="ignore"):
+            cast = shaped.astype(leaf.dtype)
+        is_float = cast.dtype.kind == shaped.dtype.kind == "f"
+        if np.array_equal(cast, shaped, equal_nan=is_float):
+            return cast
+    raise CorruptLogError(
+        f"{path}: {STEP_TOPIC} does not fit the spaces in the metadata: {leaf.name} is"
+        f" {column.dtype} {column.shape[1:]}, its space {leaf.dtype} {leaf.shape}"
+    )
+
+
+def _flags(column: NDArray[Any]) -> NDArray[np.bool_]:
+    """A column of bytes as bools; anything but 0 is true."""
+    if column.dtype == np.uint8 and column.max(initial=0) <= 1:
+        return column.view(np.bool_)
+    return column.astype(np.bool_)
+
+
+def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
+    """A column without some of its rows; it is overwritten."""
+    if len(column) < _LONG_EPISODE * len(rows):
+        return np.delete(column, rows, axis=0)
+    # Where much stands between them, moving that is cheaper than another column.
+    starts, stops = rows[:-1] + 1, rows[1:]
+    for moved, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True), 1):
+        column[start - moved : stop - moved] = column[start:stop]
+    return column[: len(column) - len(rows)]

@@ -1,0 +1,125 @@
+"""What a dataset looks like, in numbers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.dataset.mapped import Frames
+from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.spaces import Leaf
+
+
+@dataclass(frozen=True)
+class Column:
+    """Ranges of one observation leaf, element by element; of an image, over all its pixels.
+
+    Attributes:
+        mean: without NaN and infinities.
+        std: likewise.
+        low: smallest value, NaN left out.
+        high: largest value, NaN left out.
+        not_finite: how many values are NaN or infinite.
+    """
+
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    not_finite: int
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """A dataset in numbers.
+
+    Attributes:
+        episodes: how many.
+        steps: transitions in all.
+        returns: (E,) undiscounted, in order.
+        lengths: (E,) transitions.
+        ends: episodes by the reason they ended.
+        duration_s: simulated time of all episodes.
+        observations: ranges by leaf name.
+        action_counts: how often each was taken, where actions are single integers; else empty.
+    """
+
+    episodes: int
+    steps: int
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+    ends: Mapping[str, int]
+    duration_s: float
+    observations: Mapping[str, Column]
+    action_counts: Mapping[int, int]
+
+    @property
+    def mean_return(self) -> float:
+        """Over episodes; NaN if there are none."""
+        return float(self.returns.mean()) if len(self.returns) else float("nan")
+
+
+def describe_columns(columns: Transitions, leaves: Sequence[Leaf]) -> Statistics:
+    """Compute the statistics of a dataset's columns."""
+    episodes = columns.episodes
+    ends = Counter(episode.reason or "unknown" for episode in episodes)
+    counts: dict[int, int] = {}
+    if columns.actions.ndim == 1 and columns.actions.dtype.kind in "iu":
+        values, numbers = np.unique(columns.actions, return_counts=True)
+        counts = dict(zip(values.tolist(), numbers.tolist(), strict=True))
+    return Statistics(
+        episodes=len(episodes),
+        steps=len(columns.rewards),
+        returns=np.array([episode.total_reward for episode in episodes]),
+        lengths=columns.lengths,
+        ends=dict(ends.most_common()),
+        duration_s=sum(e.end_time_ns - e.start_time_ns for e in episodes) / 1e9,
+        observations={
+            leaf.name: _describe(leaf, frames)
+            for leaf, frames in zip(leaves, columns.frames, strict=True)
+        },
+        action_counts=counts,
+    )
+
+
+def _describe(leaf: Leaf, frames: Frames) -> Column:
+    if leaf.encoding is not None:
+        return _describe_image(frames)
+    values = np.asarray(frames).reshape(len(frames), leaf.size).astype(np.float64)
+    finite = np.isfinite(values)
+    kept = np.where(finite, values, 0.0)
+    # 0 / 0 is NaN: of no finite value there is no mean.
+    with np.errstate(all="ignore"):
+        counts = finite.sum(axis=0)
+        mean = kept.sum(axis=0) / counts
+        squares = np.where(finite, (values - mean) ** 2, 0.0)
+        std = np.sqrt(squares.sum(axis=0) / counts)
+    return Column(
+        mean=mean,
+        std=std,
+        low=np.fmin.reduce(values, axis=0, initial=np.nan),
+        high=np.fmax.reduce(values, axis=0, initial=np.nan),
+        not_finite=int((~finite).sum()),
+    )
+
+
+def _describe_image(frames: Frames) -> Column:
+    """From the histogram of the pixels, since copies of images as floats would not fit."""
+    counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
+    codes = np.arange(256.0)
+    seen = codes[counts > 0] if len(frames) else np.full(1, np.nan)
+    if not len(frames):
+        return Column(mean=seen, std=seen, low=seen, high=seen, not_finite=0)
+    mean = float((codes * counts).sum() / counts.sum())
+    variance = float(((codes - mean) ** 2 * counts).sum() / counts.sum())
+    return Column(
+        mean=np.array([mean]),
+        std=np.array([variance**0.5]),
+        low=seen[:1],
+        high=seen[-1:],
+        not_finite=0,
+    )

@@ -1,0 +1,249 @@
+"""What a log says of itself, so that it opens without the simulator that made it.
+
+It is the metadata record `mcaprl.dataset`, the first after the file's header, and again the channel
+metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
+
+    format_version      "1"
+    env_id              Gymnasium id, empty if there is none
+    env_kwargs          JSON object: arguments to gymnasium.make
+    observation_space   JSON, see `spaces.space_to_json`
+    action_space        JSON
+    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": place};
+                        follows from the space (`spaces.observation_leaves`)
+    observation_names   JSON list, a name for each number of a vector observation; may be empty
+    action_meanings     JSON list, a name for each discrete action; may be empty
+    step_duration_ns    simulated time between two records
+    policy, epsilon, seed   that the recording began with; empty if unknown
+    versions            JSON object: package -> version
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+
+from mcaprl._version import __version__
+from mcaprl.errors import LogError
+from mcaprl.recorder.format.spaces import leaves_of, space_from_json, space_to_json
+
+FORMAT_VERSION = "1"
+METADATA_NAME = "mcaprl.dataset"
+# What recordings that share a file must agree on; the rest may change, and tells of the first one.
+SAME_WHEN_APPENDED = (
+    "format_version",
+    "env_id",
+    "env_kwargs",
+    "observation_space",
+    "action_space",
+    "observation_names",
+    "action_meanings",
+    "step_duration_ns",
+)
+DEFAULT_STEP_DURATION_NS = 100_000_000
+# What a spec says of drawing, and of how environments are brought together.
+_NOT_OF_ONE_ENV = (
+    "render_mode",
+    "num_envs",
+    "vectorization_mode",
+    "vector_kwargs",
+    "wrappers",
+    "autoreset_mode",
+)
+_VERSIONED = ("gymnasium", "numpy", "numba", "highway-env")
+
+
+@dataclass(frozen=True)
+class LogMetadata:
+    """The description of a log.
+
+    Attributes:
+        observation_space: of the environment.
+        action_space: of the environment.
+        env_id: Gymnasium id; empty if unknown.
+        env_kwargs: arguments to `gymnasium.make`; JSON types only.
+        observation_names: one for each number of a vector observation, or empty.
+        action_meanings: one for each discrete action, or empty.
+        step_duration_ns: simulated time between two records.
+        policy: who acted at first; each episode tells its own.
+        epsilon: its exploration, as text; empty if unknown.
+        seed: of the recording, as text; empty if unknown.
+        versions: of the packages that the recording ran with.
+    """
+
+    observation_space: spaces.Space[Any]
+    action_space: spaces.Space[Any]
+    env_id: str = ""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    observation_names: tuple[str, ...] = ()
+    action_meanings: tuple[str, ...] = ()
+    step_duration_ns: int = DEFAULT_STEP_DURATION_NS
+    policy: str = ""
+    epsilon: str = ""
+    seed: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def action_names(self) -> dict[int, str]:
+        """A name for each discrete action: its meaning if each has another one, else its number.
+
+        Empty for spaces of another kind.
+        """
+        space = self.action_space
+        if not isinstance(space, spaces.Discrete):
+            return {}
+        values = range(int(space.start), int(space.start + space.n))
+        meanings = self.action_meanings
+        if len(meanings) != len(values) or len(set(meanings)) != len(meanings):
+            return {value: str(value) for value in values}
+        return dict(zip(values, meanings, strict=True))
+
+    def to_strings(self) -> dict[str, str]:
+        """The map that is written to the file."""
+        fields = [
+            {
+                "path": leaf.path,
+                **({"topic": leaf.topic} if leaf.encoding else {"field": leaf.name}),
+            }
+            for leaf in leaves_of(self.observation_space)
+        ]
+        return {
+            "format_version": FORMAT_VERSION,
+            "env_id": self.env_id,
+            "env_kwargs": json.dumps(dict(self.env_kwargs), default=repr),
+            "observation_space": space_to_json(self.observation_space),
+            "action_space": space_to_json(self.action_space),
+            "observation_fields": json.dumps(fields),
+            "observation_names": json.dumps(self.observation_names),
+            "action_meanings": json.dumps(self.action_meanings),
+            "step_duration_ns": str(self.step_duration_ns),
+            "policy": self.policy,
+            "epsilon": self.epsilon,
+            "seed": self.seed,
+            "versions": json.dumps(dict(self.versions)),
+        }
+
+    @classmethod
+    def from_strings(cls, strings: Mapping[str, str]) -> LogMetadata:
+        """Read the map from a file.
+
+        Raises:
+            LogError: a later format version, or a value that does not parse.
+        """
+        found = strings.get("format_version")
+        if found is None:
+            raise LogError(f"no metadata record '{METADATA_NAME}': the spaces are not known")
+        if found != FORMAT_VERSION:
+            raise LogError(
+                f"format version {found}; mcaprl {__version__} reads {FORMAT_VERSION}:"
+                " pip install -U mcaprl"
+            )
+        try:
+            return cls(
+                observation_space=space_from_json(strings["observation_space"]),
+                action_space=space_from_json(strings["action_space"]),
+                env_id=strings.get("env_id", ""),
+                env_kwargs=json.loads(strings.get("env_kwargs", "{}")),
+                observation_names=tuple(json.loads(strings.get("observation_names", "[]"))),
+                action_meanings=tuple(json.loads(strings.get("action_meanings", "[]"))),
+                step_duration_ns=int(strings.get("step_duration_ns", DEFAULT_STEP_DURATION_NS)),
+                policy=strings.get("policy", ""),
+                epsilon=strings.get("epsilon", ""),
+                seed=strings.get("seed", ""),
+                versions=json.loads(strings.get("versions", "{}")),
+            )
+        except (KeyError, ValueError, TypeError, MemoryError) as error:
+            raise LogError(f"metadata record '{METADATA_NAME}' does not parse: {error}") from error
+
+    @classmethod
+    def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
+        """What several descriptions agree on; the spaces must be the same."""
+        first, *others = parts
+        blank = cls(first.observation_space, first.action_space)
+        differing = {
+            field_.name: getattr(blank, field_.name)
+            for field_ in fields(cls)
+            if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
+        }
+        return replace(first, **differing)
+
+    @classmethod
+    def of_env(
+        cls,
+        env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+        *,
+        step_duration_s: float | None = None,
+        policy: str = "",
+        epsilon: str = "",
+        seed: str = "",
+    ) -> LogMetadata:
+        """Describe an environment: its spaces, id and arguments, and its own names for things.
+
+        A vector environment is described as one of those in it. The time of a step is, in this
+        order: the argument, the environment's `step_duration_s`, one over `metadata["render_fps"]`,
+        0.1 s.
+        """
+        one = _one_of(env)
+        inner = one.unwrapped
+        if step_duration_s is None:
+            fps = inner.metadata.get("render_fps")
+            fallback = 1 / fps if fps else DEFAULT_STEP_DURATION_NS / 1e9
+            step_duration_s = float(getattr(inner, "step_duration_s", fallback))
+        is_vector = isinstance(one, gym.vector.VectorEnv)
+        kwargs = dict(one.spec.kwargs) if one.spec else {}
+        for name in _NOT_OF_ONE_ENV:
+            kwargs.pop(name, None)
+        return cls(
+            observation_space=one.single_observation_space if is_vector else one.observation_space,
+            action_space=one.single_action_space if is_vector else one.action_space,
+            env_id=one.spec.id if one.spec else "",
+            env_kwargs=kwargs,
+            observation_names=_names(inner, "observation_names"),
+            action_meanings=_names(inner, "action_meanings"),
+            step_duration_ns=round(step_duration_s * 1e9),
+            policy=policy,
+            epsilon=epsilon,
+            seed=seed,
+            versions=installed_versions(),
+        )
+
+
+def _one_of(env: Any) -> Any:
+    """An environment that shows what all of a vector are, if they live in this process."""
+    if not isinstance(env, gym.vector.VectorEnv):
+        return env
+    inner = env.unwrapped
+    # Wrappers of the vector may have changed the spaces that its members know.
+    same = inner.single_observation_space == env.single_observation_space and (
+        inner.single_action_space == env.single_action_space
+    )
+    members = inner.envs if isinstance(inner, gym.vector.SyncVectorEnv) and same else []
+    return members[0] if members else env
+
+
+def _names(env: object, attribute: str) -> tuple[str, ...]:
+    """Names that an environment has for things; others mean methods by the same word."""
+    found = getattr(env, attribute, ())
+    return tuple(map(str, found)) if isinstance(found, list | tuple) else ()
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of what a recording depends on."""
+    return dict(_installed_versions())
+
+
+@lru_cache(maxsize=1)
+def _installed_versions() -> tuple[tuple[str, str], ...]:
+    # Each is read from a file; together they would take most of the time to begin a log.
+    found = {"mcaprl": __version__}
+    for package in _VERSIONED:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return tuple(found.items())

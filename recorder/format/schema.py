@@ -1,0 +1,255 @@
+"""Message types of one fixed length, as ROS 2 definition text and as NumPy dtype.
+
+A CDR message without strings and variable arrays is a C struct: a 4-byte encapsulation header,
+then the fields in order, each aligned to its own size, counted from behind that header. Such a
+type is a NumPy structured dtype, so that a chunk of messages is one array.
+
+`/rl/step` has its fields in falling order of size, hence no padding:
+
+    float64 reward              of the action taken here; 0 in a final record
+    int64 | float32[M] action   0 in a final record
+    float32[N] observation      one field per leaf of a Dict space, `observation_<key>`
+    float32 behavior_prob       probability of the action under the policy that took it, or NaN
+    uint32 episode, step        counted from 0
+    bool terminated, truncated  of the transition that starts here
+    bool final                  this record holds only an episode's last observation
+
+`/rl/learner` has, for each transition under its log_time, what changes while a policy learns:
+
+    float64 epsilon             probability of a random action; NaN if unknown
+    int64 policy_version        updates that the policy had seen; -1 if unknown
+
+Observations and actions keep their dtype (float16 is widened to float32). Image observations are
+not in it: they are `sensor_msgs/msg/Image` on topics of their own, under the same log_time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import struct
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from mcaprl.errors import SpaceError
+from mcaprl.recorder.columns.chunks import MAX_CHUNK_BYTES
+from mcaprl.recorder.columns.ros_types import ENCAPSULATION, ENCAPSULATION_BYTES, ROS_TO_NUMPY
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
+
+LEARNER_TYPE = "mcaprl_msgs/msg/Learner"
+LEARNER_TEXT = """\
+# Of the policy that took the action; NaN and -1 where unknown.
+float64 epsilon
+int64 policy_version
+"""
+
+_NUMPY_TO_ROS = {
+    np.dtype(code): name
+    for name, code in ROS_TO_NUMPY.items()
+    if name not in ("byte", "char", "bool")
+}
+_FIELD = re.compile(r"(\w+)(?:\[(\d+)\])?\s+([a-z][a-z0-9_]*)")
+
+
+def step_schema(
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> tuple[str, str]:
+    """Name and definition text of `/rl/step` for a pair of spaces.
+
+    The name carries a hash of the text, since one name must mean one layout to a viewer that has
+    several logs open.
+
+    Raises:
+        SpaceError: a log cannot hold these spaces.
+    """
+    vectors = [leaf for leaf in observation_leaves(observation_space) if leaf.encoding is None]
+    fields = [
+        ("float64", 0, "reward"),
+        _leaf_field(action_leaf(action_space)),
+        *map(_leaf_field, vectors),
+        ("float32", 0, "behavior_prob"),
+        ("uint32", 0, "episode"),
+        ("uint32", 0, "step"),
+        ("bool", 0, "terminated"),
+        ("bool", 0, "truncated"),
+        ("bool", 0, "final"),
+    ]
+    fields.sort(key=lambda field: -np.dtype(ROS_TO_NUMPY[field[0]]).itemsize)
+    return _named("Step", fields)
+
+
+def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
+    """Name and definition text of a message of float32 scalars, one per name: they are to plot.
+
+    Raises:
+        SpaceError: a name is no ROS field name.
+    """
+    names = list(names)
+    for name in names:
+        if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
+            raise SpaceError(
+                f"telemetry '{name}' is no ROS field name: lower case letters, digits and single"
+                " underscores"
+            )
+    return _named("Telemetry", [("float32", 0, name) for name in names])
+
+
+def telemetry_message(values: Iterable[float]) -> bytes:
+    """A message of `telemetry_schema`.
+
+    Values are rounded to 16 significant bits, more than four digits: a plot shows no more, and the
+    digits behind would be the greater part of what viewers need in a log.
+    """
+    mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
+    rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
+    return struct.pack(f"<I{len(rounded)}f", ENCAPSULATION, *rounded.tolist())
+
+
+def values_schema(actions: int) -> tuple[str, str]:
+    """Name and definition text of what a policy thinks of a step: `/rl/values`.
+
+    float32[A] q            value of each action; NaN if the policy has none
+    float32[A] preference   of each action: probabilities, or the softmax of the values
+    float32 value           of the state: the largest of q
+    float32 advantage       of the logged action: its q less `value`
+    float32 td_error        r + gamma max q(next) - q of the logged action
+    float32 entropy         of `preference`: 0 where it is sure, 1 where all are alike
+    int64 policy_action     what the policy would do
+    bool agrees             whether that is the logged action
+
+    Args:
+        actions: A, how many there are.
+    """
+    fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
+    fields += [("float32", actions, "preference")]
+    fields += [("float32", 0, name) for name in ("value", "advantage", "td_error", "entropy")]
+    return _named("Values", [*fields, ("bool", 0, "agrees")])
+
+
+def message_dtype(text: str) -> np.dtype[Any] | None:
+    """The memory layout of a ROS 2 message definition, encapsulation header included.
+
+    Args:
+        text: the definition, without nested types.
+
+    Returns:
+        A structured dtype with a field for each of the message's, and `encapsulation`; None if the
+        message has no fixed length.
+    """
+    names, offsets = ["encapsulation"], [0]
+    formats: list[np.dtype[Any]] = [np.dtype("<u4")]
+    end = ENCAPSULATION_BYTES
+    for line in text.splitlines():
+        declaration = line.split("#")[0].strip()
+        if not declaration or "=" in declaration:
+            continue
+        match = _FIELD.fullmatch(declaration)
+        if match is None or match[1] not in ROS_TO_NUMPY:
+            return None
+        scalar = np.dtype(ROS_TO_NUMPY[match[1]])
+        start = _align(end, scalar.itemsize)
+        count = 1 if match[2] is None else int(match[2])
+        if count > MAX_CHUNK_BYTES:
+            return None
+        field = scalar if match[2] is None else np.dtype((scalar, (count,)))
+        names.append(match[3])
+        formats.append(field)
+        offsets.append(start)
+        end = start + field.itemsize
+    try:
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
+    except (ValueError, OverflowError):
+        # A field twice, or of a size that no memory holds.
+        return None
+
+
+def is_intact(name: str, text: bytes) -> bool:
+    """Whether a definition is the one that its name was made for; others' names tell nothing."""
+    match = re.fullmatch(r"mcaprl_msgs/msg/(?:Step|Telemetry|Values)([0-9a-f]{8})", name)
+    return match is None or match[1] == _digest(text)
+
+
+def image_dtype(
+    height: int, width: int, channels: int, encoding: str, frame_id: str, item_bytes: int = 1
+) -> np.dtype[Any]:
+    """The memory layout of a `sensor_msgs/msg/Image` whose size and texts are known.
+
+    Its strings are of fixed content, so every message of the topic has one length.
+
+    Args:
+        height: rows.
+        width: columns.
+        channels: values per pixel.
+        encoding: such as `mono8`.
+        frame_id: of the header.
+        item_bytes: bytes per value.
+    """
+    layout: list[tuple[str, Any]] = [("encapsulation", "<u4"), ("sec", "<i4"), ("nanosec", "<u4")]
+    used = 12
+
+    def append(name: str, dtype: Any, alignment: int) -> None:
+        nonlocal used
+        start = _align(used, alignment)
+        if start > used:
+            layout.append((f"_pad{len(layout)}", f"V{start - used}"))
+        layout.append((name, dtype))
+        used = start + np.dtype(dtype).itemsize
+
+    for name, text in (("frame_id", frame_id), ("encoding", encoding)):
+        append(f"{name}_length", "<u4", 4)
+        append(name, f"S{len(text) + 1}", 1)
+        if name == "frame_id":
+            append("height", "<u4", 4)
+            append("width", "<u4", 4)
+    append("is_bigendian", "u1", 1)
+    append("row_bytes", "<u4", 4)
+    append("data_length", "<u4", 4)
+    append("data", ("u1", (height * width * channels * item_bytes,)), 1)
+    return np.dtype(layout)
+
+
+def fill_image_constants(
+    messages: np.ndarray[Any, Any],
+    height: int,
+    width: int,
+    encoding: str,
+    frame_id: str,
+) -> None:
+    """Write the fields that are the same in every image of a topic."""
+    data_bytes = messages.dtype["data"].itemsize
+    messages["encapsulation"] = ENCAPSULATION
+    messages["frame_id_length"], messages["frame_id"] = len(frame_id) + 1, frame_id.encode()
+    messages["encoding_length"], messages["encoding"] = len(encoding) + 1, encoding.encode()
+    messages["height"], messages["width"] = height, width
+    messages["row_bytes"], messages["data_length"] = data_bytes // height, data_bytes
+
+
+def stored_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The dtype that holds a leaf's values in a message: ROS has no float16, and bool is a byte."""
+    if dtype == np.float16:
+        return np.dtype("<f4")
+    return np.dtype("u1") if dtype == np.bool_ else dtype.newbyteorder("<")
+
+
+def _leaf_field(leaf: Leaf) -> tuple[str, int, str]:
+    name = "bool" if leaf.dtype == np.bool_ else _NUMPY_TO_ROS[stored_dtype(leaf.dtype)]
+    return name, leaf.size if leaf.shape else 0, leaf.name
+
+
+def _named(prefix: str, fields: list[tuple[str, int, str]]) -> tuple[str, str]:
+    text = "".join(
+        f"{kind}{f'[{count}]' if count else ''} {name}\n" for kind, count, name in fields
+    )
+    return f"mcaprl_msgs/msg/{prefix}{_digest(text.encode())}", text
+
+
+def _digest(text: bytes) -> str:
+    return hashlib.sha256(text).hexdigest()[:8]
+
+
+def _align(offset: int, alignment: int) -> int:
+    """The next offset that is aligned, counted from behind the encapsulation header."""
+    return offset + -(offset - ENCAPSULATION_BYTES) % alignment

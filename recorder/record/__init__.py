@@ -1,0 +1,1 @@
+"""Recording: Gymnasium environments to rows of the log format."""

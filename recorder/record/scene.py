@@ -1,0 +1,252 @@
+"""Turns what a simulator says is to be seen into ROS messages.
+
+A simulator takes part by having the methods of one or more of the protocols below on its unwrapped
+environment. It describes shapes and frames in terms of its own (any objects with these attributes
+will do) and imports nothing from here. Axes are those of REP 103: right-handed, z up, metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.format import messages
+
+Vector = tuple[float, float, float]
+Quad = tuple[float, float, float, float]
+
+# visualization_msgs/msg/Marker: type of each kind of shape.
+MARKER_TYPES = {
+    "arrow": 0,
+    "box": 1,
+    "sphere": 2,
+    "cylinder": 3,
+    "line": 4,
+    "segments": 5,
+    "points": 8,
+    "text": 9,
+    "triangles": 11,
+}
+_ADD, _DELETE_ALL = 0, 3
+_FOREVER = (0, 0)
+# What is rounded to binary fractions that no viewer can show takes half the space in a log.
+_POINTS_PER_M = 2**6
+_POSITIONS_PER_M = 2**10
+_ROTATIONS_PER_ONE = 2**14
+
+
+class Shape(Protocol):
+    """One thing to draw."""
+
+    @property
+    def name(self) -> str:
+        """Unique in its scene."""
+
+    @property
+    def kind(self) -> str:
+        """One of MARKER_TYPES."""
+
+    @property
+    def color(self) -> Quad:
+        """Red, green, blue, opacity, each 0 to 1."""
+
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(N, 3) metres, for all but `box`, `sphere`, `cylinder` and `text`."""
+
+    @property
+    def size(self) -> Vector:
+        """Edges in metres; of lines, the width is the first."""
+
+    @property
+    def position(self) -> Vector:
+        """In its frame, metres."""
+
+    @property
+    def yaw_rad(self) -> float:
+        """Turn about z."""
+
+    @property
+    def frame(self) -> str:
+        """The frame that it is fixed to."""
+
+    @property
+    def text(self) -> str:
+        """What `text` says."""
+
+
+class Frame(Protocol):
+    """Where one coordinate frame is in another."""
+
+    @property
+    def name(self) -> str:
+        """Of the frame."""
+
+    @property
+    def parent(self) -> str:
+        """Of the frame that it is placed in."""
+
+    @property
+    def position(self) -> Vector:
+        """Its origin in the parent, metres."""
+
+    @property
+    def rotation(self) -> Quad:
+        """Quaternion x, y, z, w."""
+
+
+@runtime_checkable
+class SceneSource(Protocol):
+    """An environment that describes its world."""
+
+    def static_scene(self) -> Sequence[Shape]:
+        """What does not change in an episode, bodies fixed to moving frames included."""
+
+    def scene(self) -> Sequence[Shape]:
+        """What changes from step to step, at this moment."""
+
+    def static_frames(self) -> Sequence[Frame]:
+        """Frames that are fixed in their parents."""
+
+    def frames(self) -> Sequence[Frame]:
+        """Frames that move, at this moment."""
+
+
+@runtime_checkable
+class TelemetrySource(Protocol):
+    """An environment that has numbers to plot."""
+
+    def telemetry(self) -> Mapping[str, float]:
+        """The same names each time, ROS field names with their units."""
+
+
+@runtime_checkable
+class DepthSource(Protocol):
+    """An environment with a depth camera."""
+
+    def depth_image_m(self) -> NDArray[np.float32]:
+        """(height, width) distance along the ray in metres; infinite where nothing is."""
+
+
+def marker_array(shapes: Iterable[Shape]) -> bytes:
+    """Shapes as one `visualization_msgs/msg/MarkerArray`.
+
+    It begins by deleting what the topic showed before, so that a viewer which jumps to this message
+    shows these shapes and no others. The message's log_time is the markers' time: their stamps are
+    0, which means "where the frame is now", and does not differ from message to message.
+    """
+    markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
+    return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))
+
+
+def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
+    """Frames as one `tf2_msgs/msg/TFMessage`."""
+    stamped = [
+        messages.new(
+            "geometry_msgs/msg/TransformStamped",
+            header=messages.header(time_ns, frame.parent),
+            child_frame_id=frame.name,
+            transform=messages.new(
+                "geometry_msgs/msg/Transform",
+                translation=_vector(_rounded(frame.position, _POSITIONS_PER_M)),
+                rotation=_quaternion(_rounded(frame.rotation, _ROTATIONS_PER_ONE)),
+            ),
+        )
+        for frame in frames
+    ]
+    return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
+
+
+def depth_millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Metric depth as 16UC1: millimetres; 0, as in REP 118, where nothing is or beyond 65.5 m."""
+    millimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
+    return np.where(millimetres <= np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")
+
+
+def _shape_marker(shape: Shape) -> Any:
+    half = shape.yaw_rad / 2
+    return _marker(
+        frame=shape.frame,
+        name=shape.name,
+        kind=MARKER_TYPES[shape.kind],
+        position=shape.position,
+        rotation=(0.0, 0.0, math.sin(half), math.cos(half)),
+        size=shape.size,
+        color=shape.color,
+        points=shape.points,
+        text=shape.text,
+    )
+
+
+def _marker(
+    *,
+    action: int = _ADD,
+    frame: str = "map",
+    name: str = "",
+    kind: int = 0,
+    position: Vector = (0.0, 0.0, 0.0),
+    rotation: Quad = (0.0, 0.0, 0.0, 1.0),
+    size: Vector = (0.0, 0.0, 0.0),
+    color: Quad = (0.0, 0.0, 0.0, 0.0),
+    points: NDArray[np.float64] | Sequence[Vector] = (),
+    text: str = "",
+) -> Any:
+    sec, nanosec = _FOREVER
+    red, green, blue, opacity = color
+    new = messages.new
+    return new(
+        "visualization_msgs/msg/Marker",
+        header=messages.header(0, frame),
+        ns=name,
+        id=0,
+        type=kind,
+        action=action,
+        pose=new(
+            "geometry_msgs/msg/Pose",
+            position=_point(position),
+            orientation=_quaternion(rotation),
+        ),
+        scale=_vector(size),
+        color=new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=opacity),
+        lifetime=new("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
+        # Moves with its frame between messages, as a body that is described once must.
+        frame_locked=True,
+        points=[_point(point) for point in _rounded(points, _POINTS_PER_M)],
+        colors=[],
+        texture_resource="",
+        texture=new(
+            "sensor_msgs/msg/CompressedImage",
+            header=messages.header(0, ""),
+            format="",
+            data=np.empty(0, np.uint8),
+        ),
+        uv_coordinates=[],
+        text=text,
+        mesh_resource="",
+        mesh_file=new("visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8)),
+        mesh_use_embedded_materials=False,
+    )
+
+
+def _rounded(numbers: Any, per_one: int) -> Any:
+    """Numbers or arrays of them, as lists, to the nearest 1/per_one."""
+    return (np.rint(np.multiply(numbers, per_one)) / per_one).tolist()
+
+
+def _point(xyz: Iterable[float]) -> Any:
+    x, y, z = map(float, xyz)
+    return messages.new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+
+
+def _vector(xyz: Iterable[float]) -> Any:
+    x, y, z = map(float, xyz)
+    return messages.new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _quaternion(xyzw: Iterable[float]) -> Any:
+    x, y, z, w = xyzw
+    return messages.new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)

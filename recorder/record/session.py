@@ -1,0 +1,247 @@
+"""What recorders of one environment and of many share: a log that grows by whole episodes."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.format.topics import LOG_TOPIC, STEP_TOPIC
+from mcaprl.recorder.format.writing import refuse_if_taken
+from mcaprl.recorder.record.display import Display
+from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
+
+
+@dataclass
+class OpenEpisode:
+    """An episode that is being recorded.
+
+    Attributes:
+        policy: who acts.
+        epsilon: its exploration.
+        seed: given to reset().
+        options: given to reset().
+        steps: transitions that are wholly in the columns.
+    """
+
+    policy: str
+    epsilon: float
+    seed: int | None = None
+    options: dict[str, Any] | None = None
+    steps: int = 0
+
+
+class Recording:
+    """A log whose episodes are numbered, and whose times rise from one to the next.
+
+    Attributes:
+        log: what is written to.
+        step_ns: simulated time between two records.
+        next_start_ns: log_time of the next episode's first record.
+        episodes: how many there are, which is the next one's number.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        description: LogMetadata,
+        *,
+        compression: str,
+        overwrite: bool,
+        append: bool,
+        max_file_bytes: int | None,
+        start_time_ns: int | None,
+    ) -> None:
+        """Create the file, or open it to append; see `RecordMcap`, whose arguments these are.
+
+        Raises:
+            UsageError: the times would not rise, or a file would have no room.
+            SpaceError, OutputExistsError, LogError: as `LogWriter`.
+        """
+        self._description = description
+        self.step_ns = description.step_duration_ns
+        first_ns = time.time_ns() if start_time_ns is None else start_time_ns
+        if self.step_ns < 1 or first_ns < 0:
+            raise UsageError(
+                f"a step of {self.step_ns} ns from {first_ns} ns on: times must rise"
+                " from 0 or later; give step_duration_s and start_time_ns"
+            )
+        if append and overwrite:
+            raise UsageError("append keeps what overwrite replaces: choose one of the two")
+        self._parts = None
+        if max_file_bytes is not None:
+            self._parts = _Parts(Path(path), max_file_bytes, overwrite=overwrite, append=append)
+            path = self._parts.current
+        self.log = LogWriter(
+            path, description, compression=compression, overwrite=overwrite, append=append
+        )
+        try:
+            self.episodes = _episodes_in(self.log) if append else 0
+            end_ns = self.log.mcap.end_time_ns
+            if start_time_ns is not None and first_ns <= end_ns:
+                raise UsageError(
+                    f"{path} ends at {end_ns} ns: start_time_ns {first_ns} must be later"
+                )
+        except BaseException:
+            self.log.mcap.abandon()
+            raise
+        self._has_layout = False
+        # Number of the first episode in the file; any that it had before are its own.
+        self._first_in_file = 0
+        follows = start_time_ns is None and end_ns >= 0
+        self.next_start_ns = max(first_ns, end_ns + self.step_ns) if follows else first_ns
+
+    @property
+    def closed(self) -> bool:
+        """Whether the log takes no more."""
+        return self.log.mcap.closed
+
+    def check_can_begin(self, seeds: Iterable[int | None]) -> None:
+        """Make sure that episodes with these seeds can be recorded.
+
+        Raises:
+            UsageError: the recording is closed, or a seed does not fit 63 bits.
+        """
+        if self.closed:
+            raise UsageError(f"{self.log.mcap.path} is closed; record another episode elsewhere")
+        for seed in seeds:
+            if seed is not None and not 0 <= seed < 2**63:
+                raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
+
+    def begin(self, display: Display) -> None:
+        """Begin the next episode for viewers, in a file that has room for it.
+
+        With the first episode comes the layout.
+        """
+        mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
+        has_episodes = self.episodes > self._first_in_file
+        if parts is not None and has_episodes and mcap.position >= parts.max_file_bytes:
+            mcap.start_next(parts.next())
+            display.forget_what_stands()
+            self._first_in_file = self.episodes
+        display.begin(start_ns, self.step_ns)
+        if not self._has_layout:
+            topics = (LOG_TOPIC, *display.topics)
+            layout = layout_of(
+                self._description, topics, display.telemetry_names, display.follow_frame
+            )
+            mcap.add_attachment(
+                LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns
+            )
+            self._has_layout = True
+
+    def close(self) -> None:
+        """Finish the log. A file that was begun for an episode that did not come is removed."""
+        self.log.close()
+        if self.episodes == self._first_in_file > 0 and self._parts is not None:
+            self.log.mcap.path.unlink()
+
+    def summary(
+        self,
+        episode: OpenEpisode,
+        *,
+        total_reward: float,
+        terminated: bool,
+        truncated: bool,
+        reason: str,
+    ) -> EpisodeSummary:
+        """What is to be told of an episode that ends now, as the next one of the log."""
+        return EpisodeSummary(
+            episode=self.episodes,
+            length=episode.steps,
+            total_reward=total_reward,
+            terminated=terminated,
+            truncated=truncated,
+            start_time_ns=self.next_start_ns,
+            end_time_ns=self.next_start_ns + episode.steps * self.step_ns,
+            reason=reason,
+            policy=episode.policy,
+            epsilon=episode.epsilon,
+            seed=episode.seed,
+            options="" if episode.options is None else _json(episode.options),
+        )
+
+    def advance(self, summary: EpisodeSummary) -> None:
+        """Count an episode that is wholly written."""
+        self.next_start_ns = summary.end_time_ns + self.step_ns
+        self.episodes += 1
+
+
+class _Parts:
+    """Names of files that follow each other: `lane.mcap` becomes `lane-00000.mcap` and so on."""
+
+    def __init__(self, family: Path, max_file_bytes: int, *, overwrite: bool, append: bool) -> None:
+        if max_file_bytes < 1:
+            raise UsageError(f"max_file_bytes {max_file_bytes}: a file has at least one byte")
+        self.max_file_bytes, self._family = max_file_bytes, family
+        pattern = re.escape(family.stem) + r"-(\d{5})" + re.escape(family.suffix)
+        old = [path for path in family.parent.glob("*") if re.fullmatch(pattern, path.name)]
+        if old and not (overwrite or append):
+            raise OutputExistsError(
+                f"{min(old)} exists: choose another path, append, or pass --overwrite"
+            )
+        if overwrite:
+            for path in old:
+                refuse_if_taken(path)
+            for path in old:
+                path.unlink()
+        last = max((path.stem for path in old), default="0") if append else "0"
+        self._number = int(last[-5:])
+
+    @property
+    def current(self) -> Path:
+        """The file to be written now."""
+        name = f"{self._family.stem}-{self._number:05d}{self._family.suffix}"
+        return self._family.with_name(name)
+
+    def next(self) -> Path:
+        """The file behind it."""
+        self._number += 1
+        return self.current
+
+
+def _episodes_in(log: LogWriter) -> int:
+    """How many episodes a log has that is appended to.
+
+    Raises:
+        LogError: the last one is not finished.
+    """
+    path = log.mcap.path
+    steps = Topic(McapReader(path), STEP_TOPIC)
+    if not len(steps):
+        return 0
+    last = steps.read(("episode", "final"), np.array([np.argmax(steps.times)]))
+    if not last["final"][0]:
+        raise LogError(
+            f"{path} cannot be appended to, since its last episode is not finished: run"
+            f" `mcaprl recover {path} OUT` and append to OUT"
+        )
+    return int(last["episode"][0]) + 1
+
+
+def reason_of(told: Any, terminated: bool) -> str:
+    """Why an episode ended, in the environment's words if it has any."""
+    return told if isinstance(told, str) and told else "terminated" if terminated else "time_limit"
+
+
+def _json(options: dict[str, Any]) -> str:
+    try:
+        return json.dumps(options, default=_plain)
+    except (TypeError, ValueError):
+        return json.dumps(repr(options))
+
+
+def _plain(value: Any) -> Any:
+    """What json cannot write by itself: NumPy's numbers and arrays; anything else by its repr."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else repr(value)

@@ -1,0 +1,215 @@
+"""Checks what a log says of itself: metadata against schema, steps in order, episodes, pictures."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
+from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.episodes import COUNTERS, Told, episode_lengths, of_records, summaries
+from mcaprl.recorder.dataset.log_reader import LogReader, described
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.reading import (
+    LOG_TIME,
+    Columns,
+    Contradiction,
+    Decoder,
+    McapReader,
+    Piece,
+    Span,
+    Topic,
+    joined_index,
+)
+from mcaprl.recorder.format.schema import step_schema
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
+
+_FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
+_IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
+# Messages, what decodes them, and where they belong: rows of the steps' columns, or pictures.
+_Place = tuple[Decoder, Span, slice | Leaf]
+
+
+class EpisodeCheck:
+    """Takes chunk after chunk, and judges them together at the end."""
+
+    def __init__(self, reader: McapReader) -> None:
+        """Find the topics.
+
+        Raises:
+            LogError: the file has no `/rl/step`, or its metadata is damaged.
+        """
+        self._reader = reader
+        self._steps = Topic(reader, STEP_TOPIC)
+        if not reader.channels_of(STEP_TOPIC):
+            raise NoStepsError(f"no topic {STEP_TOPIC}, so no transitions")
+        if not len(self._steps):
+            raise NoEpisodesError("no finished episode")
+        self._metadata = described(reader)
+        self._images = [
+            (leaf, Topic(reader, leaf.topic))
+            for leaf in (
+                observation_leaves(self._metadata.observation_space) if self._metadata else ()
+            )
+            if leaf.encoding is not None
+        ]
+        # What is not of the form in which this library writes is read as any reader does.
+        self._has_our_form = self._metadata is not None and self._schema_fits()
+        self._columns: Columns = {}
+        self._places: dict[int, list[_Place]] = defaultdict(list)
+        if self._has_our_form:
+            self._prepare()
+
+    def take(self, piece: Piece) -> None:
+        """Look at chunks of the log."""
+        records, starts = piece.records, piece.bounds[:-1]
+        for decoder, places in self._places_in(piece).items():
+            numbers, spans, wheres = zip(*places, strict=True)
+            index = joined_index(span.entries for span in spans)
+            index["offset"] += np.repeat(starts[list(numbers)], list(map(len, spans)))
+            first, last = wheres[0], wheres[-1]
+            if isinstance(first, slice):
+                rows = slice(first.start, last.stop)
+                self._take_steps(decoder.alike(records, index, _FIELDS), rows)
+            else:
+                self._take_images(decoder.alike(records, index, _IMAGE_FIELDS), first)
+
+    def _places_in(self, piece: Piece) -> dict[Decoder, list[tuple[int, Span, slice | Leaf]]]:
+        """Messages by what decodes them: in which of its chunks, and where they belong."""
+        found: dict[Decoder, list[tuple[int, Span, slice | Leaf]]] = defaultdict(list)
+        for number, chunk in enumerate(piece.chunks):
+            for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
+                found[decoder].append((number, span, where))
+        return found
+
+    def finish(self) -> Iterator[Contradiction]:
+        """Tell what contradicts each other.
+
+        Raises:
+            LogError, SpaceError: so much that the log cannot be read.
+        """
+        if not self._has_our_form:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                dataset = LogReader(self._reader.path).read()
+            yield from (found for e in dataset.episodes for found in _check_return(e))
+            return
+        columns, path = self._columns, str(self._reader.path)
+        lengths = episode_lengths(columns, path)
+        frames = int(lengths.sum()) + len(lengths)
+        if frames < len(self._steps):
+            yield Contradiction(
+                f"{len(self._steps) - frames} records of an episode that was not finished",
+                f"the end of {STEP_TOPIC}",
+            )
+        if not len(lengths):
+            return
+        times = columns[LOG_TIME]
+        if (np.diff(times) <= 0).any():
+            row = int(np.argmax(np.diff(times) <= 0)) + 1
+            yield Contradiction("log_times do not rise", f"record {row} of {STEP_TOPIC}")
+        yield from self._check_told(lengths)
+        for leaf, topic in self._images:
+            missing = int((~np.isin(times[:frames], topic.times)).sum())
+            if missing or len(topic) != len(self._steps):
+                yield Contradiction(
+                    f"{len(topic)} pictures for {len(self._steps)} records, {missing} have none",
+                    leaf.topic,
+                )
+
+    def _schema_fits(self) -> bool:
+        """Whether `/rl/step` is one channel of what this library writes for such spaces."""
+        channels = self._reader.channels_of(STEP_TOPIC)
+        assert self._metadata is not None
+        name, text = step_schema(self._metadata.observation_space, self._metadata.action_space)
+        schema = self._reader.schema_of(channels[0])
+        fits = schema.name == name and schema.data.decode(errors="replace") == text
+        if schema.name.startswith("mcaprl_msgs/msg/Step") and not fits:
+            raise CorruptLogError(f"the schema {schema.name} is not that of the metadata's spaces")
+        return fits and len(channels) == 1
+
+    def _prepare(self) -> None:
+        """Note which messages of which chunk belong to what."""
+        start = 0
+        for decoder, span in self._steps.parts:
+            stop = start + len(span)
+            self._place(decoder, span, slice(start, stop))
+            start = stop
+        for leaf, topic in self._images:
+            for decoder, span in topic.parts:
+                self._place(decoder, span, leaf)
+        self._columns = {name: np.empty(start, self._steps.fields[name]) for name in _FIELDS} | {
+            LOG_TIME: self._steps.times
+        }
+
+    def _place(self, decoder: Decoder, span: Span, where: slice | Leaf) -> None:
+        if span.chunk is None:
+            self._has_our_form = False
+        else:
+            self._places[span.chunk.chunk_start_offset].append((decoder, span, where))
+
+    def _take_steps(self, found: NDArray[Any] | None, rows: slice) -> None:
+        if found is None:
+            raise CorruptLogError(f"messages of {STEP_TOPIC} have not the form of their schema")
+        for name in _FIELDS:
+            self._columns[name][rows] = found[name]
+
+    def _take_images(self, found: NDArray[Any] | None, leaf: Leaf) -> None:
+        if found is None or not _is_image(found, leaf):
+            raise CorruptLogError(f"pictures on {leaf.topic} are not as the metadata's space says")
+
+    def _check_told(self, lengths: NDArray[np.int64]) -> Iterator[Contradiction]:
+        """What `/rl/episode` tells, against the records."""
+        columns = self._columns
+        finals = np.cumsum(lengths + 1) - 1
+        told = Told(Topic(self._reader, EPISODE_TOPIC)).summaries(columns[LOG_TIME][finals])
+        if len(told) not in (0, len(lengths)):
+            yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
+        whole = summaries(self._reader.path, columns, lengths, told)
+        actual = of_records(columns, finals, lengths)
+        for number, summary_and_actual in enumerate(zip(whole, actual, strict=True)):
+            yield from _check_summary(number, *summary_and_actual)
+
+
+def _check_summary(
+    number: int, told: EpisodeSummary, actual: EpisodeSummary
+) -> Iterator[Contradiction]:
+    pairs = [
+        ("a return", told.total_reward, actual.total_reward),
+        ("a start", told.start_time_ns, actual.start_time_ns),
+        ("terminated", told.terminated, actual.terminated),
+        ("truncated", told.truncated, actual.truncated),
+    ]
+    for name, claim, fact in pairs:
+        if claim != fact and not math.isnan(fact):
+            yield Contradiction(
+                f"{EPISODE_TOPIC} tells {name} of {claim}, its records {fact}", f"episode {number}"
+            )
+
+
+def _check_return(episode: Episode) -> Iterator[Contradiction]:
+    total = add_up(episode.rewards)
+    if total != episode.total_reward and not np.isnan(total):
+        yield Contradiction(
+            f"{EPISODE_TOPIC} tells a return of {episode.total_reward}, its rewards give {total}",
+            f"episode {episode.index}",
+        )
+
+
+def _is_image(found: NDArray[Any], leaf: Leaf) -> bool:
+    if not set(_IMAGE_FIELDS) <= set(found.dtype.names or ()):
+        return False
+    height, width = leaf.shape[:2]
+    encoding = (leaf.encoding or "").encode()
+    expected = (height, width, encoding, leaf.size // height)
+    heads = zip(_IMAGE_FIELDS, expected, strict=False)
+    return found["data"].shape[1:] == (leaf.size,) and all(
+        (found[name] == value).all() for name, value in heads
+    )

@@ -1,0 +1,216 @@
+"""Plays logs as viewers take them: by a clock that can be stopped, sped up and set.
+
+Nothing is read ahead. Where a message is stands in the file's own indexes, which stay in the mapped
+file; of the chunks that are inflated, a few are kept. So a long log takes no more memory than a
+short one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from mcaprl.recorder.format.reading import McapReader, Span
+
+_CHUNKS_KEPT = 24
+
+
+class Played(NamedTuple):
+    """A message that is due.
+
+    Attributes:
+        track: which log it is of, by its place in the player.
+        channel_id: of the topic, in its log.
+        time_ns: when, on the player's clock.
+        data: as it stands in the file.
+    """
+
+    track: int
+    channel_id: int
+    time_ns: int
+    data: bytes
+
+
+class Track:
+    """One log, by time.
+
+    Attributes:
+        reader: of the file.
+        start_ns: log_time of its first message that is played.
+        end_ns: likewise the last.
+    """
+
+    def __init__(
+        self,
+        reader: McapReader,
+        window_ns: tuple[int, int] | None = None,
+        *,
+        topics: Collection[str] | None = None,
+    ) -> None:
+        """Find where the messages are.
+
+        Args:
+            reader: of the file.
+            window_ns: play what has a log_time from the first to the last of these; default: all.
+            topics: play these only; default: all.
+
+        Raises:
+            CorruptLogError: an index is damaged.
+        """
+        self.reader = reader
+        self._topics = [
+            _TopicIndex(reader, channel)
+            for channel in reader.channels.values()
+            if topics is None or channel.topic in topics
+        ]
+        self._topics = [topic for topic in self._topics if topic.spans]
+        self.start_ns, self.end_ns = window_ns or (
+            min((topic.starts[0] for topic in self._topics), default=0),
+            max((max(topic.ends) for topic in self._topics), default=0),
+        )
+        self._records = lru_cache(_CHUNKS_KEPT)(self._inflated)
+
+    def between(self, start_ns: int, stop_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
+        """Yield time, channel and bytes of messages in the half-open interval, by time."""
+        start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns + 1)
+        found = [place for topic in self._topics for place in topic.between(start_ns, stop_ns)]
+        for place in sorted(found, key=lambda place: place.time_ns):
+            yield place.time_ns, place.channel, self._message(place)
+
+    def latest(self, time_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
+        """Yield the last message of each topic up to a moment: all that is to be seen then.
+
+        What stood in the file before the window is part of it.
+        """
+        for topic in self._topics:
+            place = topic.latest(min(time_ns, self.end_ns))
+            if place is not None:
+                yield place.time_ns, place.channel, self._message(place)
+
+    def _message(self, place: _Place) -> bytes:
+        records = self._records(place.chunk_start)
+        return self.reader.message(records, place.channel, place.time_ns, place.offset)
+
+    def _inflated(self, chunk_start: int) -> memoryview:
+        if chunk_start < 0:
+            return self.reader.view
+        chunk = next(c for c in self.reader.chunks if c.chunk_start_offset == chunk_start)
+        return self.reader.chunk_records(chunk)
+
+
+class _Place(NamedTuple):
+    """Where a message is; its chunk starts at -1 if it stands outside of all."""
+
+    time_ns: int
+    channel: Channel
+    chunk_start: int
+    offset: int
+
+
+class _TopicIndex:
+    """The messages of one channel; of each span the times rise."""
+
+    def __init__(self, reader: McapReader, channel: Channel) -> None:
+        self.channel = channel
+        spans = sorted(reader.spans(channel), key=lambda span: int(span.index["log_time"].min()))
+        self.spans = [_by_time(span) for span in spans]
+        self.starts = [int(span.index["log_time"][0]) for span in self.spans]
+        self.ends = [int(span.index["log_time"][-1]) for span in self.spans]
+
+    def between(self, start_ns: int, stop_ns: int) -> Iterator[_Place]:
+        for span, first_ns, last_ns in zip(self.spans, self.starts, self.ends, strict=True):
+            if first_ns < stop_ns and last_ns >= start_ns:
+                low, high = _rows_before(span, start_ns), _rows_before(span, stop_ns)
+                yield from (self._place(span, row) for row in range(low, high))
+
+    def latest(self, time_ns: int) -> _Place | None:
+        best: _Place | None = None
+        for span, first_ns in zip(self.spans, self.starts, strict=True):
+            if first_ns > time_ns:
+                break
+            row = _rows_before(span, time_ns + 1) - 1
+            if best is None or span.index["log_time"][row] >= best.time_ns:
+                best = self._place(span, row)
+        return best
+
+    def _place(self, span: Span, row: int) -> _Place:
+        time_ns, offset = span.index[row].tolist()
+        chunk_start = -1 if span.chunk is None else span.chunk.chunk_start_offset
+        return _Place(time_ns, self.channel, chunk_start, offset)
+
+
+def _rows_before(span: Span, time_ns: int) -> int:
+    # Compared with a signed integer, times would be rounded to floats.
+    return int(np.searchsorted(span.index["log_time"], np.uint64(max(time_ns, 0))))
+
+
+def _by_time(span: Span) -> Span:
+    times: NDArray[np.uint64] = span.index["log_time"]
+    if (times[1:] >= times[:-1]).all():
+        return span
+    return Span.of_index(span.chunk, span.index[np.argsort(times, kind="stable")])
+
+
+@dataclass
+class Player:
+    """The clock over one or several logs, which all start at the first one's start.
+
+    Attributes:
+        tracks: the logs.
+        speed: simulated seconds in a second.
+        loops: whether it begins again at the end.
+        playing: whether the clock runs.
+    """
+
+    tracks: Sequence[Track]
+    speed: float = 1.0
+    loops: bool = False
+    playing: bool = False
+
+    def __post_init__(self) -> None:
+        """Set the clock to the start."""
+        self.start_ns = self.tracks[0].start_ns
+        self.shifts_ns = [self.start_ns - track.start_ns for track in self.tracks]
+        self.end_ns = max(t.end_ns + s for t, s in zip(self.tracks, self.shifts_ns, strict=True))
+        self.time_ns = self.start_ns
+        # Messages before this have been played.
+        self._next_ns = self.start_ns
+
+    @property
+    def ended(self) -> bool:
+        """Whether all has been played."""
+        return self.time_ns >= self.end_ns
+
+    def seek(self, time_ns: int) -> None:
+        """Set the clock, within the logs."""
+        self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
+        self._next_ns = self.time_ns + 1
+
+    def picture(self) -> list[Played]:
+        """The last message of each topic: what a viewer must have that begins to look now."""
+        return [
+            Played(number, channel.id, time_ns + shift, data)
+            for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
+            for time_ns, channel, data in track.latest(self.time_ns - shift)
+        ]
+
+    def advance(self, elapsed_s: float) -> list[Played]:
+        """Let time go by; the messages that have become due, by time."""
+        if not self.playing:
+            return []
+        self.time_ns = min(self.time_ns + round(elapsed_s * self.speed * 1e9), self.end_ns)
+        first_ns, self._next_ns = self._next_ns, self.time_ns + 1
+        due = [
+            Played(number, channel.id, time_ns + shift, data)
+            for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
+            for time_ns, channel, data in track.between(first_ns - shift, self._next_ns - shift)
+        ]
+        if self.ended and not self.loops:
+            self.playing = False
+        return sorted(due, key=lambda message: message.time_ns)

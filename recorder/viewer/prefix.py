@@ -1,0 +1,83 @@
+"""Several logs in one viewer: each one's topics and frames below a word of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mcaprl.recorder.format import messages
+
+WORLD = "map"
+"""The frame that all logs share."""
+_MARKERS, _FRAMES = "visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"
+PREFIXED_TYPES = (_MARKERS, _FRAMES)
+"""Messages that name frames of moving bodies, and so cannot be passed on as they are."""
+
+
+def prefixes_of(paths: Sequence[Path]) -> list[str]:
+    """A word for each file; none for a single one.
+
+    >>> prefixes_of([Path("runs/a.mcap"), Path("b/a.mcap"), Path("C-1.mcap")])
+    ['a', 'a_2', 'c_1']
+    """
+    if len(paths) == 1:
+        return [""]
+    words: list[str] = []
+    for path in paths:
+        stem = re.sub(r"[^a-z0-9]+", "_", path.stem.lower()).strip("_") or "log"
+        word, count = stem, 1
+        while word in words:
+            count += 1
+            word = f"{stem}_{count}"
+        words.append(word)
+    return words
+
+
+def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) -> bytes:
+    """A message whose frames, all but the world, stand below a prefix, and whose stamps are moved.
+
+    Args:
+        data: CDR bytes of one of `PREFIXED_TYPES`.
+        type_name: which.
+        prefix: the log's word.
+        shift_ns: added to stamps; those that are 0 stay so.
+    """
+    message = messages.decode(data, type_name)
+    parts = message.markers if type_name == _MARKERS else message.transforms
+    for part in parts:
+        part.header.frame_id = _below(prefix, part.header.frame_id)
+        stamp_ns = part.header.stamp.sec * 10**9 + part.header.stamp.nanosec
+        if stamp_ns:
+            part.header.stamp = messages.stamp(stamp_ns + shift_ns)
+        if type_name == _FRAMES:
+            part.child_frame_id = _below(prefix, part.child_frame_id)
+    return messages.encode(message)
+
+
+def side_by_side(layouts: Sequence[dict[str, Any]], prefixes: Sequence[str]) -> dict[str, Any]:
+    """One layout that shows several logs beside each other."""
+    parts = [_prefixed_layout(*pair) for pair in zip(layouts, prefixes, strict=True)]
+    *firsts, root = [part["layout"] for part in parts]
+    for count, first in enumerate(reversed(firsts), start=2):
+        root = {"first": first, "second": root, "direction": "row", "splitPercentage": 100 / count}
+    panels = {name: panel for part in parts for name, panel in part["configById"].items()}
+    return {**parts[0], "configById": panels, "layout": root}
+
+
+def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
+    if not prefix:
+        return layout
+    text = json.dumps(layout)
+    # Topics begin with a slash, wherever they stand; panels are named Kind!what.
+    text = re.sub(r'"(/[a-z])', rf'"/{prefix}\1', text)
+    text = re.sub(r'"(\w+)!', rf'"\1!{prefix} ', text)
+    text = re.sub(r'("followTf": ")(?!map")', rf"\1{prefix}/", text)
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def _below(prefix: str, frame: str) -> str:
+    return frame if frame in ("", WORLD) else f"{prefix}/{frame}"

@@ -1,0 +1,234 @@
+"""A dataset at a glance: a picture for documents, a page to read. Extra: `report`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
+from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.recorder.dataset.lint import Finding
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.viewer.tracks import Track, tracks_of
+
+_BINS = 30
+_SHOWN_EPISODES: Final = 3
+"""So many of the best, and of the worst."""
+_MAP_CELLS = 80
+_MAX_ROWS = 60
+
+
+def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
+    """Write a PNG with histograms of returns and lengths, and counts of actions and ends.
+
+    Args:
+        path: of the PNG; folders above it are made.
+        dataset: to be shown.
+        title: over the picture.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        ReportError: the file cannot be written.
+    """
+    figure, ((returns, lengths), (actions, ends)) = new_figure((9, 6.5), 2, 2)
+    statistics = dataset.statistics
+    mean = statistics.mean_return
+    _histogram(returns, statistics.returns, f"return of an episode (mean {mean:.4g})")
+    _histogram(lengths, statistics.lengths, "steps of an episode")
+    _bars(actions, _actions_taken(dataset), "actions")
+    _bars(ends, statistics.ends, "ends of episodes")
+    figure.suptitle(title, x=0.02, ha="left", color=INK)
+    save_png(figure, path)
+
+
+def dataset_page(
+    path: Path,
+    dataset: Dataset,
+    title: str,
+    facts: Sequence[tuple[str, str]],
+    findings: Sequence[Finding],
+) -> None:
+    """Write a page that shows a dataset: facts, findings, plots, its best and worst episodes.
+
+    Args:
+        path: of the HTML file.
+        dataset: to be shown.
+        title: of the page.
+        facts: names and values, for a table.
+        findings: of `lint`.
+
+    Raises:
+        MissingExtraError: matplotlib or jinja2 is not installed.
+        ReportError: the file cannot be written.
+    """
+    tracks = tracks_of(dataset)
+    statistics = dataset.statistics
+    lead = (
+        f"{statistics.episodes} episodes, {statistics.steps} steps of"
+        f" {dataset.env_id or 'an unknown environment'}"
+    )
+    sections = [
+        Section("What it is", table=Table(("", ""), facts)),
+        _findings_section(findings),
+        Section("What happened", figures=_figures(dataset, tracks)),
+        *_calibration_section(dataset),
+        Section("Best and worst episodes", cards=_cards(dataset, tracks)),
+        Section("Observations", table=_columns(dataset)),
+    ]
+    write_page(path, title, lead, sections)
+
+
+def _findings_section(findings: Sequence[Finding]) -> Section:
+    if not findings:
+        return Section("Findings", text="Nothing was found that would spoil learning.")
+    rows = [(one.severity, one.what, one.where, one.effect) for one in findings]
+    return Section("Findings", table=Table(("", "what", "where", "what it does"), rows))
+
+
+def _calibration_section(dataset: Dataset) -> list[Section]:
+    """Nothing where probabilities are unknown."""
+    found = calibration(dataset.behavior_probs, dataset.action_space)
+    if found is None:
+        return []
+    rows = [
+        (f"{one.probability:.3f}", f"{one.steps / len(dataset):.1%}", f"{one.actions:.2f}")
+        for one in found.ranges
+    ]
+    table = Table(("behavior_prob", "of the steps", "actions a state has of it"), rows)
+    text = f"The actions taken, each counted 1 / behavior_prob, speak of {found}."
+    return [Section("How likely the actions were", text, table=table)]
+
+
+def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
+    statistics = dataset.statistics
+    small = (4.4, 2.6)
+    found = []
+    for caption, values in (
+        (f"Return of an episode, mean {statistics.mean_return:.4g}", statistics.returns),
+        ("Steps of an episode", statistics.lengths),
+    ):
+        figure, axes = new_figure(small)
+        _histogram(axes, values, "")
+        found.append(Figure.of(caption, figure))
+    figure, axes = new_figure(small)
+    axes.plot(statistics.returns, ".", color=COLORS[0], ms=4)
+    axes.set_xlabel("episode, as recorded")
+    found.append(Figure.of("Returns in the order of the log", figure))
+    for caption, counts in (
+        ("Actions taken", _actions_taken(dataset)),
+        ("Why episodes ended", statistics.ends),
+    ):
+        figure, axes = new_figure((small[0], max(1.6, 0.28 * len(counts) + 0.8)))
+        _bars(axes, counts, "")
+        found.append(Figure.of(caption, figure))
+    coverage = _coverage(tracks)
+    if coverage is not None:
+        found.append(Figure.of("Where the steps were, metres; darker is more", coverage))
+    return found
+
+
+def _coverage(tracks: Sequence[Track]) -> Any:
+    """A map of how many steps were where; None if the log tells no places."""
+    places = np.concatenate([np.empty((0, 2)), *tracks])
+    if not len(places):
+        return None
+    figure, axes = new_figure((4.4, 3.6))
+    cell_m = max(float(np.ptp(places, axis=0).max()) / _MAP_CELLS, 1e-6)
+    cells, counts = np.unique(np.rint(places / cell_m), axis=0, return_counts=True)
+    shade = 0.15 + 0.85 * np.log1p(counts) / np.log1p(counts.max())
+    axes.scatter(
+        *(cells * cell_m).T, s=6, c=COLORS[0], alpha=shade, marker="s", lw=0, rasterized=True
+    )
+    axes.set_aspect("equal")
+    return figure
+
+
+def _cards(dataset: Dataset, tracks: Sequence[Track]) -> list[Card]:
+    order = np.argsort([-episode.total_reward for episode in dataset.episodes], kind="stable")
+    best = order[:_SHOWN_EPISODES]
+    worst = order[len(best) :][-_SHOWN_EPISODES:][::-1]
+    shown = [("best", int(k)) for k in best] + [("worst", int(k)) for k in worst]
+    places, commands = np.concatenate([np.empty((0, 2)), *tracks]), _commands(dataset)
+    return [_card(kind, dataset.episodes[k], tracks[k], places, commands[k]) for kind, k in shown]
+
+
+def _commands(dataset: Dataset) -> list[str]:
+    """What replays each episode; empty where the files do not tell which it is."""
+    counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
+    if sum(counts) != len(dataset.episodes):
+        return [""] * len(dataset.episodes)
+    return [
+        f"mcaprl replay {path} --episode {number}"
+        for path, count in zip(dataset.sources, counts, strict=True)
+        for number in range(count)
+    ]
+
+
+def _card(kind: str, episode: Episode, track: Track, places: Track, command: str) -> Card:
+    text = f"return {episode.total_reward:.4g}, {len(episode)} steps, {episode.reason or 'unknown'}"
+    if episode.policy:
+        text += f", by {episode.policy}"
+    return Card(
+        f"{kind}: episode {episode.index}", text, _thumbnail(episode, track, places), command
+    )
+
+
+def _thumbnail(episode: Episode, track: Track, places: Track) -> str:
+    """The way of an episode on the map of all; without places, its rewards step by step."""
+    figure, axes = new_figure((3.2, 2.2))
+    if len(track):
+        stride = max(1, len(places) // 4000)
+        axes.plot(*places[::stride].T, ".", color=PALE, ms=1, rasterized=True)
+        axes.plot(*track.T, color=COLORS[1], lw=1.6)
+        axes.plot(*track[-1], "x", color=INK, ms=6)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    else:
+        axes.plot(np.cumsum(episode.rewards), color=COLORS[1])
+        axes.set_xlabel("step")
+        axes.set_title("return so far")
+    return to_svg(figure)
+
+
+def _columns(dataset: Dataset) -> Table:
+    """Ranges of the observed numbers."""
+    rows = []
+    for name, column in dataset.statistics.observations.items():
+        names = dataset.observation_names
+        for k in range(len(column.low)):
+            own = names[k] if len(names) == len(column.low) else f"{name}[{k}]"
+            numbers = (column.low[k], column.mean[k], column.std[k], column.high[k])
+            rows.append([own, *(f"{number:.4g}" for number in numbers)])
+    more = [[f"and {len(rows) - _MAX_ROWS} more", "", "", "", ""]] if len(rows) > _MAX_ROWS else []
+    return Table(("", "least", "mean", "spread", "most"), rows[:_MAX_ROWS] + more)
+
+
+def _actions_taken(dataset: Dataset) -> dict[str, int]:
+    names = dataset.action_names
+    counts = dataset.statistics.action_counts
+    return {names.get(value, str(value)): count for value, count in counts.items()}
+
+
+def _histogram(axes: Any, values: NDArray[Any], label: str) -> None:
+    axes.hist(values[np.isfinite(values)], bins=_BINS, color=COLORS[0])
+    axes.set_xlabel(label)
+    axes.set_ylabel("episodes")
+    axes.yaxis.get_major_locator().set_params(integer=True)
+
+
+def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
+    if not counts:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, f"{label or 'actions'}: continuous", ha="center", color=INK)
+        return
+    axes.barh(list(counts), list(counts.values()), color=COLORS[0], height=0.7)
+    axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set_xlabel(label)

@@ -1,0 +1,106 @@
+"""The moments of an annotated log that are worth a look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.format.reading import Columns, McapReader, Topic
+from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.record.layout import is_values_topic
+
+SHOWN = 5
+"""Moments of each kind and topic."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A step that surprised a policy, or that it would have done otherwise.
+
+    Attributes:
+        file: path of the log.
+        topic: of the policy.
+        kind: `td_error`, or `disagreement`.
+        time_ns: log_time, to jump to.
+        episode: its index in the log.
+        step: of the episode.
+        value: the TD error; of a disagreement, the advantage of the logged action, or, of a policy
+            without values, its normalised entropy.
+    """
+
+    file: str
+    topic: str
+    kind: Literal["td_error", "disagreement"]
+    time_ns: int
+    episode: int
+    step: int
+    value: float
+
+    def __str__(self) -> str:
+        """On one line; the time as viewers take it."""
+        seconds, rest_ns = divmod(self.time_ns, 10**9)
+        return (
+            f"{self.topic} {self.kind} {self.value:+.3g} in episode {self.episode}, step"
+            f" {self.step}, at {seconds}.{rest_ns:09d}"
+        )
+
+
+def moments_of(path: Path) -> list[Moment]:
+    """The greatest TD errors and the clearest disagreements of each policy that annotated a log.
+
+    Raises:
+        LogError: the log is damaged.
+    """
+    reader = McapReader(path)
+    topics = sorted({c.topic for c in reader.channels.values() if is_values_topic(c.topic)})
+    if not topics:
+        return []
+    places = _places(Topic(reader, STEP_TOPIC))
+    found = []
+    for name in topics:
+        topic = Topic(reader, name)
+        columns = topic.read(("td_error", "advantage", "entropy", "agrees"))
+        for kind, row, value in (*_surprises(columns), *_disagreements(columns)):
+            time_ns = int(topic.times[row])
+            episode, step = places.get(time_ns, (-1, -1))
+            found.append(Moment(str(path), name, kind, time_ns, episode, step, value))
+    return found
+
+
+_Ranked = tuple[Literal["td_error", "disagreement"], int, float]
+
+
+def _surprises(columns: Columns) -> Iterator[_Ranked]:
+    errors = columns["td_error"]
+    for row in _largest(np.abs(errors), np.isfinite(errors)):
+        yield "td_error", row, float(errors[row])
+
+
+def _disagreements(columns: Columns) -> Iterator[_Ranked]:
+    """Those that cost most by the policy's own values; without values, the surest."""
+    differs = ~columns["agrees"].astype(bool)
+    has_values = bool(np.isfinite(columns["advantage"]).any())
+    numbers = columns["advantage"] if has_values else columns["entropy"]
+    for row in _largest(-numbers, differs & np.isfinite(numbers)):
+        yield "disagreement", row, float(numbers[row])
+
+
+def _largest(numbers: NDArray[Any], chosen: NDArray[np.bool_]) -> list[int]:
+    rows = np.flatnonzero(chosen)
+    order = np.argsort(-numbers[rows], kind="stable")[:SHOWN]
+    return [int(row) for row in rows[order]]
+
+
+def _places(steps: Topic) -> dict[int, tuple[int, int]]:
+    """Episode and step of each log_time."""
+    times = steps.times
+    order = np.argsort(times, kind="stable")
+    step = steps.read(("step",))["step"][order]
+    episode = np.cumsum(step == 0) - 1
+    pairs = zip(episode.tolist(), step.tolist(), strict=True)
+    return dict(zip(times[order].tolist(), pairs, strict=True))

@@ -1,0 +1,1 @@
+"""Cameras, canvases and rendered views shared by the sims."""

@@ -1,0 +1,301 @@
+"""A scene in perspective, from behind the body that it is about; drawn with pygame, back to front.
+
+What lies flat on the ground is drawn first, in the order of heights; then all else, the farthest
+first. Distances are those of the faces' middles, so a large face beside a small one may be on the
+wrong side of it: a picture for people, not a measurement (that is `sims.camera`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.canvas import Canvas
+from mcaprl.sims.drawing.scene import Color, Frame, Shape
+from mcaprl.sims.geometry.mesh import box_mesh
+
+Floats = NDArray[np.float64]
+
+SIZE_PX = (960, 540)
+BEHIND_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
+"""Where the eye is from the body, and how far before it the eye looks."""
+FAR_M = 400.0
+_FOCAL_PX = 0.9 * SIZE_PX[0]
+_NEAR_M = 0.3
+_WIDEST_PX = 24.0
+"""Of a stroke: what passes close by the eye would hide all else."""
+_SKY: Color = (0.55, 0.68, 0.80, 1.0)
+_SUN = (0.36, 0.28, 0.89)
+_FLAT_M = 0.15
+_INK, _PLATE = (255, 255, 255), (20, 22, 26)
+_DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
+"""A stroke so short that it is drawn round."""
+_ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
+
+
+class Pose(NamedTuple):
+    """Where a frame is in the map."""
+
+    axes: Floats
+    """(3, 3) its axes as columns."""
+    at_m: Floats
+    """(3,)"""
+
+
+class _Piece(NamedTuple):
+    """A polygon, or a stroke between two points, in the map."""
+
+    corners_m: Floats
+    """(K, 3)"""
+    color: Color
+    width_m: float = 0.0
+    """Of a stroke; a polygon has none."""
+    text: str = ""
+
+
+class ChaseView:
+    """Draws one picture after the other; parts that do not move are prepared once."""
+
+    def __init__(self) -> None:
+        """Prepare an empty picture.
+
+        Raises:
+            MissingExtraError: pygame is not installed.
+        """
+        self._canvas = Canvas("rgb_array", SIZE_PX, "", 1)
+        self._prepared: tuple[Sequence[Shape], list[_Piece], Floats] | None = None
+
+    def draw(
+        self,
+        static: Sequence[Shape],
+        moving: Sequence[Shape],
+        frames: Iterable[Frame],
+        follow: str,
+        lines: Sequence[str],
+    ) -> NDArray[np.uint8]:
+        """Draw one moment, (height, width, 3).
+
+        Args:
+            static: shapes that do not change; those of the map are prepared while they are the
+                same list.
+            moving: those that do.
+            frames: where all frames are.
+            follow: the frame of the body; empty looks at the map's origin.
+            lines: of text, in the corner.
+        """
+        poses = poses_of(frames)
+        eye = eye_behind(poses.get(follow, Pose(np.eye(3), np.zeros(3))))
+        pieces = self._standing(static, eye)
+        loose = [shape for shape in static if shape.frame != "map"]
+        for shape in (*loose, *moving):
+            pieces += _pieces(shape, poses)
+        pieces.sort(key=lambda piece: _order(piece, eye.at_m))
+        width_px, height_px = SIZE_PX
+        self._canvas.polygon(np.array([(0, 0), (width_px, 0), SIZE_PX, (0, height_px)]), _SKY)
+        texts = [piece for piece in pieces if piece.text]
+        for piece in pieces:
+            corners = None if piece.text else _seen(piece, eye)
+            if corners is not None:
+                self._canvas.polygon(corners, _lit(piece))
+        self._canvas.flatten()
+        self._write(texts, eye, lines)
+        return self._canvas.finish()
+
+    def close(self) -> None:
+        """Let the canvas go."""
+        self._canvas.close()
+
+    def _standing(self, static: Sequence[Shape], eye: Pose) -> list[_Piece]:
+        """The pieces of the map that are near enough and before the eye."""
+        if self._prepared is None or self._prepared[0] is not static:
+            pieces = [p for s in static if s.frame == "map" for p in _pieces(s, {})]
+            middles = np.array([p.corners_m.mean(axis=0) for p in pieces]).reshape(-1, 3)
+            self._prepared = (static, pieces, middles)
+        _, pieces, middles = self._prepared
+        near = np.hypot(*(middles - eye.at_m)[:, :2].T) < FAR_M
+        return [pieces[i] for i in np.flatnonzero(near)]
+
+    def _write(self, texts: Iterable[_Piece], eye: Pose, lines: Sequence[str]) -> None:
+        for piece in texts:
+            at = (piece.corners_m - eye.at_m) @ eye.axes
+            if at[0, 2] > _NEAR_M:
+                x, y = _projected(at)[0]
+                self._canvas.text(piece.text, (round(x) - 5 * len(piece.text), round(y)), 24, _INK)
+        if lines:
+            height_px = 12 + 24 * len(lines)
+            wide_px = 24 + 9 * max(map(len, lines))
+            self._canvas.rectangle((0, 0, wide_px, height_px), _PLATE)
+            for row, line in enumerate(lines):
+                self._canvas.text(line, (12, 8 + 24 * row), 24, _INK)
+
+
+def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
+    """Where each frame is in the map, its parents' places included.
+
+    >>> car = Frame("car", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    >>> lamp = Frame("lamp", (1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0), parent="car")
+    >>> poses_of([lamp, car])["lamp"].at_m.tolist()
+    [4.0, 0.0, 2.0]
+    """
+    by_name = {frame.name: frame for frame in frames}
+    found: dict[str, Pose] = {}
+
+    def place(name: str) -> Pose:
+        if name in found:
+            return found[name]
+        if name not in by_name:
+            return Pose(np.eye(3), np.zeros(3))
+        # Popped, so that frames that hang on each other come to an end.
+        frame = by_name.pop(name)
+        parent = place(frame.parent)
+        axes = parent.axes @ rotation_matrix(frame.rotation)
+        found[name] = Pose(axes, parent.axes @ np.array(frame.position) + parent.at_m)
+        return found[name]
+
+    for name in list(by_name):
+        place(name)
+    return found
+
+
+def rotation_matrix(xyzw: tuple[float, float, float, float]) -> Floats:
+    """(3, 3) of a quaternion."""
+    x, y, z, w = np.array(xyzw) / math.hypot(*xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def eye_behind(body: Pose) -> Pose:
+    """The camera behind a body, level: its x to the right, y down, z along the view."""
+    forward = body.axes[:, 0] * [1.0, 1.0, 0.0]
+    length = float(np.linalg.norm(forward))
+    forward = forward / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    at_m = body.at_m - BEHIND_M * forward + [0.0, 0.0, ABOVE_M]
+    view = body.at_m + AHEAD_M * forward - at_m
+    view /= np.linalg.norm(view)
+    right = np.array([forward[1], -forward[0], 0.0])
+    return Pose(np.column_stack([right, np.cross(view, right), view]), at_m)
+
+
+def _pieces(shape: Shape, poses: Mapping[str, Pose]) -> list[_Piece]:
+    """A shape's faces and strokes, in the map."""
+    cos, sin = math.cos(shape.yaw_rad), math.sin(shape.yaw_rad)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    pose = poses.get(shape.frame, Pose(np.eye(3), np.zeros(3)))
+
+    def placed(points_m: Floats) -> Floats:
+        in_frame = points_m @ turn.T + np.array(shape.position)
+        in_map: Floats = in_frame @ pose.axes.T + pose.at_m
+        return in_map
+
+    if shape.kind == "text":
+        return [_Piece(placed(np.zeros((1, 3))), shape.color, text=shape.text)]
+    outlines, width_m = _outlines(shape)
+    return [_Piece(placed(outline), shape.color, width_m) for outline in outlines]
+
+
+def _outlines(shape: Shape) -> tuple[list[Floats], float]:
+    """The polygons (K, 3) of a shape in its own place, or its strokes (2, 3) and their width."""
+    points, size = shape.points, shape.size
+    match shape.kind:
+        case "box":
+            faces = box_mesh((0.0, 0.0, 0.0), size).reshape(2, 6, 3, 3)
+            return [np.vstack([a, b[2:]]) for a, b in zip(*faces, strict=True)], 0.0
+        case "cylinder":
+            return _cylinder(size), 0.0
+        case "sphere":
+            return [_DOT], size[0]
+        case "triangles":
+            return list(points.reshape(-1, 3, 3)), 0.0
+        case "points":
+            return [_DOT + point for point in points], size[0]
+        case "segments":
+            return list(points.reshape(-1, 2, 3)), size[0]
+        case _:
+            return [np.array(pair) for pair in pairwise(points)], size[0]
+
+
+def _cylinder(size: tuple[float, float, float]) -> list[Floats]:
+    rim = _ROUND * size[:2]
+    low, high = (np.column_stack([rim, np.full(12, z * size[2])]) for z in (-0.5, 0.5))
+    sides = [np.array([low[i - 1], low[i], high[i], high[i - 1]]) for i in range(12)]
+    return [*sides, high, low[::-1]]
+
+
+def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
+    heights_m = piece.corners_m[:, 2]
+    if heights_m.max() <= _FLAT_M and np.ptp(heights_m) < 0.01:
+        return 0, float(heights_m[0])
+    return 1, -float(np.linalg.norm(piece.corners_m.mean(axis=0) - eye_m))
+
+
+def _seen(piece: _Piece, eye: Pose) -> Floats | None:
+    """The piece as a polygon of the picture; None if it is behind the eye or edge-on."""
+    corners = _before_eye((piece.corners_m - eye.at_m) @ eye.axes, closed=piece.width_m == 0)
+    if len(corners) < 2:
+        return None
+    flat = _projected(corners)
+    if piece.width_m == 0:
+        return flat if len(flat) > 2 else None
+    return _stroke(flat, _FOCAL_PX * piece.width_m / corners[:, 2])
+
+
+def _before_eye(corners: Floats, *, closed: bool) -> Floats:
+    """Clip to what is before the near plane."""
+    if (corners[:, 2] >= _NEAR_M).all():
+        return corners
+    kept: list[Floats] = []
+    for i, here in enumerate(corners):
+        if here[2] >= _NEAR_M:
+            kept.append(here)
+        if i + 1 == len(corners) and not closed:
+            break
+        there = corners[(i + 1) % len(corners)]
+        if (here[2] >= _NEAR_M) != (there[2] >= _NEAR_M):
+            kept.append(here + (_NEAR_M - here[2]) / (there[2] - here[2]) * (there - here))
+    return np.array(kept).reshape(-1, 3)
+
+
+def _projected(corners: Floats) -> Floats:
+    middle = np.array(SIZE_PX) / 2
+    flat: Floats = middle + _FOCAL_PX * corners[:, :2] / corners[:, 2:]
+    return np.clip(flat, -4000, 4000)
+
+
+def _stroke(ends: Floats, widths_px: Floats) -> Floats:
+    """A line between two points as a polygon, as wide at each end as it is near; or a dot."""
+    along = ends[1] - ends[0]
+    length = float(np.hypot(*along))
+    half_px = np.clip(widths_px, 1.0, _WIDEST_PX)[:, None] / 2
+    if length < half_px[0, 0] / 2:
+        dot: Floats = ends[0] + 2 * half_px[0] * _ROUND
+        return dot
+    across = np.array([[-along[1], along[0]]]) / length * half_px
+    return np.vstack([ends + across, (ends - across)[::-1]])
+
+
+def _lit(piece: _Piece) -> Color:
+    """The colour of a face by how it stands to the sun."""
+    if piece.width_m:
+        return piece.color
+    corners = piece.corners_m
+    (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
+    # Written out: for one pair of vectors NumPy's cross product takes longer than all the rest.
+    normal = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    length = math.hypot(*normal)
+    light = (
+        0.62 + 0.38 * abs(sum(n * s for n, s in zip(normal, _SUN, strict=True))) / length
+        if length
+        else 1.0
+    )
+    red, green, blue, opacity = piece.color
+    return red * light, green * light, blue * light, opacity

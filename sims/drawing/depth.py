@@ -1,0 +1,165 @@
+"""Depth pictures: shrinking them, and packing them into one byte a pixel."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.camera import Lens, draw, draw_wires, fronts, lengths, ray_lengths
+from mcaprl.sims.geometry.compiled import compiled
+
+Floats = NDArray[np.float64]
+
+NEAREST_M = 0.5
+"""Distance of code 0, and of all that is nearer."""
+FARTHEST_M = 100.0
+"""Distance of code 255, and of all that is farther, nothing included."""
+_CODES_PER_E = 255.0 / math.log(FARTHEST_M / NEAREST_M)
+_NO_WIRES: Floats = np.empty((0, 2, 3))
+
+
+def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Pack metres into bytes: 255 ln(d / 0.5 m) / ln(100 m / 0.5 m), rounded, within 0 to 255.
+
+    One code is a step of 2.1 % at any distance. Infinity is 255.
+    """
+    codes = np.asarray(np.clip(depth_m, NEAREST_M, FARTHEST_M))
+    codes /= NEAREST_M
+    np.log(codes, out=codes)
+    codes *= _CODES_PER_E
+    np.rint(codes, out=codes)
+    return codes.astype(np.uint8)
+
+
+def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Unpack bytes into metres; 255 becomes infinity. `encode_depth` gives the same codes again."""
+    depth_m = NEAREST_M * np.exp(codes.astype(np.float64) / _CODES_PER_E)
+    return np.where(codes == 255, np.inf, depth_m).astype(np.float32)
+
+
+def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Pack metres into bytes as AirSim's examples do: 255 / max(1, d), rounded down; infinity is 0.
+
+    Half of the codes go to distances of 1 to 2 m.
+    """
+    codes: NDArray[np.uint8] = (255.0 / np.maximum(1.0, depth_m)).astype(np.uint8)
+    return codes
+
+
+class Overlaps(NamedTuple):
+    """Which of a row of old pixels lie in each of a shorter row of new ones."""
+
+    first: NDArray[np.int64]
+    """(new,) the first old pixel that counts."""
+    weights: Floats
+    """(new, K) shares of the new pixel's area, of that old pixel and of those after it."""
+
+
+def overlaps(old_size: int, new_size: int) -> Overlaps:
+    """Lay `new_size` equal pixels over `old_size` pixels.
+
+    >>> overlaps(3, 2).weights.round(2).tolist()
+    [[0.67, 0.33, 0.0], [0.0, 0.33, 0.67]]
+    """
+    edges = np.arange(new_size + 1) * (old_size / new_size)
+    count = min(old_size, math.floor(old_size / new_size) + 2)
+    first = np.minimum(edges[:-1].astype(np.int64), old_size - count)
+    old = first[:, None] + np.arange(count)
+    width = np.minimum(edges[1:, None], old + 1) - np.maximum(edges[:-1, None], old)
+    return Overlaps(first, np.maximum(width, 0.0) * (new_size / old_size))
+
+
+@compiled
+def shrink(
+    inverse: Floats, rows: Overlaps, columns: Overlaps, depth_m: NDArray[np.float32]
+) -> None:
+    """Average a picture of inverse distances down to one of metres.
+
+    Where at least half of a new pixel's area hits something, it gets the mean inverse of that part,
+    where not, infinity. So the sky never mixes into a distance; and since inverse depth is linear
+    on a plane, the mean is the plane's own distance near the middle of the area.
+
+    Args:
+        inverse: (H, W) 1/m, 0 where nothing is hit.
+        rows: H to h pixels.
+        columns: W to w pixels.
+        depth_m: (h, w), to be filled.
+    """
+    width = inverse.shape[1]
+    sums, hits = np.empty(width), np.empty(width)
+    for i in range(len(rows.first)):
+        sums[:], hits[:] = 0.0, 0.0
+        for k in range(rows.weights.shape[1]):
+            line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
+            # Many rows overlap with fewer others than there is room for.
+            if weight > 0.0:
+                for column in range(width):
+                    sums[column] += weight * line[column]
+                    hits[column] += weight if line[column] > 0.0 else 0.0
+        for j in range(len(columns.first)):
+            total, hit = 0.0, 0.0
+            first, weights = columns.first[j], columns.weights[j]
+            for k in range(len(weights)):
+                total += weights[k] * sums[first + k]
+                hit += weights[k] * hits[first + k]
+            depth_m[i, j] = hit / total if hit >= 0.5 else math.inf
+
+
+class DepthCamera:
+    """A camera in a world that does not change."""
+
+    def __init__(
+        self, mesh: Floats, view: Lens, small: tuple[int, int], wires: Floats = _NO_WIRES
+    ) -> None:
+        """Look at a mesh, (T, 3, 3) metres, through a lens.
+
+        Args:
+            mesh: triangles; see `draw`.
+            view: the lens, and the size at which pictures are drawn.
+            small: (h, w) pixels, the size to which they are averaged down.
+            wires: (S, 2, 3) metres, drawn into the small picture, one pixel wide.
+        """
+        self._mesh, self._planes = mesh, fronts(mesh)
+        self._wires = wires
+        self._view = view
+        self._nearness = 1.0 / ray_lengths(view)
+        self._rows = overlaps(view.height_px, small[0])
+        self._columns = overlaps(view.width_px, small[1])
+        self._small = small
+        self._small_focal_px = (
+            view.focal_px * small[1] / view.width_px,
+            view.focal_px * small[0] / view.height_px,
+        )
+        self._small_lengths = lengths(small, *self._small_focal_px)
+
+    def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
+        """Draw the whole picture, without wires.
+
+        Args:
+            position_m: of the camera.
+            axes: (3, 3) its x, y and z axes as rows, in the mesh's coordinates.
+
+        Returns:
+            (height, width) 1/m along each ray, 0 where nothing is hit.
+        """
+        inverse = np.empty((self._view.height_px, self._view.width_px))
+        eye_m = np.array(position_m)
+        draw(self._mesh, self._planes, eye_m, axes, self._view.focal_px, inverse)
+        inverse *= self._nearness
+        return inverse
+
+    def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
+        """Draw the small picture: (h, w) metres along each ray, infinity where nothing is hit."""
+        small = np.empty(self._small, dtype=np.float32)
+        shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
+        if len(self._wires):
+            wired = np.zeros(self._small)
+            eye = np.array(position_m)
+            draw_wires(self._wires, eye, axes, *self._small_focal_px, wired)
+            shown = wired > 0.0
+            wires_m = (self._small_lengths[shown] / wired[shown]).astype(np.float32)
+            small[shown] = np.minimum(small[shown], wires_m)
+        return small

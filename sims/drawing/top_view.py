@@ -1,0 +1,84 @@
+"""A scene seen from straight above: shapes become flat patches, in the order of their heights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.scene import Color, Shape
+
+Floats = NDArray[np.float64]
+
+_SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_CIRCLE = 0.5 * np.array([[math.cos(a), math.sin(a)] for a in np.arange(16) * math.pi / 8])
+
+
+class Patch(NamedTuple):
+    """A convex polygon of one colour."""
+
+    top_m: float
+    """The height of the shape that it comes from."""
+    color: Color
+    corners_m: Floats
+    """(K, 2)"""
+    frame: str
+
+
+def patches(shapes: Iterable[Shape]) -> list[Patch]:
+    """Flatten shapes, the lowest first; `text` is left out."""
+    flat = [
+        Patch(_top(shape), shape.color, corners, shape.frame)
+        for shape in shapes
+        for corners in _outlines(shape)
+    ]
+    return sorted(flat, key=lambda patch: patch.top_m)
+
+
+def placed(corners_m: Floats, x_m: float, y_m: float, yaw_rad: float) -> Floats:
+    """Turn points of shape (..., 2) by a yaw, then move them."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    moved: Floats = corners_m @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
+    return moved
+
+
+def _top(shape: Shape) -> float:
+    if len(shape.points):
+        return float(shape.position[2] + shape.points[:, 2].max())
+    return shape.position[2] + shape.size[2] / 2
+
+
+def _outlines(shape: Shape) -> list[Floats]:
+    """Give the polygons (K, 2) of a shape, in its frame."""
+    flat, width_m = shape.points[:, :2], shape.size[0]
+    match shape.kind:
+        case "box":
+            outlines = [_SQUARE * shape.size[:2]]
+        case "sphere" | "cylinder":
+            outlines = [_CIRCLE * shape.size[:2]]
+        case "points":
+            outlines = [_CIRCLE * width_m + point for point in flat]
+        case "triangles":
+            outlines = list(flat.reshape(-1, 3, 2))
+        case "segments":
+            outlines = [_stroke(a, b, width_m) for a, b in flat.reshape(-1, 2, 2)]
+        case "line" | "arrow":
+            outlines = [_stroke(a, b, width_m) for a, b in pairwise(flat)]
+        case "text":
+            outlines = []
+    x_m, y_m, _ = shape.position
+    return [placed(outline, x_m, y_m, shape.yaw_rad) for outline in outlines]
+
+
+def _stroke(start: Floats, end: Floats, width_m: float) -> Floats:
+    """Give the rectangle (4, 2) around a straight line, longer by half its width at each end."""
+    along = end - start
+    length_m = float(np.hypot(along[0], along[1]))
+    yaw_rad = math.atan2(along[1], along[0])
+    middle = (start + end) / 2
+    size = (length_m + width_m, width_m)
+    return placed(_SQUARE * size, float(middle[0]), float(middle[1]), yaw_rad)

@@ -1,0 +1,1 @@
+"""Rollouts, evaluation, statistics and reports of policies in a sim."""

@@ -1,0 +1,189 @@
+"""Scores policies on the same episodes, with intervals that say how sure one can be."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.evaluation.batch_rollout import batch_rollout
+from mcaprl.sims.evaluation.rollout import (
+    EpisodeResult,
+    EpsilonGreedy,
+    Policy,
+    episode_seed,
+    rollout,
+)
+from mcaprl.sims.evaluation.statistics import (
+    bootstrap_interval,
+    improvement_interval,
+    improvement_probability,
+    interquartile_mean,
+    median,
+)
+
+
+@dataclass(frozen=True)
+class PolicyScore:
+    """What one policy reached.
+
+    Attributes:
+        policy: its name.
+        results: episodes of each training seed; scripted policies have one "seed".
+        mean_return: over seeds and episodes.
+        interval: 95 % bootstrap interval of the mean, over seeds and episodes.
+        normalized_score: 0 as random, 1 as the pilot; None without a pilot.
+        normalized_interval: the interval on that scale.
+        successes: ends that count as success; None if the environment does not tell.
+    """
+
+    policy: str
+    results: tuple[tuple[EpisodeResult, ...], ...]
+    mean_return: float
+    interval: tuple[float, float]
+    normalized_score: float | None = None
+    normalized_interval: tuple[float, float] | None = None
+    successes: tuple[str, ...] | None = None
+
+    @property
+    def returns(self) -> NDArray[np.float64]:
+        """(seeds, episodes)."""
+        return np.array([[episode.total_reward for episode in seed] for seed in self.results])
+
+    @property
+    def ends(self) -> dict[str, int]:
+        """Episodes by the reason they ended."""
+        return dict(Counter(e.reason for seed in self.results for e in seed).most_common())
+
+    @property
+    def success_rate(self) -> float | None:
+        """The share of episodes that ended well; None if the environment does not tell."""
+        if self.successes is None:
+            return None
+        return sum(self.ends.get(reason, 0) for reason in self.successes) / self.returns.size
+
+    def to_json(self) -> dict[str, Any]:
+        """As `mcaprl evaluate --json` prints it."""
+        returns = self.returns
+        middle = {"median": median, "interquartile_mean": interquartile_mean}
+        return {
+            "policy": self.policy,
+            "episodes": int(returns.size),
+            "mean_return": self.mean_return,
+            "interval": list(self.interval),
+            "normalized_score": self.normalized_score,
+            "normalized_interval": self.normalized_interval and list(self.normalized_interval),
+            **{name: float(statistic(returns)) for name, statistic in middle.items()},
+            **{
+                f"{name}_interval": list(bootstrap_interval(returns, statistic))
+                for name, statistic in middle.items()
+            },
+            "seed_means": returns.mean(axis=1).tolist(),
+            "success_rate": self.success_rate,
+            "mean_length": float(np.mean([e.length for seed in self.results for e in seed])),
+            "ends": self.ends,
+            "returns": returns.ravel().tolist(),
+        }
+
+
+def evaluate(
+    env: gym.Env[Any, Any],
+    policies: Sequence[Policy | None],
+    *,
+    name: str,
+    episodes: int,
+    seed: int,
+    envs: gym.vector.VectorEnv[Any, Any, Any] | None = None,
+    on_policy: Callable[[str], None] = lambda name: None,
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> PolicyScore:
+    """Run one policy, or one per training seed, greedily through the same episodes.
+
+    Args:
+        env: to run in.
+        policies: of the training seeds; [None] acts at random.
+        name: for tables.
+        episodes: for each of `policies`; the same starts for all.
+        seed: of the episodes.
+        envs: `episodes` of the same environment, to be stepped together instead; for policies that
+            act on batches.
+        on_policy: called with each policy's own name before its first episode.
+        on_episode: called after each episode.
+    """
+    results = []
+    for policy in policies:
+        on_policy(name if policy is None or len(policies) == 1 else policy.name)
+        if envs is not None and policy is not None:
+            seeds = [episode_seed(seed, episode) for episode in range(episodes)]
+            results.append(tuple(batch_rollout(envs, policy, seeds, on_episode)))
+            continue
+        behavior = EpsilonGreedy(policy, 0.0, env.action_space)
+        results.append(
+            tuple(rollout(env, behavior, seed=seed, episodes=episodes, on_episode=on_episode))
+        )
+    returns = np.array([[episode.total_reward for episode in one] for one in results])
+    return PolicyScore(
+        name,
+        tuple(results),
+        float(returns.mean()),
+        bootstrap_interval(returns),
+        successes=getattr(env.unwrapped, "success_reasons", None),
+    )
+
+
+def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
+    """Add the score on the scale random = 0, pilot = 1; as it is if there is no pilot."""
+    if pilot is None or pilot.mean_return == random.mean_return:
+        return score
+    span = pilot.mean_return - random.mean_return
+
+    def scaled(value: float) -> float:
+        return (value - random.mean_return) / span
+
+    low, high = score.interval
+    return replace(
+        score,
+        normalized_score=scaled(score.mean_return),
+        normalized_interval=(scaled(low), scaled(high)),
+    )
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """How often an episode of one policy returns more than one of another.
+
+    Attributes:
+        better: the policy that may be better.
+        than: the other.
+        probability: 0.5 for equals.
+        interval: its 95 % bootstrap interval.
+    """
+
+    better: str
+    than: str
+    probability: float
+    interval: tuple[float, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """As `mcaprl evaluate --json` prints it."""
+        return {**vars(self), "interval": list(self.interval)}
+
+
+def improvements(scores: Sequence[PolicyScore]) -> list[Improvement]:
+    """Compare each policy with all that have a lower mean."""
+    ordered = sorted(scores, key=lambda score: -score.mean_return)
+    return [
+        Improvement(
+            first.policy,
+            second.policy,
+            improvement_probability(first.returns, second.returns),
+            improvement_interval(first.returns, second.returns),
+        )
+        for first, second in itertools.combinations(ordered, 2)
+    ]

@@ -1,0 +1,269 @@
+"""An evaluation at a glance: how policies compare, where they went, what to look at next.
+
+Extra: `report`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
+from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.sims.drawing.scene import Shape
+from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
+from mcaprl.sims.evaluation.rollout import EpisodeResult
+from mcaprl.sims.evaluation.statistics import interquartile_mean, median
+
+_MAX_PATHS = 30
+_PAIRS = "How often an episode of one policy returns more than one of another; ties count half."
+# What is lower than this is ground, not something to drive around.
+_FLAT_M = 1.0
+
+
+def comparison_figure(
+    scores: Sequence[PolicyScore],
+    title: str,
+    behavior: tuple[float, float, float] | None,
+    width: float = 8.0,
+) -> Any:
+    """Mean returns with their intervals, a dot for each training seed.
+
+    Args:
+        scores: from top to bottom.
+        title: over the picture.
+        behavior: mean, low and high of the logged episodes' returns, drawn as a band.
+        width: inches.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
+    if behavior is not None:
+        mean, low, high = behavior
+        axes.axvspan(low, high, color=PALE, alpha=0.45, lw=0)
+        axes.axvline(mean, color=INK, lw=1, ls="--", label=f"behavior in the log {mean:.0f}")
+    for row, score in enumerate(scores):
+        low, high = score.interval
+        color = COLORS[row % len(COLORS)]
+        axes.barh(row, score.mean_return, color=color, alpha=0.85, height=0.62)
+        axes.plot([low, high], [row, row], color=INK, lw=2, solid_capstyle="butt")
+        means = score.returns.mean(axis=1)
+        if len(means) > 1:
+            axes.plot(means, np.full(len(means), row), "o", color="white", mec=INK, ms=4.5)
+        label = f"{score.mean_return:.1f}"
+        if score.normalized_score is not None:
+            label += f"   score {score.normalized_score:.2f}"
+        # Behind the longest of bar, interval and dots.
+        end = max(high, 0.0, float(means.max()))
+        text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
+        # The line of the behavior in the log may run through it.
+        text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
+    axes.set_yticks(range(len(scores)), [score.policy for score in scores])
+    axes.invert_yaxis()
+    axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
+    axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
+    axes.set_title(title)
+    if behavior is not None:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    return figure
+
+
+def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> Any:
+    """Where each policy went, on the map seen from above; a cross where an episode ended early.
+
+    Args:
+        scores: a panel each; those without positions are left out. None if none has any.
+        world: what stands still, to be drawn beneath.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    shown = [score for score in scores if score.results[0][0].positions.size]
+    if not shown:
+        return None
+    columns = min(3, len(shown))
+    rows = -(-len(shown) // columns)
+    figure, panels = new_figure((4.2 * columns, 5.6 * rows), rows, columns, grid=True)
+    panels = panels.ravel()
+    for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
+        _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+        axes.set_title(f"{score.policy}\n{_ends(score)}")
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _ways(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
+    """The same for pages: a figure for each policy, which a phone shows below each other."""
+    figures = []
+    for row, score in enumerate(scores):
+        if score.results[0][0].positions.size:
+            figure, axes = new_figure((4.2, 4.8))
+            _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+            figures.append(Figure.of(f"{score.policy}: {_ends(score)}", figure))
+    return figures
+
+
+def _draw_ways(axes: Any, score: PolicyScore, world: Sequence[Shape], color: str) -> None:
+    _draw_world(axes, world)
+    episodes = [episode for seed in score.results for episode in seed]
+    stride = -(-len(episodes) // _MAX_PATHS)
+    for episode in episodes[::stride]:
+        x, y = episode.positions.T
+        axes.plot(x, y, color=color, lw=1.1, alpha=0.75)
+        if episode.reason != "time_limit":
+            axes.plot(x[-1], y[-1], "x", color=INK, ms=5, mew=1.3)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, m")
+    axes.set_ylabel("y, m")
+
+
+def _ends(score: PolicyScore) -> str:
+    return ", ".join(f"{count} {reason}" for reason, count in score.ends.items())
+
+
+def evaluation_page(
+    folder: Path,
+    title: str,
+    scores: Sequence[PolicyScore],
+    compared: Sequence[Improvement],
+    world: Sequence[Shape],
+    behavior: tuple[float, float, float] | None,
+    recorded: tuple[Path, int] | None,
+    curves: Sequence[Figure] = (),
+) -> None:
+    """Write FOLDER/index.html, comparison.png and trajectories.png.
+
+    Args:
+        folder: made if it is not there.
+        title: of the page.
+        scores: of the policies.
+        compared: the policies with each other.
+        world: what stands still.
+        behavior: mean, low and high of the logged episodes' returns, if there are such.
+        recorded: the log with the episodes, and of how many of the first `scores` it has them.
+        curves: how the policies were learnt.
+
+    Raises:
+        MissingExtraError: matplotlib or jinja2 is not installed.
+        ReportError: a file cannot be written.
+    """
+    save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
+    ways = trajectory_figure(scores, world)
+    if ways is not None:
+        save_png(ways, folder / "trajectories.png")
+    comparison = comparison_figure(scores, "", behavior, width=5.6)
+    figures = [Figure.of("Mean returns", comparison)]
+    sections = [
+        Section("Scores", figures=figures, table=_score_table(scores)),
+        Section("Against each other", _PAIRS, table=_improvement_table(compared)),
+    ]
+    if ways is not None:
+        text = "A cross is an early end."
+        sections.append(Section("Where they went", text, figures=_ways(scores, world)))
+    cards = _cards(scores, world, recorded)
+    sections.append(Section("Best and worst episodes", cards=cards))
+    if curves:
+        sections.append(Section("How they were learnt", figures=curves))
+    episodes = sum(score.returns.size for score in scores)
+    write_page(folder / "index.html", title, f"{episodes} episodes, greedy actions", sections)
+
+
+def _score_table(scores: Sequence[PolicyScore]) -> Table:
+    rows = [
+        (
+            score.policy,
+            f"{score.mean_return:.2f}",
+            f"{score.interval[0]:.2f} to {score.interval[1]:.2f}",
+            f"{float(interquartile_mean(score.returns)):.2f}",
+            f"{float(median(score.returns)):.2f}",
+            "" if score.normalized_score is None else f"{score.normalized_score:.3f}",
+            "" if score.success_rate is None else f"{score.success_rate:.0%}",
+            _ends(score),
+        )
+        for score in scores
+    ]
+    names = (
+        "policy",
+        "mean return",
+        "95 % interval",
+        "middle half",
+        "median",
+        "score",
+        "success",
+        "ends",
+    )
+    return Table(names, rows)
+
+
+def _improvement_table(compared: Sequence[Improvement]) -> Table:
+    rows = [
+        (
+            one.better,
+            one.than,
+            f"{one.probability:.2f}",
+            f"{one.interval[0]:.2f} to {one.interval[1]:.2f}",
+        )
+        for one in compared
+    ]
+    return Table(("policy", "than", "probability", "95 % interval"), rows)
+
+
+def _cards(
+    scores: Sequence[PolicyScore], world: Sequence[Shape], recorded: tuple[Path, int] | None
+) -> list[Card]:
+    """The best and the worst episode of each policy."""
+    cards, first = [], 0
+    for row, score in enumerate(scores):
+        episodes = [episode for seed in score.results for episode in seed]
+        totals = [episode.total_reward for episode in episodes]
+        for kind, index in (("best", int(np.argmax(totals))), ("worst", int(np.argmin(totals)))):
+            episode = episodes[index]
+            command = f"reset(seed={episode.seed})"
+            if recorded is not None and row < recorded[1]:
+                command = f"mcaprl replay {recorded[0]} --episode {first + index}"
+            text = f"return {episode.total_reward:.4g}, {episode.length} steps, {episode.reason}"
+            cards.append(Card(f"{score.policy}: {kind}", text, _thumbnail(episode, world), command))
+        first += len(episodes)
+    return cards
+
+
+def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
+    """An episode's way on the map as a small SVG; empty if it has no positions."""
+    if not episode.positions.size:
+        return ""
+    figure, axes = new_figure((3.2, 2.2))
+    _draw_world(axes, world)
+    axes.plot(*episode.positions.T, color=COLORS[1], lw=1.6)
+    axes.plot(*episode.positions[-1], "x", color=INK, ms=6)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    return to_svg(figure)
+
+
+def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
+    """Lines and boxes that are fixed to the map."""
+    for shape in world:
+        if shape.frame != "map":
+            continue
+        if shape.kind == "line":
+            axes.plot(shape.points[:, 0], shape.points[:, 1], color=PALE, lw=1, zorder=0)
+        elif shape.kind == "segments":
+            pairs = shape.points[:, :2].reshape(-1, 2, 2)
+            # Not-a-number ends a stroke.
+            strokes = np.pad(pairs, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+            axes.plot(*strokes.reshape(-1, 2).T, color=PALE, lw=1, zorder=0)
+        elif shape.kind == "box" and shape.size[2] > _FLAT_M:
+            corners = _box_corners(shape)
+            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0.8, zorder=0)
+
+
+def _box_corners(shape: Shape) -> Any:
+    half_x, half_y = shape.size[0] / 2, shape.size[1] / 2
+    local = np.array([(half_x, half_y), (-half_x, half_y), (-half_x, -half_y), (half_x, -half_y)])
+    cos, sin = np.cos(shape.yaw_rad), np.sin(shape.yaw_rad)
+    return local @ np.array([(cos, sin), (-sin, cos)]) + np.array(shape.position[:2])

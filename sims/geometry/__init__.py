@@ -1,0 +1,1 @@
+"""Paths, vectors, meshes and kinematics shared by the sims."""

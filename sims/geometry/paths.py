@@ -1,0 +1,225 @@
+"""Plane geometry of a closed path: where its points are, and which one is nearest."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mcaprl.sims.geometry.compiled import compiled, inlined
+
+
+class Path(NamedTuple):
+    """A closed polyline of N legs, addressed by the distance along it."""
+
+    points_m: NDArray[np.float64]
+    """(N + 1, 2) corners; the last one is the first again."""
+    along_m: NDArray[np.float64]
+    """(N + 1,) distance of each corner from the start, along the path."""
+    yaw_rad: NDArray[np.float64]
+    """(N,) direction of each leg, counter-clockwise from x."""
+    forward: NDArray[np.float64]
+    """(N, 2) the same as unit vectors."""
+    length_m: float
+
+
+class Projection(NamedTuple):
+    """The path point nearest to a position."""
+
+    along_m: float
+    offset_m: float
+    """Distance from it, positive to the left of the path's direction."""
+    yaw_rad: float
+    """Direction of the path there."""
+
+
+def closed_path(corners: ArrayLike) -> Path:
+    """Make a path through corners of shape (N + 1, 2), metres, the last equal to the first.
+
+    Raises:
+        ValueError: the corners do not form a closed polyline of legs longer than 0.
+    """
+    points = np.array(corners, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+        raise ValueError(f"corners have shape {points.shape}: at least (3, 2) is needed")
+    if not np.array_equal(points[0], points[-1]):
+        raise ValueError(f"the path is open: it starts at {points[0]} and ends at {points[-1]}")
+    legs = np.diff(points, axis=0)
+    lengths = np.hypot(legs[:, 0], legs[:, 1])
+    if not np.all(lengths > 0):
+        raise ValueError("two neighbouring corners are the same point")
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    yaw_rad = np.arctan2(legs[:, 1], legs[:, 0])
+    return Path(points, along, yaw_rad, legs / lengths[:, np.newaxis], float(along[-1]))
+
+
+@inlined
+def wrap_angle(angle_rad: float) -> float:
+    """Bring an angle into [-pi, pi)."""
+    turns = np.floor((angle_rad + math.pi) / (2.0 * math.pi))
+    wrapped = max(angle_rad - 2.0 * math.pi * turns, -math.pi)
+    # Rounding may leave it a hair outside on the other side.
+    return wrapped if wrapped < math.pi else -math.pi
+
+
+@inlined
+def sine(angle_rad: float) -> float:
+    """Give the sine of an angle of at most 45 degrees, to the last bit or two.
+
+    Without a branch or a call, so that the compiler can do those of several vehicles at once. The
+    series x - x^3/3! + x^5/5! - ...: the first term left out is below 6e-17 of the sine.
+    """
+    square = angle_rad * angle_rad
+    rest = 1.0 / 6227020800.0 - square * (1.0 / 1307674368000.0)
+    rest = 1.0 / 39916800.0 - square * rest
+    rest = 1.0 / 362880.0 - square * rest
+    rest = 1.0 / 5040.0 - square * rest
+    rest = 1.0 / 120.0 - square * rest
+    rest = 1.0 / 6.0 - square * rest
+    return angle_rad * (1.0 - square * rest)
+
+
+@inlined
+def cosine(angle_rad: float) -> float:
+    """Give the cosine of an angle of at most 45 degrees, as `sine` gives the sine.
+
+    1 - x^2/2! + x^4/4! - ...: the first term left out is below 2e-18.
+    """
+    square = angle_rad * angle_rad
+    rest = 1.0 / 87178291200.0 - square * (1.0 / 20922789888000.0)
+    rest = 1.0 / 479001600.0 - square * rest
+    rest = 1.0 / 3628800.0 - square * rest
+    rest = 1.0 / 40320.0 - square * rest
+    rest = 1.0 / 720.0 - square * rest
+    rest = 1.0 / 24.0 - square * rest
+    return 1.0 - square * (0.5 - square * rest)
+
+
+_QUARTER_RAD, _QUARTER_REST_RAD = math.pi / 2, 6.123233995736766e-17
+"""A quarter turn, and what float64 lacks of it."""
+
+
+class Heading(NamedTuple):
+    """The direction of a yaw, as a unit vector."""
+
+    cos: float
+    sin: float
+
+
+@inlined
+def heading_of(yaw_rad: float) -> Heading:
+    """Give the direction of a yaw, to the last bit or two.
+
+    Without a branch or a call, as `sine`: the sine of what is left of the nearest quarter turn, and
+    its cosine, trade places from quarter to quarter.
+    """
+    quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
+    rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
+    sin, cos = sine(rest_rad), cosine(rest_rad)
+    # 0 to 3.
+    quarter = quarters - 4.0 * np.floor(0.25 * quarters)
+    is_odd = (quarter == 1.0) | (quarter == 3.0)
+    size_of_cos, size_of_sin = (sin, cos) if is_odd else (cos, sin)
+    is_left, is_below = (quarter == 1.0) | (quarter == 2.0), quarter >= 2.0
+    return Heading(
+        -size_of_cos if is_left else size_of_cos, -size_of_sin if is_below else size_of_sin
+    )
+
+
+@inlined
+def turned(heading: Heading, angle_rad: float) -> Heading:
+    """Turn a direction to the left, by at most 90 degrees either way.
+
+    The sum formulas need the angle's own sine and cosine; 1 - cos is 2 sin^2 of half the angle.
+    """
+    half = sine(0.5 * angle_rad)
+    cos = 1.0 - 2.0 * half * half
+    sin = 2.0 * half * math.sqrt(1.0 - half * half)
+    return Heading(heading.cos * cos - heading.sin * sin, heading.sin * cos + heading.cos * sin)
+
+
+class Spot(NamedTuple):
+    """A place on a path: on which leg, and how far from the leg's start."""
+
+    leg: int
+    rest_m: float
+
+
+@compiled
+def spot_at(path: Path, along_m: float) -> Spot:
+    """Find the place at a distance along the path; any lap will do."""
+    rest_m = along_m % path.length_m
+    leg, beyond = 0, len(path.yaw_rad)
+    while beyond - leg > 1:
+        middle = (leg + beyond) // 2
+        if path.along_m[middle] <= rest_m:
+            leg = middle
+        else:
+            beyond = middle
+    return Spot(leg, rest_m - path.along_m[leg])
+
+
+@compiled
+def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
+    """Go on from a place by a distance of 0 or more, metres."""
+    leg, rest_m = spot.leg, spot.rest_m + ahead_m
+    length_m = path.along_m[leg + 1] - path.along_m[leg]
+    while rest_m >= length_m:
+        rest_m -= length_m
+        leg = leg + 1 if leg + 1 < len(path.yaw_rad) else 0
+        length_m = path.along_m[leg + 1] - path.along_m[leg]
+    return Spot(leg, rest_m)
+
+
+@compiled
+def point_of(path: Path, spot: Spot) -> tuple[float, float]:
+    """Give the coordinates (x, y) of a place, metres."""
+    start, forward = path.points_m[spot.leg], path.forward[spot.leg]
+    return start[0] + spot.rest_m * forward[0], start[1] + spot.rest_m * forward[1]
+
+
+@compiled
+def leg_at(path: Path, along_m: float) -> int:
+    """Give the index of the leg that holds a distance along the path; any lap will do."""
+    return spot_at(path, along_m).leg
+
+
+@compiled
+def point_at(path: Path, along_m: float) -> tuple[float, float]:
+    """Give the point (x, y) at a distance along the path, metres; any lap will do."""
+    return point_of(path, spot_at(path, along_m))
+
+
+@compiled
+def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
+    """Find the nearest of the path points between two distances along it.
+
+    The window [from_m, to_m] keeps a traveller on its own pass where the path meets itself. It may
+    begin on any lap, and the result's `along_m` lies inside it.
+    """
+    leg, rest_m = spot_at(path, from_m)
+    leg_start_m = from_m - rest_m
+    nearest, along_m, leftward, yaw_rad = math.inf, from_m, True, 0.0
+    while leg_start_m <= to_m:
+        leg_length_m = path.along_m[leg + 1] - path.along_m[leg]
+        cos, sin = path.forward[leg, 0], path.forward[leg, 1]
+        dx, dy = x_m - path.points_m[leg, 0], y_m - path.points_m[leg, 1]
+        first_m = max(0.0, from_m - leg_start_m)
+        last_m = min(leg_length_m, to_m - leg_start_m)
+        along_leg_m = min(max(dx * cos + dy * sin, first_m), last_m)
+        square = (dx - along_leg_m * cos) ** 2 + (dy - along_leg_m * sin) ** 2
+        if square < nearest:
+            nearest, along_m, yaw_rad = square, leg_start_m + along_leg_m, path.yaw_rad[leg]
+            leftward = cos * dy - sin * dx >= 0.0
+        leg_start_m += leg_length_m
+        leg = leg + 1 if leg + 1 < len(path.yaw_rad) else 0
+    distance_m = math.sqrt(nearest)
+    return Projection(along_m, distance_m if leftward else -distance_m, yaw_rad)
+
+
+@inlined
+def in_body_frame(dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
+    """Turn a map vector into a body's frame: (forward, left), metres."""
+    return dx_m * cos_yaw + dy_m * sin_yaw, dy_m * cos_yaw - dx_m * sin_yaw

@@ -1,0 +1,1 @@
+"""The roads of highway-env, `mcaprl/HighwayLane-v0`."""

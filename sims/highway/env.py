@@ -1,0 +1,374 @@
+"""highway-env's lane keeping and racetracks, with the actions, names and scene of our sims."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from highway_env.envs.lane_keeping_env import LaneKeepingEnv
+from highway_env.envs.racetrack_env import RacetrackEnv, RacetrackEnvOval
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.scene import Frame, Shape
+from mcaprl.sims.highway import scene as highway_scene
+from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
+from mcaprl.sims.highway.scene import Car
+from mcaprl.sims.highway.start import drawn_pose, pose_from_options
+from mcaprl.sims.vehicle.arguments import Pose, check_action, check_name
+
+if TYPE_CHECKING:
+    from mcaprl.sims.highway.view import HighwayView
+
+Floats = NDArray[np.float64]
+
+RULES = ("default",)
+OBSERVATIONS = ("state",)
+STARTS = ("anywhere", "line")
+RENDER_MODES = ("human", "rgb_array")
+METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}
+ROADS: Final[dict[str, type]] = {
+    "lane-keeping-v0": LaneKeepingEnv,
+    "racetrack-v0": RacetrackEnv,
+    "racetrack-oval-v0": RacetrackEnvOval,
+}
+"""highway-env's own ids."""
+
+ACTION_MEANINGS = ("straight", "right", "left", "slightly right", "slightly left")
+STEERING_RAD = np.radians([0.0, -24.0, 24.0, -6.0, 6.0])
+"""Of the front wheels; left is positive."""
+LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
+SEEN_AHEAD_M = 50.0
+OBSERVATION_NAMES = (
+    "offset",
+    "heading_error",
+    "speed",
+    "lateral_speed",
+    "yaw_rate",
+    *(f"{axis}_{ahead:.0f}m" for ahead in LOOKAHEADS_M for axis in ("forward", "left")),
+    "other_forward",
+    "other_left",
+)
+OBSERVATION_LIMIT = 4.0
+TRAIL_LENGTH = 40
+# No observation of theirs is made: its noise and its tables are not ours.
+_NO_OBSERVATION = {"type": "AttributesObservation", "attributes": []}
+
+
+class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
+    """A car that keeps its lane on a road of highway-env.
+
+    ## Description
+
+    The roads, the cars and the rewards are highway-env's, unchanged: `lane-keeping-v0`, where a car
+    whose tyres slip follows a straight road and then a winding one, 480 m in all; and two closed
+    racetracks of several lanes with another car on them, which is slower. The speed is given;
+    the agent steers. Edouard Leurent, "An environment for autonomous driving decision-making",
+    https://github.com/Farama-Foundation/HighwayEnv, 2018.
+
+    The car decides each 0.1 s of simulated time, on racetracks each 0.2 s. The same seed and
+    actions give the same bits. Axes are right-handed with z up, x and y in metres; y and angles
+    have the opposite sign of highway-env's, so left is positive.
+
+    ## Action Space
+
+    `Discrete(5)`, the angle of the front wheels.
+
+    | Action | Meaning | Steering |
+    |---|---|---|
+    | 0 | straight | 0 |
+    | 1 | right | 24 degrees to the right |
+    | 2 | left | 24 degrees to the left |
+    | 3 | slightly right | 6 degrees to the right |
+    | 4 | slightly left | 6 degrees to the left |
+
+    ## Observation Space
+
+    `observation="state"`: `Box(-4, 4)` of 15 float32; what is beyond is clipped.
+
+    | Index | Observation | Unit |
+    |---|---|---|
+    | 0 | distance from the middle of the lane, left positive | half the lane's width |
+    | 1 | heading error, left positive | pi / 2 rad |
+    | 2 | speed | 10 m/s |
+    | 3 | speed sideways, by slipping, left positive | 5 m/s |
+    | 4 | yaw rate of a slipping car, left positive | 2 rad/s |
+    | 5, 6 | the lane's middle 5 m ahead: forward, left of the car | 5 m |
+    | 7, 8 | 10 m ahead | 10 m |
+    | 9, 10 | 20 m ahead | 20 m |
+    | 11, 12 | 40 m ahead | 40 m |
+    | 13, 14 | nearest other car within 50 m: forward, left; (1, 0) if there is none | 50 m |
+
+    ## Rewards
+
+    highway-env's. Lane keeping: 1 - (d / 10 m)^2 at distance d from the middle of the lane that is
+    to be followed. Racetracks: 1 / (1 + 4 d^2) less 0.3 for full steering, scaled to 0 to 1; 0 off
+    the road.
+
+    ## Starting State
+
+    `start="line"`: highway-env's own, which is always the same in lane keeping.
+    `start="anywhere"`: from there the car is put anywhere on its road, but for the last 60 m of one
+    that ends and 20 m around another car; up to 1.5 m and 0.2 rad off.
+    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, or with a fourth number for the speed in m/s,
+    puts it there.
+
+    ## Episode End
+
+    Terminated with `info["reason"]` = `off_lane` (the car's middle is on no lane), `collision`, or
+    `finished` (5 m before the end of a road that has one). Truncated after 700 steps, and on
+    racetracks with `time_limit` after highway-env's own 300 s.
+
+    `info` has lateral_offset_m, heading_error_rad, speed_m_s and progress_m (along the road since
+    the start; on a racetrack along its first lane, growing over the laps).
+
+    What differs from highway-env: lane keeping there never terminates, is cut after 200 steps,
+    166 m, and observes with noise.
+
+    ## Arguments
+
+    - `road`: `"lane-keeping-v0"`, `"racetrack-v0"` or `"racetrack-oval-v0"`.
+    - `rules`: `"default"`.
+    - `observation`: `"state"`.
+    - `start`: `"anywhere"` or `"line"`.
+    - `render_mode`: None, `"human"` or `"rgb_array"`.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    metadata = METADATA
+    success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
+    action_meanings = ACTION_MEANINGS
+    observation_names = OBSERVATION_NAMES
+
+    def __init__(
+        self,
+        road: str = "lane-keeping-v0",
+        rules: str = "default",
+        observation: str = "state",
+        start: str = "anywhere",
+        render_mode: Literal["human", "rgb_array"] | None = None,
+    ) -> None:
+        """See "Arguments" above.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+        """
+        check_name("road", road, tuple(ROADS))
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("start", start, STARTS)
+        check_name("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
+        self.render_mode = self._render_mode = render_mode
+        self._inner: Any = ROADS[road](config={"observation": _NO_OBSERVATION})
+        frequency_hz = self._inner.config["policy_frequency"]
+        self.step_duration_s = 1.0 / frequency_hz
+        self.metadata = {**METADATA, "render_fps": frequency_hz}
+        self.courses = courses_of(self._inner.road.network)
+        self._steering_range_rad = float(self._inner.action_type.steering_range[1])
+        self.action_space = spaces.Discrete(len(ACTION_MEANINGS))
+        self.observation_space = spaces.Box(
+            -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (len(OBSERVATION_NAMES),), np.float32
+        )
+        self._start = start
+        self._progress_m = 0.0
+        self._last_action = 0
+        self._reward = 0.0
+        self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
+        self._view: HighwayView | None = None
+        self._locate()
+
+    @property
+    def car(self) -> Car:
+        """The car that is driven."""
+        return self._car
+
+    @property
+    def others(self) -> tuple[Car, ...]:
+        """The other cars."""
+        own = self._inner.vehicle
+        return tuple(_car_of(each) for each in self._inner.road.vehicles if each is not own)
+
+    @property
+    def course(self) -> Course:
+        """The lane that the car is on, from end to end."""
+        return self.courses[self._lane]
+
+    @property
+    def place(self) -> Place:
+        """Where the car is on its lane."""
+        return self._place
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; see "Starting State".
+
+        Raises:
+            UsageError: `options` has an unknown key, or a pose that is not free and on a lane.
+        """
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self._inner.reset(seed=seed)
+        # It keeps all states since it was made.
+        getattr(self._inner, "trajectory", []).clear()
+        self._locate()
+        car, others = self._car, self.others
+        if options:
+            self._put(pose_from_options(options, self.courses, others, car))
+        elif self._start == "anywhere":
+            self._put(drawn_pose(self.np_random, self.courses, others, car.speed_m_s))
+        self._progress_m, self._last_action, self._reward = 0.0, 0, 0.0
+        self._trail_m.clear()
+        return self._seen(), self._info()
+
+    def step(
+        self, action: int | np.integer[Any]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Drive on for one decision.
+
+        Raises:
+            UsageError: the action is not 0 to 4.
+        """
+        check_action(action, len(ACTION_MEANINGS))
+        self._last_action = int(action)
+        # Their angles grow clockwise.
+        share = -STEERING_RAD[action] / self._steering_range_rad
+        _, reward, _, is_over, _ = self._inner.step(np.array([share]))
+        before_m = self._along_m
+        self._locate()
+        self._progress_m += self._moved_m(before_m)
+        self._reward = float(reward)
+        reason = self._reason()
+        info = self._info()
+        if reason or is_over:
+            info["reason"] = reason or "time_limit"
+        return self._seen(), self._reward, bool(reason), bool(is_over and not reason), info
+
+    def _reason(self) -> str:
+        """Say why the car cannot drive on; empty if it can."""
+        if self._inner.vehicle.crashed:
+            return "collision"
+        if abs(self._place.offset_m) > self.course.half_width_m:
+            return "off_lane"
+        left_m = self.course.length_m - self._place.along_m
+        return "finished" if not self.course.is_closed and left_m < LOOKAHEADS_M[0] else ""
+
+    def _locate(self) -> None:
+        """Find the car on the courses; the nearest one is its lane."""
+        self._car = _car_of(self._inner.vehicle)
+        places = [course.nearest(self._car.x_m, self._car.y_m) for course in self.courses]
+        self._lane = int(np.argmin([abs(place.offset_m) for place in places]))
+        self._place, self._along_m = places[self._lane], places[0].along_m
+
+    def _moved_m(self, before_m: float) -> float:
+        """Give the way along the first lane since it was at `before_m`."""
+        moved_m, length_m = self._along_m - before_m, self.courses[0].length_m
+        if self.courses[0].is_closed:
+            moved_m = (moved_m + length_m / 2) % length_m - length_m / 2
+        return moved_m
+
+    def _put(self, pose: Pose) -> None:
+        """Move the car of the inner environment."""
+        vehicle = self._inner.vehicle
+        vehicle.position = np.array([pose.x_m, pose.y_m]) * FLIP
+        vehicle.heading, vehicle.speed = -pose.yaw_rad, pose.speed_m_s
+        vehicle.on_state_update()
+        self._locate()
+
+    def _seen(self) -> NDArray[np.float32]:
+        """Give the observation, and take note of the place for what is drawn."""
+        self._trail_m.append((self._car.x_m, self._car.y_m))
+        if self.render_mode == "human":
+            self.render()
+        vehicle = self._inner.vehicle
+        seen = [
+            self._place.offset_m / self.course.half_width_m,
+            self._heading_error_rad() / (math.pi / 2),
+            self._car.speed_m_s / 10.0,
+            -float(getattr(vehicle, "lateral_speed", 0.0)) / 5.0,
+            -float(getattr(vehicle, "yaw_rate", 0.0)) / 2.0,
+        ]
+        for ahead_m in LOOKAHEADS_M:
+            forward_m, left_m = self._car.sees(self.course.point(self._place.along_m + ahead_m))
+            seen += [forward_m / ahead_m, left_m / ahead_m]
+        near = [self._car.sees((car.x_m, car.y_m)) for car in self.others]
+        nearest = min(near, key=lambda at: math.hypot(*at), default=(math.inf, 0.0))
+        is_near = math.hypot(*nearest) < SEEN_AHEAD_M
+        seen += [part / SEEN_AHEAD_M for part in nearest] if is_near else [1.0, 0.0]
+        clipped = np.clip(seen, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        return clipped.astype(np.float32)
+
+    def _heading_error_rad(self) -> float:
+        return (self._car.yaw_rad - self._place.yaw_rad + math.pi) % (2 * math.pi) - math.pi
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "lateral_offset_m": self._place.offset_m,
+            "heading_error_rad": self._heading_error_rad(),
+            "speed_m_s": self._car.speed_m_s,
+            "progress_m": self._progress_m,
+        }
+
+    def telemetry(self) -> dict[str, float]:
+        """Give the car's state by name; the units are in the names."""
+        steering_rad = float(STEERING_RAD[self._last_action])
+        place = {"x_m": self._car.x_m, "y_m": self._car.y_m, "yaw_rad": self._car.yaw_rad}
+        return {**place, **self._info(), "steering_rad": steering_rad}
+
+    def static_scene(self) -> Sequence[Shape]:
+        """Give the shapes that never change, those of the car's body in the frame `car`."""
+        return highway_scene.static_shapes(self._inner.road.network, self.courses)
+
+    def scene(self) -> Sequence[Shape]:
+        """Give the shapes that change with each step."""
+        aims_m = [self.course.point(self._place.along_m + ahead) for ahead in LOOKAHEADS_M]
+        steering_rad = float(STEERING_RAD[self._last_action])
+        return highway_scene.moving_shapes(
+            self._car, self.others, self._trail_m, aims_m, steering_rad
+        )
+
+    def static_frames(self) -> Sequence[Frame]:
+        """Give no frames: nothing is fixed to the car but its body."""
+        return ()
+
+    def frames(self) -> Sequence[Frame]:
+        """Give the car's frame in the map."""
+        return (highway_scene.car_frame(self._car),)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the car from above: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
+        if self._render_mode is None:
+            return None
+        if self._view is None:
+            from mcaprl.sims.highway.view import HighwayView
+
+            static = self.static_scene()
+            self._view = HighwayView(self._render_mode, static, self.metadata["render_fps"])
+        image = self._view.draw(self._car, self.scene(), self._place.offset_m, self._reward)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+
+def _car_of(vehicle: Any) -> Car:
+    x_m, y_m = (vehicle.position * FLIP).tolist()
+    return Car(
+        x_m=x_m,
+        y_m=y_m,
+        yaw_rad=-float(vehicle.heading),
+        speed_m_s=float(vehicle.speed),
+        length_m=vehicle.LENGTH,
+        width_m=vehicle.WIDTH,
+    )

@@ -1,0 +1,1 @@
+"""The lane-keeping car, `mcaprl/LaneKeeping-v0`."""

@@ -1,0 +1,202 @@
+"""N cars of the lane sim, each driven on by one decision.
+
+Cars stand side by side in blocks of memory, number by number. Nothing in the loops over a block
+branches or is called, and the distances between a car's numbers are constants, which tells the
+compiler that no two cars share any: it does several at once, with the same bits as car by car, in a
+third of the time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.bicycle import Motion
+from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.sims.geometry.paths import Heading, heading_of
+from mcaprl.sims.lane.rules import (
+    BRAKE,
+    STEERING,
+    SUBSTEPS,
+    Car,
+    arrived,
+    car_at,
+    drive,
+    driven,
+    end_of,
+    observe,
+    reward_of,
+    seen_from,
+    store_car,
+)
+
+LANES = 32
+"""Cars that drive side by side in one block of memory."""
+_STEERING, _COS, _SIN, _BRAKING = 4, 9, 10, 11
+_REWARD, _END, _SEEN, _BLOCK_NUMBERS = 12, 13, 14, 26
+"""Where a block has what it has of each car; the first nine are those of `Car`."""
+
+
+@compiled
+def step_cars(
+    cars: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+) -> None:
+    """Advance N cars by one decision each, in place.
+
+    Args:
+        cars: (N, 10) rows that begin with `Car`.
+        actions: (N,) 0 to 5.
+        rewards: (N,) to be filled.
+        ends: (N,) to be filled with DRIVING, OFF_LANE or STALL.
+        observations: (N, 12) to be filled.
+    """
+    first = 0
+    if len(cars) >= LANES:
+        first = _step_blocks(cars, actions, rewards, ends, observations)
+    for i in range(first, len(cars)):
+        before = car_at(cars[i])
+        after = drive(before, actions[i])
+        rewards[i], ends[i] = reward_of(before, after), end_of(after)
+        observe(after, observations[i])
+        store_car(after, cars[i])
+
+
+@compiled
+def step_only_car(
+    cars: NDArray[np.float64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+    action: int,
+) -> tuple[float, int, float, float, float, float]:
+    """Do as `step_cars` with a single car, and give back all that is told of it.
+
+    Args:
+        cars: (1, 10) a row that begins with `Car`, and ends with where the car started.
+        rewards: (1,) to be filled.
+        ends: (1,) to be filled.
+        observations: (1, 12) to be filled.
+        action: 0 to 5.
+
+    Returns:
+        Reward, end, offset, heading error, speed and progress.
+    """
+    before = car_at(cars[0])
+    after = drive(before, action)
+    reward, end = reward_of(before, after), end_of(after)
+    rewards[0], ends[0] = reward, end
+    observe(after, observations[0])
+    store_car(after, cars[0])
+    progress_m = after.along_m - cars[0, -1]
+    return reward, end, after.offset_m, after.heading_error_rad, after.speed_m_s, progress_m
+
+
+@compiled
+def tell_cars(cars: NDArray[np.float64], told: NDArray[np.float64]) -> None:
+    """Put together what is told of N cars.
+
+    Args:
+        cars: (N, 10) rows that begin with `Car`, and end with where the car started.
+        told: (4, N) to be filled with offsets, heading errors, speeds and progress.
+    """
+    for i in range(len(cars)):
+        car = car_at(cars[i])
+        told[0, i], told[1, i], told[2, i] = car.offset_m, car.heading_error_rad, car.speed_m_s
+        told[3, i] = car.along_m - cars[i, -1]
+
+
+@compiled
+def _step_blocks(
+    cars: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+) -> int:
+    """Do as `step_cars` with as many cars as fill blocks; gives how many those are."""
+    block = np.empty(_BLOCK_NUMBERS * LANES)
+    count = len(cars) // LANES * LANES
+    for first in range(0, count, LANES):
+        for lane in range(LANES):
+            i = first + lane
+            for k in range(9):
+                block[k * LANES + lane] = cars[i, k]
+            is_braking = actions[i] == BRAKE
+            block[_BRAKING * LANES + lane] = 1.0 if is_braking else 0.0
+            if not is_braking:
+                block[_STEERING * LANES + lane] = STEERING[actions[i]]
+        _step_block(block)
+        for lane in range(LANES):
+            i = first + lane
+            for k in range(9):
+                cars[i, k] = block[k * LANES + lane]
+            rewards[i] = block[_REWARD * LANES + lane]
+            ends[i] = int(block[_END * LANES + lane])
+            for k in range(12):
+                observations[i, k] = block[(_SEEN + k) * LANES + lane]
+    return count
+
+
+@compiled
+def _step_block(block: NDArray[np.float64]) -> None:
+    """Drive the cars of a block for a decision, and find what each gets and sees."""
+    before = block.copy()
+    for lane in range(LANES):
+        heading = heading_of(block[2 * LANES + lane])
+        block[_COS * LANES + lane], block[_SIN * LANES + lane] = heading.cos, heading.sin
+    for _ in range(SUBSTEPS):
+        for lane in range(LANES):
+            is_braking = block[_BRAKING * LANES + lane] > 0.0
+            after = driven(_motion_in(block, lane), block[_STEERING * LANES + lane], is_braking)
+            block[lane], block[LANES + lane] = after.x_m, after.y_m
+            block[2 * LANES + lane], block[3 * LANES + lane] = after.yaw_rad, after.speed_m_s
+            block[_COS * LANES + lane] = after.heading.cos
+            block[_SIN * LANES + lane] = after.heading.sin
+    for lane in range(LANES):
+        was = _car_in(before, lane)
+        steering = block[_STEERING * LANES + lane]
+        car = arrived(was, _motion_in(block, lane), steering, SUBSTEPS)
+        block[2 * LANES + lane], block[5 * LANES + lane] = car.yaw_rad, car.along_m
+        block[6 * LANES + lane], block[7 * LANES + lane] = car.offset_m, car.heading_error_rad
+        block[8 * LANES + lane] = car.slow_s
+        block[_REWARD * LANES + lane] = reward_of(was, car)
+        block[_END * LANES + lane] = float(end_of(car))
+    for lane in range(LANES):
+        seen = seen_from(_car_in(block, lane))
+        block[14 * LANES + lane], block[15 * LANES + lane] = seen[0], seen[1]
+        block[16 * LANES + lane], block[17 * LANES + lane] = seen[2], seen[3]
+        block[18 * LANES + lane], block[19 * LANES + lane] = seen[4], seen[5]
+        block[20 * LANES + lane], block[21 * LANES + lane] = seen[6], seen[7]
+        block[22 * LANES + lane], block[23 * LANES + lane] = seen[8], seen[9]
+        block[24 * LANES + lane], block[25 * LANES + lane] = seen[10], seen[11]
+
+
+@inlined
+def _motion_in(block: NDArray[np.float64], lane: int) -> Motion:
+    heading = Heading(block[_COS * LANES + lane], block[_SIN * LANES + lane])
+    return Motion(
+        block[lane],
+        block[LANES + lane],
+        block[2 * LANES + lane],
+        block[3 * LANES + lane],
+        heading,
+    )
+
+
+@inlined
+def _car_in(block: NDArray[np.float64], lane: int) -> Car:
+    return Car(
+        block[lane],
+        block[LANES + lane],
+        block[2 * LANES + lane],
+        block[3 * LANES + lane],
+        block[4 * LANES + lane],
+        block[5 * LANES + lane],
+        block[6 * LANES + lane],
+        block[7 * LANES + lane],
+        block[8 * LANES + lane],
+    )

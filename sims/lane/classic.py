@@ -1,0 +1,111 @@
+"""The published rules of the lane sim, their faults included; they are listed in `LaneKeepingEnv`.
+
+Two ends were published: the text's, which is over when the car is too slow, and the code's, which
+is over when it drives into something.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.obstacles import touches
+from mcaprl.sims.lane.rules import (
+    BRAKE,
+    COLLISION,
+    DRIVING,
+    LOW_REWARD,
+    OFF_LANE,
+    SLOW,
+    SUBSTEP_S,
+    Car,
+    car_at,
+    drive,
+    observe,
+    store_car,
+)
+
+CLASSIC_DECISION_S = 1.0
+CLASSIC_SUBSTEPS = round(CLASSIC_DECISION_S / SUBSTEP_S)
+CLASSIC_LANE_M = 3.5
+CLASSIC_OFF_LANE_REWARD = -3.0
+LOWEST_REWARD = -1.0
+NEARNESS_PER_M = 3.0
+LOW_SPEED_M_S, TOP_SPEED_M_S = 10.0, 300.0
+SLOWEST_M_S = 5.0
+STRAIGHT = 1
+
+
+@compiled
+def classic_distance(x_m: float, y_m: float) -> float:
+    """Give the distance to the nearest of the endless straight lines through the legs, metres."""
+    nearest_m = math.inf
+    for leg in range(len(COURSE.yaw_rad)):
+        dx, dy = x_m - COURSE.points_m[leg, 0], y_m - COURSE.points_m[leg, 1]
+        nearest_m = min(nearest_m, abs(COURSE.forward[leg, 0] * dy - COURSE.forward[leg, 1] * dx))
+    return nearest_m
+
+
+@compiled
+def classic_reward(distance_m: float, speed_m_s: float) -> float:
+    """Pay a decision: (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5); -3 beyond 3.5 m."""
+    if distance_m > CLASSIC_LANE_M:
+        return CLASSIC_OFF_LANE_REWARD
+    nearness = math.exp(-NEARNESS_PER_M * distance_m) - 0.5
+    return nearness + (speed_m_s - LOW_SPEED_M_S) / (TOP_SPEED_M_S - LOW_SPEED_M_S) - 0.5
+
+
+@compiled
+def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_code: bool) -> int:
+    """Say whether an episode is over: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
+
+    Args:
+        distance_m: to the nearest endless line.
+        speed_m_s: after the decision.
+        action: that was taken.
+        hit: whether the car's body touched something.
+        by_code: end as the published code does, not as the text says.
+    """
+    if distance_m > CLASSIC_LANE_M:
+        return OFF_LANE
+    if classic_reward(distance_m, speed_m_s) < LOWEST_REWARD:
+        return LOW_REWARD
+    if by_code:
+        return COLLISION if hit and action == STRAIGHT else DRIVING
+    return SLOW if speed_m_s <= SLOWEST_M_S and action != BRAKE else DRIVING
+
+
+@compiled
+def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
+    """Drive for a second; give the car, and whether its body touched something on the way.
+
+    Nothing stops the car: it drives through.
+    """
+    hit = False
+    for _ in range(CLASSIC_SUBSTEPS):
+        car = drive(car, action, 1)
+        hit = hit or touches(car)
+    return car, hit
+
+
+@compiled
+def step_classic(
+    cars: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+    by_code: bool,
+) -> None:
+    """Advance N cars by one decision each, in place; arguments as of `step_cars`."""
+    for i in range(len(cars)):
+        after, hit = classic_decide(car_at(cars[i]), actions[i])
+        distance_m = classic_distance(after.x_m, after.y_m)
+        rewards[i] = classic_reward(distance_m, after.speed_m_s)
+        ends[i] = classic_end(distance_m, after.speed_m_s, actions[i], hit, by_code)
+        observe(after, observations[i])
+        store_car(after, cars[i])

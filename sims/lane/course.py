@@ -1,0 +1,174 @@
+"""The course of the lane sim: its path, its streets, and what stands beside them.
+
+The path is two squares of about 130 m that share a leg, 1,026 m in all: the first square is driven
+clockwise, the second counter-clockwise. Coordinates are right-handed with z up, so y is mirrored
+against the published course, whose y points right; turning right in one is turning right in the
+other. Nothing here is random: the same course stands on every machine.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.paths import closed_path
+
+CORNERS_M = (
+    (0.0, 1.0),
+    (130.0, 1.0),
+    (130.0, -125.0),
+    (0.0, -125.0),
+    (0.0, 1.0),
+    (130.0, 1.0),
+    (130.0, 128.0),
+    (0.0, 128.0),
+    (0.0, 1.0),
+)
+COURSE = closed_path(CORNERS_M)
+NEXT_TURN: NDArray[np.float64] = np.sign(np.sin(np.roll(COURSE.yaw_rad, -1) - COURSE.yaw_rad))
+"""(N,) which way the course turns at the end of each leg: 1 left, -1 right."""
+
+LANE_HALF_WIDTH_M = 3.5
+RAIL_OFFSET_M = 4.0
+"""Distance of the rails' inner faces from the centre line."""
+RAIL_HEIGHT_M = 0.7
+RAIL_THICKNESS_M = 0.12
+GROUND_HALF_SIDE_M = 1000.0
+"""The ground reaches beyond the last row of pixels under the horizon."""
+
+CAMERA_FORWARD_M = 0.4
+"""Of the middle of the wheelbase, on which the car's own frame stands."""
+CAMERA_HEIGHT_M = 1.4
+
+HOUSE_GAP_M = 1.0
+"""At least as much grass all around a house."""
+
+
+class Box(NamedTuple):
+    """An upright box on the ground, its edges along x, y and z; metres."""
+
+    x_m: float
+    y_m: float
+    length_m: float
+    width_m: float
+    height_m: float
+
+
+def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Give each leg's two ends (2,), metres; the leg that the path takes twice comes once."""
+    legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
+    return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
+
+
+def street_bounds(half_width_m: float) -> NDArray[np.float64]:
+    """Give (K, 4) rectangles x0, y0, x1, y1 around the streets, square ends included; metres."""
+    ends = np.array(streets())
+    return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
+
+
+class Pavement(NamedTuple):
+    """The union of the streets, cut into cells by the lines through all rectangles' edges."""
+
+    x_m: NDArray[np.float64]
+    """(M + 1,) cell borders."""
+    y_m: NDArray[np.float64]
+    """(N + 1,) cell borders."""
+    paved: NDArray[np.bool_]
+    """(M, N)"""
+
+
+def pavement(half_width_m: float) -> Pavement:
+    """Cut the union of the streets into cells; the cells show where it ends."""
+    bounds = street_bounds(half_width_m)
+    x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
+    middle_x, middle_y = (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
+    paved = np.zeros((len(middle_x), len(middle_y)), dtype=np.bool_)
+    for x0, y0, x1, y1 in bounds:
+        inside_x, inside_y = (middle_x > x0) & (middle_x < x1), (middle_y > y0) & (middle_y < y1)
+        paved |= np.outer(inside_x, inside_y)
+    return Pavement(x_m, y_m, paved)
+
+
+def outline(half_width_m: float) -> NDArray[np.float64]:
+    """Give the edge of the streets' union as (M, 2, 2) segments: start and end, x and y, metres."""
+    x_m, y_m, paved = pavement(half_width_m)
+    padded = np.pad(paved, 1)
+    across_x = np.argwhere(padded[1:, 1:-1] != padded[:-1, 1:-1])
+    across_y = np.argwhere(padded[1:-1, 1:] != padded[1:-1, :-1])
+    edges = [((x_m[i], y_m[j]), (x_m[i], y_m[j + 1])) for i, j in across_x]
+    edges += [((x_m[i], y_m[j]), (x_m[i + 1], y_m[j])) for i, j in across_y]
+    return np.array(edges)
+
+
+def rails() -> list[Box]:
+    """Give the guard rails: thin boxes around the streets, open where streets meet."""
+    boxes = []
+    for (x0, y0), (x1, y1) in outline(RAIL_OFFSET_M + RAIL_THICKNESS_M / 2):
+        length_m, width_m = x1 - x0 + RAIL_THICKNESS_M, y1 - y0 + RAIL_THICKNESS_M
+        boxes.append(Box((x0 + x1) / 2, (y0 + y1) / 2, length_m, width_m, RAIL_HEIGHT_M))
+    return boxes
+
+
+def _spread(index: int, low: float, high: float) -> float:
+    """Give the index-th number of an evenly spread sequence (multiples of the golden ratio)."""
+    return low + (high - low) * (index * 0.6180339887498949 % 1.0)
+
+
+def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
+    apart_x = np.minimum(bounds[:, 2] - box.x_m, box.x_m - bounds[:, 0]) <= -box.length_m / 2
+    apart_y = np.minimum(bounds[:, 3] - box.y_m, box.y_m - bounds[:, 1]) <= -box.width_m / 2
+    return bool(np.any(~(apart_x | apart_y)))
+
+
+def _house(
+    index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
+) -> Box:
+    """Build the index-th house, its front beginning at `at` on the centre line.
+
+    Args:
+        index: picks its size and its distance from the street.
+        at: (2,) metres.
+        forward: (2,) unit vector along the street.
+        left: (2,) unit vector from the street to the house.
+    """
+    front_m, deep_m = _spread(index, 8.0, 18.0), _spread(3 * index, 8.0, 15.0)
+    garden_m = _spread(5 * index, 7.5, 11.5)
+    middle = at + forward * (front_m / 2) + left * (garden_m + deep_m / 2)
+    size = np.abs(forward) * front_m + np.abs(left) * deep_m
+    height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
+    return Box(float(middle[0]), float(middle[1]), float(size[0]), float(size[1]), height_m)
+
+
+def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, int]]:
+    """Give each side of each street: its start (2,), direction (2,), length in metres and side."""
+    for start, end in streets():
+        length_m = float(np.hypot(*(end - start)))
+        for side in (1, -1):
+            yield start, (end - start) / length_m, length_m, side
+
+
+@functools.cache
+def buildings() -> tuple[Box, ...]:
+    """Give the houses along both sides of each street; none stands on a street or another."""
+    taken = street_bounds(RAIL_OFFSET_M + 2.0)
+    boxes: list[Box] = []
+    index = 0
+    for start, forward, length_m, side in _street_sides():
+        left = side * np.array([-forward[1], forward[0]])
+        along_m = -12.0
+        while along_m < length_m + 12.0:
+            index += 1
+            box = _house(index, start + forward * along_m, forward, left)
+            if not _overlaps(box, taken):
+                boxes.append(box)
+                half = np.array([box.length_m, box.width_m]) / 2 + HOUSE_GAP_M
+                middle = np.array([box.x_m, box.y_m])
+                taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
+            front_m = abs(float(forward @ [box.length_m, box.width_m]))
+            along_m += front_m + _spread(13 * index, 2.0, 6.0)
+    return tuple(boxes)

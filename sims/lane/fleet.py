@@ -1,0 +1,251 @@
+"""N cars of the lane sim as arrays: starts, steps and observations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.camera import level_axes
+from mcaprl.sims.drawing.depth import DepthCamera, encode_depth, encode_nearness
+from mcaprl.sims.geometry.compiled import ready
+from mcaprl.sims.lane.block import step_cars, step_only_car, tell_cars
+from mcaprl.sims.lane.camera import IMAGE_SHAPE, lane_camera
+from mcaprl.sims.lane.classic import (
+    CLASSIC_DECISION_S,
+    step_classic,
+)
+from mcaprl.sims.lane.course import CAMERA_FORWARD_M, CAMERA_HEIGHT_M, COURSE, NEXT_TURN
+from mcaprl.sims.lane.rays import (
+    RAY_OBSERVATION_LIMIT,
+    RAY_OBSERVATION_NAMES,
+    observe_all_rays,
+)
+from mcaprl.sims.lane.rules import (
+    ACTION_MEANINGS,
+    DECISION_S,
+    OBSERVATION_LIMIT,
+    OBSERVATION_NAMES,
+    REASONS,
+    Car,
+    observe,
+    store_car,
+)
+from mcaprl.sims.lane.start import ALONG, STARTED_AT, car_from, start_cars, start_one_of
+from mcaprl.sims.vehicle.arguments import check_name
+from mcaprl.sims.vehicle.draws import Draws
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+
+RULES = ("default", "classic", "classic-code")
+STARTS = ("anywhere", "line")
+OBSERVATIONS = ("state", "depth", "dashboard", "rays")
+_NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
+SPEED = Car._fields.index("speed_m_s")
+"""Where in a car's row begins what is told of it."""
+MOTION = slice(2, 4)
+"""Speed and steering in a state."""
+
+
+class LaneFleet(Fleet):
+    """N cars on the course; see `LaneKeepingEnv`, whose arguments it has."""
+
+    reasons: ClassVar[tuple[str, ...]] = REASONS
+    truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
+
+    def __init__(
+        self,
+        count: int,
+        rules: str = "default",
+        observation: str = "state",
+        start: str | None = None,
+    ) -> None:
+        """Make N cars; each is to be started by `begin`.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+        """
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("start", start, (None, *STARTS))
+        self._classic, self._by_code = rules != "default", rules == "classic-code"
+        self._on_line = start == "line" or (self._classic and start is None)
+        super().__init__(
+            count,
+            _space(observation),
+            _NAMES.get(observation, ()),
+            ACTION_MEANINGS,
+            CLASSIC_DECISION_S if self._classic else DECISION_S,
+        )
+        self._cars = np.zeros((count, STARTED_AT + 1))
+        self._draws = Draws(count, 4)
+        # By what chance a car is started by itself.
+        self._shares = np.zeros(4)
+        self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
+        self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
+        self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
+        self._has_pictures = observation == "depth" or self._has_dashboard
+        self._seen = self._rays if self._has_rays else self._states
+        self._is_told_at_once = observation == "state" and not self._classic
+        self._encode = encode_nearness if self._classic else encode_depth
+        self._camera: DepthCamera | None = None
+        self._depth_m: dict[int, NDArray[np.float32]] = {}
+
+    def car(self, i: int) -> Car:
+        """Give the whole state of a car."""
+        return Car._make(self._cars[i, :STARTED_AT].tolist())
+
+    def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
+        """Start car i; see "Starting State" of `LaneKeepingEnv`."""
+        self._draws.belong_to(i, random)
+        if options:
+            car, row = car_from(options), self._cars[i]
+            store_car(car, row)
+            row[STARTED_AT] = row[ALONG]
+            observe(car, self._states[i])
+            self.rewards[i], self.ends[i] = 0.0, GOING_ON
+        else:
+            self._draws.one(i, self._shares)
+            self._start_one(i)
+        if self._has_rays:
+            observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
+        self._depth_m.pop(i, None)
+
+    def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
+        """Start an episode of some cars."""
+        draws, kind = self._draws, (self._on_line, self._classic)
+        draws.draw_ahead(chosen)
+        chances = (draws.numbers, draws.used, *kind)
+        start_cars(chosen, *chances, self._cars, self.rewards, self.ends, self._states)
+        if self._has_rays:
+            seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
+            observe_all_rays(self._cars[chosen], seen)
+            self._rays[chosen] = seen
+        if self._depth_m:
+            for i in chosen.tolist():
+                self._depth_m.pop(i, None)
+
+    def advance(self) -> None:
+        """Drive on for a decision."""
+        self._step()
+        if self._has_rays:
+            observe_all_rays(self._cars, self._rays)
+        if self._depth_m:
+            self._depth_m.clear()
+
+    def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
+        """Drive on with the only car: all that is told of its state comes in one call."""
+        if not self._is_told_at_once:
+            return super().step_one(action)
+        reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
+        if self._depth_m:
+            self._depth_m.clear()
+        # As `_named`, which would be one more call.
+        info = {
+            "lateral_offset_m": offset_m,
+            "heading_error_rad": heading_error_rad,
+            "speed_m_s": speed_m_s,
+            "progress_m": progress_m,
+        }
+        return self._observe_only(), reward, end, info
+
+    def _kernel(self) -> tuple[Any, ...]:
+        arrays = (self._cars, self.actions, self.rewards, self.ends, self._states)
+        return (step_classic, *arrays, self._by_code) if self._classic else (step_cars, *arrays)
+
+    @cached_property
+    def _start_one(self) -> Callable[[int], None]:
+        kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
+        return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
+
+    # Of a fleet of one, what its steps call.
+
+    @cached_property
+    def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
+        arrays = (self._cars, self.rewards, self.ends, self._states)
+        return ready(step_only_car, *arrays, examples=(0,))
+
+    @cached_property
+    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
+        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
+        return copy
+
+    def observation(self, i: int) -> Any:
+        """Give the numbers or the picture that car i sees."""
+        if not self._has_pictures:
+            return self._seen[i].copy()
+        depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]
+        return {"depth": depth, "motion": self._motions()[i]} if self._has_dashboard else depth
+
+    def observations(self) -> Any:
+        """Give what all cars see."""
+        if not self._has_pictures:
+            return self._seen.copy()
+        images_m = np.stack([self.depth_image_m(i) for i in range(self.count)])
+        depth = self._encode(images_m)[..., np.newaxis]
+        return {"depth": depth, "motion": self._motions()} if self._has_dashboard else depth
+
+    def _motions(self) -> NDArray[np.float32]:
+        """Give (N, 3) speed, last steering and next turn of all cars."""
+        along_m = self._cars[:, ALONG] % COURSE.length_m
+        legs = np.searchsorted(COURSE.along_m, along_m, side="right") - 1
+        turns = NEXT_TURN[np.minimum(legs, len(NEXT_TURN) - 1)]
+        return np.column_stack([self._states[:, MOTION], turns]).astype(np.float32)
+
+    def depth_image_m(self, i: int) -> NDArray[np.float32]:
+        """Give car i's (84, 84) distances along each ray, metres; inf is nothing."""
+        if i not in self._depth_m:
+            if self._camera is None:
+                self._camera = lane_camera()
+            x_m, y_m, yaw_rad, *_ = self._cars[i].tolist()
+            x_m += CAMERA_FORWARD_M * math.cos(yaw_rad)
+            y_m += CAMERA_FORWARD_M * math.sin(yaw_rad)
+            position_m = (x_m, y_m, CAMERA_HEIGHT_M)
+            self._depth_m[i] = self._camera.image_m(position_m, level_axes(yaw_rad))
+        return self._depth_m[i]
+
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres."""
+        return self._cars[:, :2].copy()
+
+    def info(self, i: int) -> dict[str, Any]:
+        """Give the `info` of car i."""
+        car = self._cars[i, SPEED:].tolist()
+        speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
+        return _named(offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
+
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Give the `info` of all cars."""
+        told = np.empty((4, self.count))
+        tell_cars(self._cars, told)
+        return _named(*told)
+
+
+def _named(
+    offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any
+) -> dict[str, Any]:
+    """Name what is told of a car, or of all."""
+    return {
+        "lateral_offset_m": offset_m,
+        "heading_error_rad": heading_error_rad,
+        "speed_m_s": speed_m_s,
+        "progress_m": progress_m,
+    }
+
+
+def _space(observation: str) -> spaces.Space[Any]:
+    depth = spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
+    if observation == "depth":
+        return depth
+    if observation == "dashboard":
+        ends = np.array([[0, -1, -1], [1, 1, 1]], dtype=np.float32)
+        return spaces.Dict({"depth": depth, "motion": spaces.Box(*ends)})
+    if observation == "state":
+        return spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    low = -RAY_OBSERVATION_LIMIT
+    low[:-3] = 0.0
+    return spaces.Box(low, RAY_OBSERVATION_LIMIT)

@@ -1,0 +1,71 @@
+"""What a car of the lane sim can touch, and measure its distance to: the rails and the houses."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.ray_code import FAR_M
+from mcaprl.sims.lane.course import buildings, rails
+from mcaprl.sims.lane.rules import Car
+
+BODY_LENGTH_M, BODY_WIDTH_M = 4.3, 1.75
+BODY_FORWARD_M = 0.05
+"""Of the body's middle, from the middle of the wheelbase."""
+
+BOXES_M: NDArray[np.float64] = np.array(
+    [(box.x_m, box.y_m, box.length_m / 2, box.width_m / 2) for box in (*rails(), *buildings())]
+)
+"""(K, 4) the middle x and y of each obstacle, and half of its edges along x and y."""
+_HUGE = 1e12
+"""Stands for one divided by nothing."""
+
+
+@compiled
+def touches(car: Car) -> bool:
+    """Say whether the car's body touches a rail or a house.
+
+    Two rectangles are apart if, and only if, they are so along an edge of one of them.
+    """
+    cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
+    x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
+    ahead_m, aside_m = 0.5 * BODY_LENGTH_M, 0.5 * BODY_WIDTH_M
+    cos_size, sin_size = abs(cos), abs(sin)
+    for i in range(len(BOXES_M)):
+        box = BOXES_M[i]
+        dx, dy = box[0] - x_m, box[1] - y_m
+        if (
+            abs(dx) <= box[2] + ahead_m * cos_size + aside_m * sin_size
+            and abs(dy) <= box[3] + ahead_m * sin_size + aside_m * cos_size
+            and abs(dx * cos + dy * sin) <= ahead_m + box[2] * cos_size + box[3] * sin_size
+            and abs(dy * cos - dx * sin) <= aside_m + box[2] * sin_size + box[3] * cos_size
+        ):
+            return True
+    return False
+
+
+@compiled
+def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
+    """Give the distance from a point to the nearest obstacle in a direction, at most 100 m.
+
+    A ray is inside a box where it is between both pairs of its sides.
+    """
+    per_x, per_y = _per_metre(math.cos(angle_rad)), _per_metre(math.sin(angle_rad))
+    nearest_m = FAR_M
+    for i in range(len(BOXES_M)):
+        box = BOXES_M[i]
+        to_x, half_x = (box[0] - x_m) * per_x, box[2] * abs(per_x)
+        to_y, half_y = (box[1] - y_m) * per_y, box[3] * abs(per_y)
+        enter_m = max(to_x - half_x, to_y - half_y, 0.0)
+        if enter_m < nearest_m and enter_m <= min(to_x + half_x, to_y + half_y):
+            nearest_m = enter_m
+    return nearest_m
+
+
+@compiled
+def _per_metre(share: float) -> float:
+    """Give how long a ray is for each metre along an axis, with the sign of its direction."""
+    return 1.0 / share if abs(share) * _HUGE > 1.0 else math.copysign(_HUGE, share)

@@ -1,0 +1,123 @@
+"""The scripted driver of the lane sim: pursue a point ahead, slow down for corners, think twice."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.bicycle import steering_of
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.paths import in_body_frame, leg_at, point_at
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.env import LaneKeepingEnv
+from mcaprl.sims.lane.rules import (
+    BRAKE,
+    DRIVING,
+    STEERING,
+    SUBSTEP_S,
+    SUBSTEPS,
+    WHEELBASE_M,
+    Car,
+    drive,
+    end_of,
+    reward_of,
+    wheel_angle,
+)
+from mcaprl.sims.vehicle.arguments import check_one
+
+PURSUIT_M = 8.0
+PURSUIT_S = 0.4
+"""The point pursued lies 8 m ahead along the path, and 0.4 s at the present speed."""
+CORNER_SPEED_M_S = 7.0
+CORNER_BRAKE_M_S2 = 1.5
+CORNER_EARLY_M = 2.0
+"""The car is down to the corner speed 2 m before a corner, having slowed by at most 1.5 m/s^2."""
+HORIZON = 12
+"""Decisions (3 s by default) that a plan must survive."""
+
+
+@compiled
+def pursue(car: Car) -> int:
+    """Choose an action by pure pursuit, or brake for the next corner.
+
+    The circle through the car, along its heading, and a point at distance d and l to its left has
+    radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path tracking algorithm",
+    CMU-RI-TR-92-01, 1992.
+    """
+    leg = leg_at(COURSE, car.along_m)
+    corner_m = COURSE.along_m[leg + 1] - car.along_m % COURSE.length_m
+    slowing_m = max(0.0, corner_m - CORNER_EARLY_M)
+    if car.speed_m_s > math.sqrt(CORNER_SPEED_M_S**2 + 2.0 * CORNER_BRAKE_M_S2 * slowing_m):
+        return BRAKE
+    ahead_m = PURSUIT_M + PURSUIT_S * car.speed_m_s
+    x_m, y_m = point_at(COURSE, car.along_m + ahead_m)
+    forward_m, left_m = in_body_frame(
+        x_m - car.x_m, y_m - car.y_m, math.cos(car.yaw_rad), math.sin(car.yaw_rad)
+    )
+    slip_sine = WHEELBASE_M * left_m / (forward_m**2 + left_m**2)
+    wanted_rad = steering_of(min(max(slip_sine, -1.0), 1.0))
+    best, smallest_rad = BRAKE, math.inf
+    for action in range(BRAKE + 1, len(STEERING)):
+        error_rad = abs(wheel_angle(STEERING[action], car.speed_m_s) - wanted_rad)
+        if error_rad < smallest_rad:
+            best, smallest_rad = action, error_rad
+    return best
+
+
+@compiled
+def worth(car: Car, substeps: int = SUBSTEPS) -> float:
+    """Value pursuing from here: decisions survived, up to the horizon, and a little the reward."""
+    total = 0.0
+    for survived in range(HORIZON):
+        after = drive(car, pursue(car), substeps)
+        if end_of(after) != DRIVING:
+            return survived + 0.1 * total
+        total += reward_of(car, after)
+        car = after
+    return HORIZON + 0.1 * total
+
+
+@compiled
+def choose(car: Car, substeps: int = SUBSTEPS) -> int:
+    """Pursue while that survives; else try all pairs of actions before pursuing.
+
+    Args:
+        car: now.
+        substeps: of 0.05 s that a decision lasts.
+    """
+    if worth(car, substeps) >= HORIZON:
+        return pursue(car)
+    best, most = BRAKE, -math.inf
+    for first in range(len(STEERING)):
+        middle = drive(car, first, substeps)
+        if end_of(middle) != DRIVING:
+            continue
+        for second in range(len(STEERING)):
+            after = drive(middle, second, substeps)
+            value = worth(after, substeps) if end_of(after) == DRIVING else -1.0
+            if value > most:
+                best, most = first, value
+    return best
+
+
+class LanePilot:
+    """Drives the car of one environment, whose state it reads."""
+
+    name: ClassVar[str] = "pilot"
+
+    def __init__(self, sim: LaneKeepingEnv) -> None:
+        """Take the wheel of `sim`."""
+        self._sim = sim
+        self._substeps = round(sim.step_duration_s / SUBSTEP_S)
+
+    def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
+        """Give the action, shape (1,), for the car as it is now.
+
+        Raises:
+            ValueError: there are observations of more than one environment.
+        """
+        check_one(observations)
+        return np.array([choose(self._sim.car, self._substeps)], dtype=np.int64)

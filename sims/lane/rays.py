@@ -1,0 +1,71 @@
+"""What a car of the lane sim sees with `observation="rays"`: how far the rails are, and the way."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.paths import in_body_frame, point_at
+from mcaprl.sims.geometry.ray_code import log_code
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.obstacles import ray_length
+from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
+
+RAYS_DEG = (0, 10, -10, 20, -20, 30, -30, 45, -45, 60, -60, 90, -90, 135, -135, 180)
+"""Directions of the rays from the car's middle; left is positive."""
+RAYS_RAD = tuple(math.radians(angle) for angle in RAYS_DEG)
+RAYS = len(RAYS_DEG)
+WAY_M = 20.0
+"""At a crossing, rays cannot tell which street to take: a path point ahead does."""
+WAY_LIMIT = 4.0
+
+
+def _ray_name(angle_deg: int) -> str:
+    if angle_deg in (0, 180):
+        return "behind" if angle_deg else "ahead"
+    return f"{'left' if angle_deg > 0 else 'right'}_{abs(angle_deg)}"
+
+
+RAY_OBSERVATION_NAMES = (
+    *(_ray_name(angle) for angle in RAYS_DEG),
+    "speed",
+    "steering",
+    "way_20m_forward",
+    "way_20m_left",
+)
+RAY_OBSERVATION_LIMIT = np.array([1] * (RAYS + 2) + [WAY_LIMIT] * 2, dtype=np.float32)
+
+
+@compiled
+def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
+    """Write the 20 observed numbers; see the table of `LaneKeepingEnv`."""
+    for i in range(RAYS):
+        observation[i] = log_code(ray_length(car.x_m, car.y_m, car.yaw_rad + RAYS_RAD[i]))
+    observation[RAYS] = car.speed_m_s / MAX_SPEED_M_S
+    observation[RAYS + 1] = 2.0 * car.steering
+    x_m, y_m = point_at(COURSE, car.along_m + WAY_M)
+    cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
+    way_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, cos, sin)
+    for i in range(2):
+        observation[RAYS + 2 + i] = min(max(way_m[i] / WAY_M, -WAY_LIMIT), WAY_LIMIT)
+
+
+@compiled
+def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
+    """Write what N cars, (N, 10) rows that begin with `Car`, observe: (N, 20)."""
+    for i in range(len(cars)):
+        observe_rays(car_at(cars[i]), observations[i])
+
+
+def ray_lines(car: Car) -> NDArray[np.float64]:
+    """Give the rays as lines (16, 2, 2) from the car's middle to what they hit, metres."""
+    lines = np.empty((RAYS, 2, 2))
+    lines[:, 0] = car.x_m, car.y_m
+    for line, turn_rad in zip(lines, RAYS_RAD, strict=True):
+        angle_rad = car.yaw_rad + turn_rad
+        length_m = ray_length(car.x_m, car.y_m, angle_rad)
+        line[1] = line[0] + length_m * np.array([math.cos(angle_rad), math.sin(angle_rad)])
+    return lines

@@ -1,0 +1,262 @@
+"""The equations of the lane sim: one decision of a car that keeps its lane, for one car or many."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.bicycle import (
+    Motion,
+    moving,
+    roll,
+    slip_for_lateral,
+    slip_of,
+    steering_of,
+)
+from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.sims.geometry.paths import Heading, heading_of, in_body_frame, wrap_angle
+from mcaprl.sims.lane.course import LANE_HALF_WIDTH_M
+from mcaprl.sims.lane.path import (
+    Leg,
+    course_leg,
+    course_next,
+    course_point_ahead,
+    course_project,
+    course_spot_at,
+)
+
+ACTION_MEANINGS = ("brake", "straight", "right", "left", "slightly right", "slightly left")
+STEERING = (0.0, 0.0, -0.5, 0.5, -0.25, 0.25)
+"""Of the largest steering angle, left positive; action 0 brakes and keeps the last one."""
+BRAKE = 0
+
+DECISION_S = 0.25
+SUBSTEPS = 5
+SUBSTEP_S = DECISION_S / SUBSTEPS
+WHEELBASE_M = 2.7
+THROTTLE_M_S2 = 4.0
+BRAKE_M_S2 = 8.0
+MAX_SPEED_M_S = 30.0
+MAX_STEERING_RAD = math.radians(40.0)
+MAX_LATERAL_M_S2 = 9.0
+STEERING_CURVE_M_S = (20 / 3.6, 60 / 3.6, 120 / 3.6)
+"""The steering angle falls linearly with speed, through these knots, to these shares."""
+STEERING_CURVE = (0.9, 0.8, 0.7)
+_FALL_1 = (1.0 - STEERING_CURVE[0]) / STEERING_CURVE_M_S[0]
+_FALL_2 = (STEERING_CURVE[0] - STEERING_CURVE[1]) / (STEERING_CURVE_M_S[1] - STEERING_CURVE_M_S[0])
+_FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STEERING_CURVE_M_S[1])
+"""How much the share falls with each m/s, before each knot."""
+
+BEHIND_M = 4.0
+AHEAD_M = 8.0
+"""How far behind and ahead of the last nearest path point the next one is looked for."""
+
+STALL_SPEED_M_S = 1.0
+STALL_TIME_S = 3.0
+FAILURE_REWARD = -5.0
+DRIVING, OFF_LANE, STALL, LOW_REWARD, SLOW, COLLISION = range(6)
+REASONS = ("", "off_lane", "stall", "low_reward", "slow", "collision")
+"""The last three are the classic rules' own."""
+
+LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
+OBSERVATION_NAMES = (
+    "lateral_offset",
+    "heading_error",
+    "speed",
+    "steering",
+    "ahead_5m_forward",
+    "ahead_5m_left",
+    "ahead_10m_forward",
+    "ahead_10m_left",
+    "ahead_20m_forward",
+    "ahead_20m_left",
+    "ahead_40m_forward",
+    "ahead_40m_left",
+)
+OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
+# Of a tuple, the compiler knows the numbers.
+_LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
+
+
+class Car(NamedTuple):
+    """The whole state of one car on the course; a row of a (cars, 9) array holds the same."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    """In [-pi, pi), counter-clockwise from x."""
+    speed_m_s: float
+    steering: float
+    """Last steering command, a share of the largest angle, left positive."""
+    along_m: float
+    """Distance of the nearest path point along the path; grows beyond one lap."""
+    offset_m: float
+    """Distance from the path, left positive."""
+    heading_error_rad: float
+    """Yaw relative to the path, left positive, in [-pi, pi)."""
+    slow_s: float
+    """How long the car has been slower than the stall speed."""
+
+
+@compiled
+def car_at(row: NDArray[np.float64]) -> Car:
+    """Read a car from a row of 9 floats."""
+    return Car(row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8])
+
+
+@compiled
+def store_car(car: Car, row: NDArray[np.float64]) -> None:
+    """Write a car into a row of 9 floats."""
+    for i, value in enumerate(car):
+        row[i] = value
+
+
+@inlined
+def slip(steering: float, speed_m_s: float) -> float:
+    """Give the sine of the car's slip angle: that of the steering command, less at high speed.
+
+    The command counts for 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at 120 km/h; and
+    the car never turns so sharply that it would feel more than 9 m/s^2 sideways.
+    """
+    # The curve flattens, so it is the highest of its straight lines.
+    share = max(
+        max(
+            1.0 - _FALL_1 * speed_m_s,
+            STEERING_CURVE[0] - _FALL_2 * (speed_m_s - STEERING_CURVE_M_S[0]),
+        ),
+        STEERING_CURVE[1] - _FALL_3 * (speed_m_s - STEERING_CURVE_M_S[1]),
+    )
+    limit = slip_for_lateral(MAX_LATERAL_M_S2, speed_m_s, WHEELBASE_M)
+    return min(max(slip_of(steering * MAX_STEERING_RAD * share), -limit), limit)
+
+
+@compiled
+def wheel_angle(steering: float, speed_m_s: float) -> float:
+    """Give the front wheels' angle, radians, for a steering command at a speed; see `slip`."""
+    return steering_of(slip(steering, speed_m_s))
+
+
+@inlined
+def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
+    """Make a car from its motion, looking for its place on the path around `near_m`."""
+    place = course_project(motion.x_m, motion.y_m, near_m - BEHIND_M, near_m + AHEAD_M)
+    return Car(
+        motion.x_m,
+        motion.y_m,
+        wrap_angle(motion.yaw_rad),
+        motion.speed_m_s,
+        steering,
+        place.along_m,
+        place.offset_m,
+        wrap_angle(motion.yaw_rad - place.yaw_rad),
+        slow_s,
+    )
+
+
+@inlined
+def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
+    """Drive on for a sub-step of 0.05 s.
+
+    Without a branch, so that the compiler can do several cars at once.
+    """
+    speed_m_s = motion.speed_m_s
+    throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
+    brake_m_s2 = -min(BRAKE_M_S2, speed_m_s * (1.0 / SUBSTEP_S))
+    acceleration_m_s2 = brake_m_s2 if is_braking else throttle_m_s2
+    return roll(motion, slip(steering, speed_m_s), acceleration_m_s2, WHEELBASE_M, SUBSTEP_S)
+
+
+@inlined
+def steering_for(action: int, last: float) -> float:
+    """Give the steering command of an action: the brake keeps the last one."""
+    return last if action == BRAKE else STEERING[action]
+
+
+@compiled
+def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
+    """Carry out an action for so many sub-steps of 0.05 s."""
+    motion = moving(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
+    steering = steering_for(action, car.steering)
+    for _ in range(substeps):
+        motion = driven(motion, steering, action == BRAKE)
+    return arrived(car, motion, steering, substeps)
+
+
+@inlined
+def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
+    """Make a car of where so many sub-steps led it."""
+    slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
+    return located(motion, steering, before.along_m, slow_s)
+
+
+@inlined
+def end_of(car: Car) -> int:
+    """Say whether a car has failed: DRIVING, OFF_LANE or STALL."""
+    stalled = STALL if car.slow_s >= STALL_TIME_S else DRIVING
+    return OFF_LANE if abs(car.offset_m) > LANE_HALF_WIDTH_M else stalled
+
+
+@inlined
+def reward_of(before: Car, after: Car) -> float:
+    """Pay a decision: progress ds along the path, less for driving beside its middle.
+
+    ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) at distance d from the path, and -5 for a failure.
+    """
+    progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
+    paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
+    return paid if end_of(after) == DRIVING else FAILURE_REWARD
+
+
+@compiled
+def observe(car: Car, observation: NDArray[np.float32]) -> None:
+    """Write the 12 observed numbers; see the table of `LaneKeepingEnv`."""
+    for i, number in enumerate(seen_from(car)):
+        observation[i] = number
+
+
+Numbers = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+
+
+@inlined
+def seen_from(car: Car) -> Numbers:
+    """Give the 12 observed numbers, each within its limit."""
+    here = course_spot_at(car.along_m)
+    leg, after = course_leg(here.leg), course_leg(course_next(here.leg))
+    heading = heading_of(car.yaw_rad)
+    near_x, near_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[0])
+    mid_x, mid_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[1])
+    far_x, far_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[2])
+    last_x, last_y = _ahead(car, heading, leg, after, here.rest_m, LOOKAHEADS_M[3])
+    return (
+        _within(car.offset_m / LANE_HALF_WIDTH_M, _LIMITS[0]),
+        _within(car.heading_error_rad / (0.5 * math.pi), _LIMITS[1]),
+        _within(car.speed_m_s / MAX_SPEED_M_S, _LIMITS[2]),
+        _within(2.0 * car.steering, _LIMITS[3]),
+        near_x,
+        near_y,
+        mid_x,
+        mid_y,
+        far_x,
+        far_y,
+        last_x,
+        last_y,
+    )
+
+
+@inlined
+def _ahead(
+    car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
+) -> tuple[float, float]:
+    """Where the path is so far ahead, seen from the car, in units of that."""
+    x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
+    forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
+    forward, left = forward_m / lookahead_m, left_m / lookahead_m
+    return _within(forward, _LIMITS[4]), _within(left, _LIMITS[4])
+
+
+@inlined
+def _within(number: float, limit: float) -> float:
+    return min(max(number, -limit), limit)

@@ -1,0 +1,191 @@
+"""What a 3D viewer shows of the lane sim: streets, rails, houses, the car and what it looks at.
+
+Frames: `map` (x and y on the ground, z up), `car` (on the ground under the middle of the wheelbase,
+x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the view).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.car_parts import part, wheel
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
+from mcaprl.sims.geometry.paths import point_at
+from mcaprl.sims.lane import course
+from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
+from mcaprl.sims.lane.rays import ray_lines
+from mcaprl.sims.lane.rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
+
+GRASS: Color = (0.36, 0.44, 0.33, 1.0)
+ASPHALT: Color = (0.21, 0.22, 0.24, 1.0)
+WHITE: Color = (0.92, 0.92, 0.90, 1.0)
+YELLOW: Color = (0.93, 0.76, 0.22, 1.0)
+STEEL: Color = (0.66, 0.69, 0.72, 1.0)
+PAINT: Color = (0.83, 0.18, 0.16, 1.0)
+GLASS: Color = (0.12, 0.17, 0.22, 1.0)
+RUBBER: Color = (0.07, 0.07, 0.08, 1.0)
+LAMP: Color = (1.0, 0.96, 0.78, 1.0)
+TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
+RAY: Color = (0.98, 0.80, 0.28, 0.8)
+LOOK: Color = (0.99, 0.55, 0.10, 1.0)
+WALLS: tuple[Color, ...] = (
+    (0.80, 0.73, 0.63, 1.0),
+    (0.69, 0.48, 0.39, 1.0),
+    (0.60, 0.64, 0.69, 1.0),
+    (0.86, 0.83, 0.77, 1.0),
+    (0.47, 0.53, 0.59, 1.0),
+)
+
+WHEEL_RADIUS_M = 0.34
+WHEEL_WIDTH_M = 0.24
+TRACK_M = 1.6
+DASH_M = 3.0
+
+
+def _asphalt() -> NDArray[np.float64]:
+    """Cover each paved cell with two triangles, (6 cells, 3)."""
+    x_m, y_m, paved = course.pavement(course.RAIL_OFFSET_M)
+    corners = []
+    for i, j in np.argwhere(paved):
+        low, right = (x_m[i], y_m[j]), (x_m[i + 1], y_m[j])
+        left, high = (x_m[i], y_m[j + 1]), (x_m[i + 1], y_m[j + 1])
+        corners += [low, right, high, low, high, left]
+    return raised(np.array(corners), 0.0)
+
+
+def _dashes() -> NDArray[np.float64]:
+    """Give the centre line's dashes as pairs of points, (N, 3)."""
+    pairs = []
+    for start, end in course.streets():
+        length_m = float(np.hypot(*(end - start)))
+        forward = (end - start) / length_m
+        for along_m in np.arange(DASH_M, length_m - DASH_M, 2 * DASH_M):
+            pairs += [start + forward * along_m, start + forward * (along_m + DASH_M)]
+    return raised(np.array(pairs), 0.02)
+
+
+def _road() -> list[Shape]:
+    side_m = 420.0
+    middle = course.COURSE.points_m.mean(axis=0)
+    return [
+        Shape(
+            name="ground",
+            kind="box",
+            color=GRASS,
+            size=(side_m, side_m, 0.1),
+            position=(float(middle[0]), float(middle[1]), -0.1),
+        ),
+        Shape("road", "triangles", ASPHALT, _asphalt()),
+        Shape(
+            name="lane_borders",
+            kind="segments",
+            color=WHITE,
+            points=raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02),
+            size=(0.15, 0.0, 0.0),
+        ),
+        Shape("centre_line", "segments", YELLOW, _dashes(), size=(0.12, 0.0, 0.0)),
+    ]
+
+
+def _standing(name: str, box: course.Box, color: Color) -> Shape:
+    return Shape(
+        name=name,
+        kind="box",
+        color=color,
+        size=(box.length_m, box.width_m, box.height_m),
+        position=(box.x_m, box.y_m, box.height_m / 2),
+    )
+
+
+def _surroundings() -> list[Shape]:
+    shapes = [_standing(f"rail_{i}", box, STEEL) for i, box in enumerate(course.rails())]
+    for i, box in enumerate(course.buildings()):
+        shapes.append(_standing(f"building_{i}", box, WALLS[i % len(WALLS)]))
+    return shapes
+
+
+def _wheel(name: str, forward_m: float, left_m: float) -> Shape:
+    hub = (forward_m, left_m, WHEEL_RADIUS_M)
+    return wheel(name, RUBBER, hub, WHEEL_RADIUS_M, WHEEL_WIDTH_M)
+
+
+def _car() -> list[Shape]:
+    axle_m, side_m = WHEELBASE_M / 2, TRACK_M / 2
+    return [
+        part("body", PAINT, (BODY_LENGTH_M, BODY_WIDTH_M, 0.5), (BODY_FORWARD_M, 0.0, 0.58)),
+        part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
+        part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
+        part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
+        part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
+        part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
+        part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
+        part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
+        _wheel("front_left", axle_m, side_m),
+        _wheel("front_right", axle_m, -side_m),
+        _wheel("rear_left", -axle_m, side_m),
+        _wheel("rear_right", -axle_m, -side_m),
+    ]
+
+
+@functools.cache
+def static_shapes() -> tuple[Shape, ...]:
+    """Give what never changes: the world in `map`, and the car's parts in `car`."""
+    return (*_road(), *_surroundings(), *_car())
+
+
+def moving_shapes(
+    car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
+) -> tuple[Shape, ...]:
+    """Give what changes with each step.
+
+    Args:
+        car: now.
+        trail_m: the last positions of the car, (x, y) in the map; at least one.
+        has_rays: whether the car sees by rays.
+    """
+    aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
+    nearest = point_at(course.COURSE, car.along_m)
+    link = np.array([(car.x_m, car.y_m), nearest])
+    wheel_rad = wheel_angle(car.steering, car.speed_m_s)
+    axle = np.array([WHEELBASE_M / 2, 0.0, 1.0])
+    tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
+    return (
+        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
+        Shape("lookahead", "points", LOOK, raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
+        Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
+        Shape("steering", "arrow", LOOK, np.array([axle, tip]), size=(0.12, 0.3, 0.4), frame="car"),
+        Shape(
+            name="speed",
+            kind="text",
+            color=WHITE,
+            size=(1.0, 1.0, 0.8),
+            position=(0.0, 0.0, 2.4),
+            frame="car",
+            text=f"{car.speed_m_s:.1f} m/s",
+        ),
+        *(_rays(car) if has_rays else ()),
+    )
+
+
+def _rays(car: Car) -> tuple[Shape, ...]:
+    lines_m = ray_lines(car)
+    return (
+        Shape("rays", "segments", RAY, raised(lines_m, 0.5), size=(0.06, 0.0, 0.0)),
+        Shape("hits", "points", LOOK, raised(lines_m[:, 1], 0.75), size=(0.3, 0.3, 0.3)),
+    )
+
+
+def car_frame(car: Car) -> Frame:
+    """Give the car's frame in the map."""
+    return Frame("car", (car.x_m, car.y_m, 0.0), yaw_rotation(car.yaw_rad))
+
+
+def camera_frame() -> Frame:
+    """Give the front camera in the car: optical axes, level, looking forward."""
+    at = (course.CAMERA_FORWARD_M, 0.0, course.CAMERA_HEIGHT_M)
+    return Frame("camera", at, (-0.5, 0.5, -0.5, 0.5), parent="car")

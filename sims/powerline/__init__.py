@@ -1,0 +1,1 @@
+"""The powerline drone, `mcaprl/Powerline-v0`."""

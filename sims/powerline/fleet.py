@@ -1,0 +1,199 @@
+"""N drones of the powerline sim as arrays: starts, steps and observations."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
+from mcaprl.sims.powerline.camera import CAMERAS, IMAGE_SHAPE, DroneCamera
+from mcaprl.sims.powerline.classic import (
+    CLASSIC_DECISION_S,
+    CLASSIC_FIRST_COMMAND_M_S,
+    CLASSIC_VELOCITY_STEP_M_S,
+    step_classic,
+)
+from mcaprl.sims.powerline.quadrotor import PLANTS
+from mcaprl.sims.powerline.rules import (
+    ACTION_MEANINGS,
+    DECISION_S,
+    FIRST_COMMAND_M_S,
+    FLIGHT_SIZE,
+    OBSERVATION_LIMIT,
+    OBSERVATION_NAMES,
+    REASONS,
+    VELOCITY_STEP_M_S,
+    Bearing,
+    Flight,
+    flight_at,
+    observe,
+    step_flights,
+    store_flight,
+    take_bearings,
+)
+from mcaprl.sims.powerline.start import draw_wind, flight_from, start_anywhere, start_on_line
+from mcaprl.sims.vehicle.arguments import check_name, check_range
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+
+RULES = ("default", "classic")
+OBSERVATIONS = ("state", "depth")
+STARTS = ("anywhere", "line")
+MAX_WIND_M_S = 8.0
+MAX_GUST_M_S = 3.0
+MOTION = slice(3, 9)
+"""What of the vector is observed beside a picture: velocity, and command minus velocity."""
+
+
+class PowerlineFleet(Fleet):
+    """N drones on the line, each in a wind of its own; see `PowerlineEnv`."""
+
+    reasons: ClassVar[tuple[str, ...]] = REASONS
+    truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
+
+    def __init__(
+        self,
+        count: int,
+        rules: str = "default",
+        observation: str = "state",
+        camera: str = "down",
+        start: str = "anywhere",
+        plant: str | None = None,
+        wind_m_s: float = 0.0,
+        gust_m_s: float = 0.0,
+    ) -> None:
+        """Make N drones; each is to be started by `begin`.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+            UsageError: a number is outside its range, or the classic rules are to have gusts.
+        """
+        check_name("rules", rules, RULES)
+        check_name("observation", observation, OBSERVATIONS)
+        check_name("camera", camera, CAMERAS)
+        check_name("start", start, STARTS)
+        check_name("plant", plant, (None, *PLANTS))
+        self.classic = classic = rules == "classic"
+        check_range("wind_m_s", wind_m_s, 0.0, MAX_WIND_M_S)
+        check_range("gust_m_s", gust_m_s, 0.0, 0.0 if classic else MAX_GUST_M_S)
+        self.velocity_step_m_s = CLASSIC_VELOCITY_STEP_M_S if classic else VELOCITY_STEP_M_S
+        super().__init__(
+            count,
+            _space(observation, classic),
+            OBSERVATION_NAMES if observation == "state" else (),
+            ACTION_MEANINGS,
+            CLASSIC_DECISION_S if classic else DECISION_S,
+            noise_size=3 if gust_m_s else 0,
+        )
+        self._plant = PLANTS.index(plant or ("point" if classic else "quad"))
+        self._on_line = start == "line"
+        self._wind_m_s, self._gust_m_s = wind_m_s, float(gust_m_s)
+        self._shows_state = observation == "state"
+        self._camera_view = camera
+        self._camera: DroneCamera | None = None
+        self._depth_m: dict[int, NDArray[np.float32]] = {}
+        self._make_arrays()
+
+    def _make_arrays(self) -> None:
+        self._flights = np.zeros((self.count, FLIGHT_SIZE))
+        self._bearings = np.zeros((self.count, len(Bearing._fields)))
+        self._started_at_m = np.zeros(self.count)
+        self._seen = np.zeros((self.count, len(OBSERVATION_NAMES)), dtype=np.float32)
+
+    def flight(self, i: int) -> Flight:
+        """Give the whole state of a drone, NED."""
+        return flight_at(self._flights[i])
+
+    def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
+        """Start drone i; see "Starting State" of `PowerlineEnv`."""
+        wind = draw_wind(random, self._wind_m_s)
+        if options:
+            flight = flight_from(options, wind, self.classic)
+        elif self.classic:
+            flight = start_on_line(random, self._plant, CLASSIC_FIRST_COMMAND_M_S, wind)
+        elif self._on_line or random.random() < 0.5:
+            flight = start_on_line(random, self._plant, FIRST_COMMAND_M_S, wind)
+        else:
+            flight = start_anywhere(random, wind)
+        store_flight(flight, self._flights[i])
+        self._started_at_m[i] = flight.furthest_m
+        self.rewards[i], self.ends[i] = 0.0, GOING_ON
+        observe(flight, self._seen[i])
+        take_bearings(self._flights[i : i + 1], self._bearings[i : i + 1])
+        self._depth_m.pop(i, None)
+
+    def advance(self) -> None:
+        """Fly on for a decision."""
+        self._step()
+        take_bearings(self._flights, self._bearings)
+        self._depth_m.clear()
+
+    def _kernel(self) -> tuple[Any, ...]:
+        before = (self._plant, self._flights, self.actions)
+        after = (self.rewards, self.ends, self._seen)
+        if self.classic:
+            return step_classic, *before, *after
+        return step_flights, *before, self._gust_m_s, self.noise, *after
+
+    def observation(self, i: int) -> Any:
+        """Give the numbers or the picture that drone i sees."""
+        if self._shows_state:
+            return self._seen[i].copy()
+        if self.classic:
+            return encode_nearness(self.depth_image_m(i))[:, :, np.newaxis]
+        depth = encode_depth(self.depth_image_m(i))[:, :, np.newaxis]
+        return {"depth": depth, "motion": self._seen[i, MOTION].copy()}
+
+    def observations(self) -> Any:
+        """Give what all drones see."""
+        if self._shows_state:
+            return self._seen.copy()
+        seen = [self.observation(i) for i in range(self.count)]
+        if self.classic:
+            return np.stack(seen)
+        return {key: np.stack([each[key] for each in seen]) for key in ("depth", "motion")}
+
+    def depth_image_m(self, i: int) -> NDArray[np.float32]:
+        """Give drone i's (84, 84) distances along each ray, metres; inf is nothing."""
+        if i not in self._depth_m:
+            if self._camera is None:
+                self._camera = DroneCamera(self._camera_view)
+            self._depth_m[i] = self._camera.image_m(self.flight(i).drone)
+        return self._depth_m[i]
+
+    def places(self) -> NDArray[np.float64]:
+        """Give where all are, (N, 2) x and y in the map, metres."""
+        # The log's axes are ROS's: y points west.
+        return self._flights[:, :2] * (1.0, -1.0)
+
+    def info(self, i: int) -> dict[str, Any]:
+        """Give the `info` of drone i."""
+        return _described(self._bearings[i].tolist(), self._started_at_m.item(i))
+
+    def infos(self) -> dict[str, NDArray[Any]]:
+        """Give the `info` of all drones."""
+        return _described(self._bearings.T.copy(), self._started_at_m)
+
+
+def _described(bearing: Any, started_at_m: Any) -> dict[str, Any]:
+    """Name what is told of a drone, or of all: 5 numbers, or as many columns."""
+    lateral_m, vertical_m, distance_m, along_m, speed_m_s = bearing
+    return {
+        "lateral_offset_m": lateral_m,
+        "vertical_offset_m": vertical_m,
+        "line_distance_m": distance_m,
+        "speed_m_s": speed_m_s,
+        "progress_m": along_m - started_at_m,
+    }
+
+
+def _space(observation: str, classic: bool) -> spaces.Space[Any]:
+    if observation == "state":
+        return spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+    depth = spaces.Box(0, 255, (*IMAGE_SHAPE, 1), np.uint8)
+    if classic:
+        return depth
+    limit = OBSERVATION_LIMIT[MOTION]
+    return spaces.Dict({"depth": depth, "motion": spaces.Box(-limit, limit)})

@@ -1,0 +1,319 @@
+"""Two drones that follow a commanded velocity: a quadrotor with its controllers, and a point.
+
+Axes are NED: x north, y east, z down; the body's are x forward, y right, z down. Both keep their
+nose to the north.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled, inlined
+from mcaprl.sims.geometry.vectors import (
+    Quaternion,
+    Vector,
+    cross,
+    dot,
+    inverse,
+    minus,
+    norm,
+    plus,
+    product,
+    rotate,
+    times,
+    unit,
+)
+
+PLANTS = ("quad", "point")
+QUAD, POINT = 0, 1
+
+GRAVITY_M_S2 = 9.81
+TIME_STEP_S = 0.002
+"""The quadrotor's equations and controllers run at 500 Hz."""
+POINT_LAG_S = 0.5
+
+MASS_KG = 1.0
+INERTIA_KG_M2 = (0.01, 0.01, 0.018)
+ROTOR_OFFSET_M = 0.15
+"""Of each rotor from the middle, both forward and sideways: the arms form an X."""
+TORQUE_PER_THRUST_M = 0.016
+MAX_ROTOR_THRUST_N = 5.5
+ROTOR_LAG_S = 0.02
+ROTOR_SHARE = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
+"""Of the way to a commanded thrust, in one time step."""
+DRAG_PER_S = 0.25
+"""Drag is linear in the speed through the air; per mass."""
+
+VELOCITY_GAIN_PER_S = 2.5
+INTEGRAL_GAIN_PER_S2 = 1.5
+REFERENCE_GAIN_PER_S = VELOCITY_GAIN_PER_S + DRAG_PER_S
+"""In still air, the velocity itself approaches the command at this rate."""
+MAX_INTEGRAL_M_S2 = 2.0
+MAX_ACCELERATION_M_S2 = 6.0
+ATTITUDE_GAIN_PER_S = 12.0
+RATE_GAIN_PER_S = 30.0
+
+
+class Rotors(NamedTuple):
+    """One number for each rotor; the first two turn against the last two."""
+
+    front_right: float
+    rear_left: float
+    front_left: float
+    rear_right: float
+
+
+class Drone(NamedTuple):
+    """The whole state of a drone and its controllers; a point uses only the first two."""
+
+    position_m: Vector
+    velocity_m_s: Vector
+    attitude: Quaternion
+    """Turns vectors of the body into the world's."""
+    rates_rad_s: Vector
+    """Angular velocity about the body's axes."""
+    thrusts_n: Rotors
+    reference_m_s: Vector
+    """The velocity that the command asks for by now, without wind."""
+    integral_m_s2: Vector
+    """What the velocity controller has learnt of the wind."""
+
+
+DRONE_SIZE = 23
+"""Numbers in a `Drone`, and in the row of an array that holds one."""
+
+
+@compiled
+def drone_at(row: NDArray[np.float64]) -> Drone:
+    """Read a drone from a row of 23 floats."""
+    return Drone(
+        Vector(row[0], row[1], row[2]),
+        Vector(row[3], row[4], row[5]),
+        Quaternion(row[6], row[7], row[8], row[9]),
+        Vector(row[10], row[11], row[12]),
+        Rotors(row[13], row[14], row[15], row[16]),
+        Vector(row[17], row[18], row[19]),
+        Vector(row[20], row[21], row[22]),
+    )
+
+
+@compiled
+def store(drone: Drone, row: NDArray[np.float64]) -> None:
+    """Write a drone into a row of 23 floats."""
+    row[0:3] = drone.position_m
+    row[3:6] = drone.velocity_m_s
+    row[6:10] = drone.attitude
+    row[10:13] = drone.rates_rad_s
+    row[13:17] = drone.thrusts_n
+    row[17:20] = drone.reference_m_s
+    row[20:23] = drone.integral_m_s2
+
+
+@compiled
+def cruising(position_m: Vector, velocity_m_s: Vector) -> Drone:
+    """Make a level drone that has been commanded its velocity, in still air, for some time."""
+    hover_n = 0.25 * MASS_KG * GRAVITY_M_S2
+    still = Vector(0.0, 0.0, 0.0)
+    return Drone(
+        position_m,
+        velocity_m_s,
+        Quaternion(1.0, 0.0, 0.0, 0.0),
+        still,
+        Rotors(hover_n, hover_n, hover_n, hover_n),
+        velocity_m_s,
+        still,
+    )
+
+
+@compiled
+def fly(
+    plant: int, drone: Drone, command_m_s: Vector, wind_m_s: Vector, duration_s: float
+) -> Drone:
+    """Fly at a commanded velocity for a while.
+
+    Args:
+        plant: QUAD, or POINT, which no wind moves.
+        drone: at the start.
+        command_m_s: over the ground.
+        wind_m_s: velocity of the air over the ground.
+        duration_s: for QUAD, a multiple of 2 ms.
+    """
+    if plant == POINT:
+        return lag(drone, command_m_s, duration_s)
+    for _ in range(round(duration_s / TIME_STEP_S)):
+        drone = advance(drone, command_m_s, wind_m_s)
+    return drone
+
+
+@compiled
+def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
+    """Solve v' = (c - v) / T exactly: v(t) = c + (v - c) e, x(t) = x + c t + (v - c) T (1 - e).
+
+    e = exp(-t / T).
+    """
+    left = math.exp(-duration_s / POINT_LAG_S)
+    error = minus(drone.velocity_m_s, command_m_s)
+    moved = plus(times(duration_s, command_m_s), times(POINT_LAG_S * (1.0 - left), error))
+    return Drone(
+        plus(drone.position_m, moved),
+        plus(command_m_s, times(left, error)),
+        drone.attitude,
+        drone.rates_rad_s,
+        drone.thrusts_n,
+        drone.reference_m_s,
+        drone.integral_m_s2,
+    )
+
+
+@inlined
+def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
+    """Advance a quadrotor by 2 ms: control it, then move it."""
+    wanted = wanted_acceleration(drone, command_m_s)
+    rotors = rotor_commands(drone, wanted)
+    reference = drone.reference_m_s
+    reference_rate = times(REFERENCE_GAIN_PER_S, minus(command_m_s, reference))
+    moved = move(drone, rotors, wind_m_s)
+    return Drone(
+        moved.position_m,
+        moved.velocity_m_s,
+        moved.attitude,
+        moved.rates_rad_s,
+        moved.thrusts_n,
+        plus(reference, times(TIME_STEP_S, reference_rate)),
+        Vector(
+            _integrated(drone.integral_m_s2.x, reference.x - drone.velocity_m_s.x, wanted.x),
+            _integrated(drone.integral_m_s2.y, reference.y - drone.velocity_m_s.y, wanted.y),
+            _integrated(drone.integral_m_s2.z, reference.z - drone.velocity_m_s.z, wanted.z),
+        ),
+    )
+
+
+@inlined
+def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
+    """Ask for the acceleration that brings the velocity to the command.
+
+    On each axis k (c - v), what drag takes away at the commanded speed, and the integral, which
+    sees the wind and not the step; at most 6 m/s^2.
+    """
+    c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
+    return Vector(_asked(c.x, v.x, i.x), _asked(c.y, v.y, i.y), _asked(c.z, v.z, i.z))
+
+
+@inlined
+def _asked(command_m_s: float, velocity_m_s: float, integral_m_s2: float) -> float:
+    wanted = VELOCITY_GAIN_PER_S * (command_m_s - velocity_m_s) + DRAG_PER_S * command_m_s
+    return min(max(wanted + integral_m_s2, -MAX_ACCELERATION_M_S2), MAX_ACCELERATION_M_S2)
+
+
+@inlined
+def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> float:
+    """Add up an axis' velocity error, unless its acceleration is at the limit."""
+    if abs(wanted_m_s2) >= MAX_ACCELERATION_M_S2:
+        return integral_m_s2
+    grown = integral_m_s2 + TIME_STEP_S * INTEGRAL_GAIN_PER_S2 * error_m_s
+    return min(max(grown, -MAX_INTEGRAL_M_S2), MAX_INTEGRAL_M_S2)
+
+
+@inlined
+def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
+    """Choose the rotors' thrusts, newtons, for a wanted acceleration.
+
+    The body's z axis is to point along g - a, by the shortest turn from upright. The attitude's
+    error commands the angular velocity, and that one's error the torques. Mellinger and Kumar,
+    "Minimum snap trajectory generation and control for quadrotors", ICRA 2011, has the cascade.
+    """
+    down = minus(Vector(0.0, 0.0, GRAVITY_M_S2), wanted_m_s2)
+    size = norm(down)
+    upright_to_wanted = unit(Quaternion(size + down.z, -down.y, down.x, 0.0))
+    error = product(inverse(drone.attitude), upright_to_wanted)
+    gain = 2.0 * ATTITUDE_GAIN_PER_S if error.w >= 0.0 else -2.0 * ATTITUDE_GAIN_PER_S
+    missing = minus(times(gain, Vector(error.x, error.y, error.z)), drone.rates_rad_s)
+    spin = angular_momentum(drone.rates_rad_s)
+    turn = times(RATE_GAIN_PER_S, angular_momentum(missing))
+    torque = plus(turn, cross(drone.rates_rad_s, spin))
+    body_down = rotate(drone.attitude, Vector(0.0, 0.0, 1.0))
+    return _mixed(MASS_KG * max(0.0, dot(down, body_down)), torque)
+
+
+@inlined
+def angular_momentum(rates_rad_s: Vector) -> Vector:
+    """Give inertia times angular velocity, about the body's axes."""
+    about_x, about_y, about_z = INERTIA_KG_M2
+    return Vector(about_x * rates_rad_s.x, about_y * rates_rad_s.y, about_z * rates_rad_s.z)
+
+
+@inlined
+def _mixed(thrust_n: float, torque_n_m: Vector) -> Rotors:
+    """Share a thrust and torques among the rotors; none pulls down or beyond its limit."""
+    each = 0.25 * thrust_n
+    roll = 0.25 * torque_n_m.x / ROTOR_OFFSET_M
+    pitch = 0.25 * torque_n_m.y / ROTOR_OFFSET_M
+    yaw = 0.25 * torque_n_m.z / TORQUE_PER_THRUST_M
+    return Rotors(
+        _limited(each - roll + pitch + yaw),
+        _limited(each + roll - pitch + yaw),
+        _limited(each + roll + pitch - yaw),
+        _limited(each - roll - pitch - yaw),
+    )
+
+
+@inlined
+def _limited(thrust_n: float) -> float:
+    return min(max(thrust_n, 0.0), MAX_ROTOR_THRUST_N)
+
+
+@inlined
+def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
+    """Advance a rigid body by 2 ms: rates and velocity first, then attitude and position with them.
+
+    m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega, q' = q (0, omega) / 2, and
+    each thrust follows its command with a lag of 20 ms.
+    """
+    share, old = ROTOR_SHARE, drone.thrusts_n
+    thrusts = Rotors(
+        old.front_right + share * (rotors.front_right - old.front_right),
+        old.rear_left + share * (rotors.rear_left - old.rear_left),
+        old.front_left + share * (rotors.front_left - old.front_left),
+        old.rear_right + share * (rotors.rear_right - old.rear_right),
+    )
+    first, second, third, fourth = thrusts
+    lift = Vector(0.0, 0.0, -(first + second + third + fourth) / MASS_KG)
+    drag = times(DRAG_PER_S, minus(wind_m_s, drone.velocity_m_s))
+    push = plus(rotate(drone.attitude, lift), plus(drag, Vector(0.0, 0.0, GRAVITY_M_S2)))
+    velocity = plus(drone.velocity_m_s, times(TIME_STEP_S, push))
+    rates = _turned(drone.rates_rad_s, thrusts)
+    half = times(0.5 * TIME_STEP_S, rates)
+    attitude = product(drone.attitude, Quaternion(1.0, half.x, half.y, half.z))
+    return Drone(
+        plus(drone.position_m, times(TIME_STEP_S, velocity)),
+        velocity,
+        unit(attitude),
+        rates,
+        thrusts,
+        drone.reference_m_s,
+        drone.integral_m_s2,
+    )
+
+
+@inlined
+def _turned(rates_rad_s: Vector, thrusts: Rotors) -> Vector:
+    """Give the angular velocity after 2 ms."""
+    right, left = thrusts.front_right + thrusts.rear_right, thrusts.front_left + thrusts.rear_left
+    front, rear = thrusts.front_right + thrusts.front_left, thrusts.rear_right + thrusts.rear_left
+    one_way = thrusts.front_right + thrusts.rear_left
+    other_way = thrusts.front_left + thrusts.rear_right
+    torque = Vector(
+        ROTOR_OFFSET_M * (left - right),
+        ROTOR_OFFSET_M * (front - rear),
+        TORQUE_PER_THRUST_M * (one_way - other_way),
+    )
+    net = minus(torque, cross(rates_rad_s, angular_momentum(rates_rad_s)))
+    about_x, about_y, about_z = INERTIA_KG_M2
+    return plus(
+        rates_rad_s,
+        times(TIME_STEP_S, Vector(net.x / about_x, net.y / about_y, net.z / about_z)),
+    )

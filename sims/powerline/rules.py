@@ -1,0 +1,342 @@
+"""The equations of the powerline sim's default rules, for one drone or many.
+
+Axes are NED, as in `powerline_world`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.vectors import Vector, minus, norm, plus, times
+from mcaprl.sims.powerline.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
+from mcaprl.sims.powerline.quadrotor_block import fly_all
+from mcaprl.sims.powerline.world import (
+    ALONG_M,
+    LEGS,
+    LENGTH_M,
+    TANGENTS,
+    Place,
+    ground_height,
+    nearest_on_line,
+    tower_distance,
+    wire_distance,
+)
+
+ACTION_MEANINGS = (
+    "faster north (+x)",
+    "faster east (+y)",
+    "faster down (+z)",
+    "faster south (-x)",
+    "faster west (-y)",
+    "faster up (-z)",
+    "no change",
+)
+DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])
+"""(7, 3) how each action changes the velocity, in steps, along x, y and z."""
+
+DECISION_S = 0.5
+CHECK_S = 0.1
+"""How often a flight is checked for its end."""
+VELOCITY_STEP_M_S = 0.5
+MAX_COMMAND_M_S = 8.0
+APPROACH_S = 5.0
+"""An episode's flight from the first point of the line before the first decision."""
+FIRST_COMMAND_M_S = (1.0, -0.5, -1.0)
+"""The published one is (1, -0.67, -0.8): from there, no steps of 0.5 m/s lead back to hovering."""
+
+MAX_DISTANCE_M = 7.0
+WIRE_CLEARANCE_M = 0.6
+TOWER_CLEARANCE_M = 1.2
+GROUND_CLEARANCE_M = 0.3
+FINISH_M = 1.0
+"""The line is done this far before its end."""
+FAILURE_REWARD = -5.0
+FINISH_REWARD = 5.0
+PAID_PROGRESS_M = 2.5
+"""In one decision, 5 m/s: what is more is taken off again."""
+PAID_DISTANCE_M = 4.0
+FLYING, OFF_LINE, COLLISION, FINISHED = 0, 1, 2, 3
+REASONS = ("", "off_line", "collision", "finished")
+
+GUST_TIME_S = 2.0
+
+OBSERVATION_NAMES = (
+    "offset_x",
+    "offset_y",
+    "offset_z",
+    "velocity_x",
+    "velocity_y",
+    "velocity_z",
+    "command_error_x",
+    "command_error_y",
+    "command_error_z",
+    "tangent_x",
+    "tangent_y",
+    "tangent_z",
+    "next_tangent_x",
+    "next_tangent_y",
+    "next_tangent_z",
+    "to_corner",
+    "corner_nearness",
+    "lost_progress",
+)
+OBSERVATION_LIMIT = np.array([2] * 3 + [4] * 3 + [8] * 3 + [1] * 8 + [10], dtype=np.float32)
+
+COMMAND, WIND, GUST, FURTHEST = DRONE_SIZE, DRONE_SIZE + 3, DRONE_SIZE + 6, DRONE_SIZE + 9
+FLIGHT_SIZE = DRONE_SIZE + 10
+"""Numbers in a `Flight`, and in the row of an array that holds one."""
+
+
+class Flight(NamedTuple):
+    """The whole state of one drone on the line."""
+
+    drone: Drone
+    command_m_s: Vector
+    """Last commanded velocity."""
+    wind_m_s: Vector
+    """Steady wind of the episode."""
+    gust_m_s: Vector
+    """What is added to it now."""
+    furthest_m: float
+    """Most progress along the line so far."""
+
+
+@compiled
+def vector_at(row: NDArray[np.float64], start: int) -> Vector:
+    """Read a vector from three neighbours of a row."""
+    return Vector(row[start], row[start + 1], row[start + 2])
+
+
+@compiled
+def flight_at(row: NDArray[np.float64]) -> Flight:
+    """Read a flight from a row of 33 floats."""
+    return Flight(
+        drone_at(row),
+        vector_at(row, COMMAND),
+        vector_at(row, WIND),
+        vector_at(row, GUST),
+        row[FURTHEST],
+    )
+
+
+@compiled
+def store_flight(flight: Flight, row: NDArray[np.float64]) -> None:
+    """Write a flight into a row of 33 floats."""
+    store(flight.drone, row)
+    for k in range(3):
+        row[COMMAND + k] = flight.command_m_s[k]
+        row[WIND + k] = flight.wind_m_s[k]
+        row[GUST + k] = flight.gust_m_s[k]
+    row[FURTHEST] = flight.furthest_m
+
+
+@compiled
+def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
+    """Make a flight that starts at its commanded velocity."""
+    drone = cruising(position_m, command_m_s)
+    place = nearest_on_line(position_m)
+    return Flight(drone, command_m_s, wind_m_s, Vector(0.0, 0.0, 0.0), place.along_m)
+
+
+@compiled
+def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
+    """Hover at a position, then fly for 5 s at a command."""
+    drone = cruising(position_m, Vector(0.0, 0.0, 0.0))
+    drone = fly(plant, drone, command_m_s, wind_m_s, APPROACH_S)
+    along_m = nearest_on_line(drone.position_m).along_m
+    return Flight(drone, command_m_s, wind_m_s, Vector(0.0, 0.0, 0.0), along_m)
+
+
+@compiled
+def commanded(command_m_s: Vector, action: int) -> Vector:
+    """Change a command by an action; one that would exceed 8 m/s stays as it is."""
+    direction = vector_at(DIRECTIONS[action], 0)
+    changed = plus(command_m_s, times(VELOCITY_STEP_M_S, direction))
+    return changed if norm(changed) <= MAX_COMMAND_M_S else command_m_s
+
+
+@compiled
+def blown(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
+    """Give the gusts of the next decision: on each axis, noise that forgets itself within 2 s.
+
+    g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has standard deviation s for ever.
+
+    Args:
+        gust_m_s: until now.
+        strength_m_s: s.
+        noise: (3,) numbers n from the standard normal distribution.
+    """
+    kept = math.exp(-DECISION_S / GUST_TIME_S)
+    fresh = strength_m_s * math.sqrt(1.0 - kept * kept)
+    return plus(times(kept, gust_m_s), times(fresh, vector_at(noise, 0)))
+
+
+@compiled
+def collides(position_m: Vector) -> bool:
+    """Say whether a drone there touches a conductor, a tower or the ground."""
+    if wire_distance(position_m) < WIRE_CLEARANCE_M:
+        return True
+    if tower_distance(position_m) < TOWER_CLEARANCE_M:
+        return True
+    height_m = -position_m.z - ground_height(position_m.x, position_m.y)
+    return height_m < GROUND_CLEARANCE_M
+
+
+@compiled
+def end_of(position_m: Vector, place: Place) -> int:
+    """Say whether a flight is over: FLYING, OFF_LINE, COLLISION or FINISHED."""
+    if collides(position_m):
+        return COLLISION
+    if place.distance_m > MAX_DISTANCE_M:
+        return OFF_LINE
+    return FINISHED if place.along_m > LENGTH_M - FINISH_M else FLYING
+
+
+@compiled
+def reward_of(furthest_m: float, after: Flight, end: int) -> float:
+    """Pay a decision: new progress ds along the line, less for flying beside it.
+
+    Before the decision the drone had been at most `furthest_m` along the line. Pays
+    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, at distance d; -5 for a failure, 5 more for the
+    finish. Beyond 5 m/s each metre costs what it would have paid: if it cost nothing, hurrying
+    would waste the rest of the line, but only beyond the horizon of whoever discounts.
+    """
+    if end in (OFF_LINE, COLLISION):
+        return FAILURE_REWARD
+    distance_m = nearest_on_line(after.drone.position_m).distance_m
+    progress = (after.furthest_m - furthest_m) / PAID_PROGRESS_M
+    progress = min(progress, 2.0 - progress)
+    bonus = FINISH_REWARD if end == FINISHED else 0.0
+    return progress * math.exp(-distance_m / PAID_DISTANCE_M) + bonus
+
+
+@compiled
+def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
+    """Write the 18 observed numbers; see the table of `PowerlineEnv`."""
+    drone = flight.drone
+    place = nearest_on_line(drone.position_m)
+    following = min(place.leg + 1, LEGS - 1)
+    for k in range(3):
+        observation[k] = (drone.position_m[k] - place.point_m[k]) / MAX_DISTANCE_M
+        observation[3 + k] = drone.velocity_m_s[k] / 5.0
+        observation[6 + k] = flight.command_m_s[k] - drone.velocity_m_s[k]
+        observation[9 + k] = TANGENTS[place.leg, k]
+        observation[12 + k] = TANGENTS[following, k]
+    to_corner_m = ALONG_M[place.leg + 1] - place.along_m
+    observation[15] = min(to_corner_m, 60.0) / 60.0
+    observation[16] = math.exp(-to_corner_m / 10.0)
+    observation[17] = (flight.furthest_m - place.along_m) / 10.0
+    for i in range(len(observation)):
+        limit = OBSERVATION_LIMIT[i]
+        observation[i] = min(max(observation[i], -limit), limit)
+
+
+class Bearing(NamedTuple):
+    """Where a drone is, seen from the line, in ROS axes."""
+
+    lateral_m: float
+    """Left of the line, seen along it."""
+    vertical_m: float
+    """Above the line."""
+    distance_m: float
+    """From the line."""
+    along_m: float
+    """Of the nearest point, along the line."""
+    speed_m_s: float
+
+
+@compiled
+def bearing_of(drone: Drone) -> Bearing:
+    """Give where a drone is."""
+    place = nearest_on_line(drone.position_m)
+    away = minus(drone.position_m, place.point_m)
+    forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
+    level = math.hypot(forward_x, forward_y)
+    lateral_m = (forward_y * away.x - forward_x * away.y) / level
+    speed_m_s = norm(drone.velocity_m_s)
+    return Bearing(lateral_m, -away.z, place.distance_m, place.along_m, speed_m_s)
+
+
+@compiled
+def take_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
+    """Write the bearings (N, 5) of N drones, (N, 33) rows of `Flight`."""
+    for i in range(len(flights)):
+        bearing = bearing_of(drone_at(flights[i]))
+        for k, value in enumerate(bearing):
+            bearings[i, k] = value
+
+
+@compiled
+def step_flights(
+    plant: int,
+    flights: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    gust_m_s: float,
+    noise: NDArray[np.float64],
+    rewards: NDArray[np.float64],
+    ends: NDArray[np.int64],
+    observations: NDArray[np.float32],
+) -> None:
+    """Advance N drones by one decision each, in place.
+
+    Args:
+        plant: QUAD or POINT.
+        flights: (N, 33) rows of `Flight`.
+        actions: (N,) 0 to 6.
+        gust_m_s: standard deviation of the gusts.
+        noise: (N, 3) standard normal numbers for the gusts; (N, 0) will do where there are none.
+        rewards: (N,) to be filled.
+        ends: (N,) to be filled with FLYING, OFF_LINE, COLLISION or FINISHED.
+        observations: (N, 18) to be filled.
+    """
+    if gust_m_s > 0.0:
+        for i in range(len(flights)):
+            blow(flights[i], gust_m_s, noise[i])
+    befores_m = flights[:, FURTHEST].copy()
+    decide_all(plant, flights, actions, ends)
+    for i in range(len(flights)):
+        after = flight_at(flights[i])
+        rewards[i] = reward_of(befores_m[i], after, ends[i])
+        observe(after, observations[i])
+
+
+@compiled
+def blow(row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]) -> None:
+    """Renew the gusts of a flight's row; see `blown`."""
+    gust = blown(vector_at(row, GUST), strength_m_s, noise)
+    for k in range(3):
+        row[GUST + k] = gust[k]
+
+
+@compiled
+def decide_all(
+    plant: int,
+    flights: NDArray[np.float64],
+    actions: NDArray[np.int64],
+    ends: NDArray[np.int64],
+) -> None:
+    """Fly N drones, (N, 33) rows of `Flight`, for half a second or to the end of each's flight.
+
+    The ends (N,) are filled with FLYING, OFF_LINE, COLLISION or FINISHED.
+    """
+    count = len(flights)
+    commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))
+    for i in range(count):
+        command = commanded(vector_at(flights[i], COMMAND), actions[i])
+        for k in range(3):
+            commands[i, k] = command[k]
+            winds[i, k] = flights[i, WIND + k] + flights[i, GUST + k]
+        ends[i] = FLYING
+    for _ in range(round(DECISION_S / CHECK_S)):
+        flying = np.flatnonzero(ends == FLYING)
+        fly_all(plant, flights, flying, commands, winds, CHECK_S)
+        for number in flying:
+            position_m = vector_at(flights[number], 0)
+            place = nearest_on_line(position_m)
+            flights[number, FURTHEST] = max(flights[number, FURTHEST], place.along_m)
+            ends[number] = end_of(position_m, place)

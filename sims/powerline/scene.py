@@ -1,0 +1,246 @@
+"""What a 3D viewer shows of the powerline sim: hills, firs, towers, conductors and the drone.
+
+Frames: `map` (x north, y west, z up), `base_stabilized` (at the drone, level), `drone` (its body, x
+forward, y left, z up) and `camera` (ROS optical axes: x right, y down, z along the view).
+The drone is drawn five times its size, so that it can be seen.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, path
+from mcaprl.sims.geometry.vectors import Vector, norm
+from mcaprl.sims.powerline import camera, world
+from mcaprl.sims.powerline.quadrotor import ROTOR_OFFSET_M, Drone
+from mcaprl.sims.powerline.rules import Flight
+
+Floats = NDArray[np.float64]
+
+WHITE: Color = (0.92, 0.92, 0.90, 1.0)
+STEEL: Color = (0.66, 0.69, 0.72, 1.0)
+CERAMIC: Color = (0.45, 0.25, 0.18, 1.0)
+COPPER: Color = (0.10, 0.10, 0.12, 1.0)
+ROUTE: Color = (0.93, 0.76, 0.22, 1.0)
+BODY: Color = (0.16, 0.17, 0.20, 1.0)
+PAINT: Color = (0.83, 0.18, 0.16, 1.0)
+DISC: Color = (0.85, 0.88, 0.92, 0.45)
+TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
+LOOK: Color = (0.99, 0.55, 0.10, 1.0)
+GRASS = (0.42, 0.52, 0.34)
+NEEDLES = (0.16, 0.33, 0.20)
+UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
+"""An arrow of no length points nowhere, and viewers complain."""
+CORNERS_PER_M = 16
+"""Corners of surfaces are rounded so: a log holds them in a third of the space."""
+SHADES = 10
+"""Surfaces are drawn in so many brightnesses, by how they face the sun."""
+SUN = np.array([0.45, 0.35, 0.82])
+
+DRONE_SCALE = 5.0
+CROSSINGS = 6
+"""Storeys of a tower's lattice."""
+
+
+def ros(ned: Vector) -> tuple[float, float, float]:
+    """Turn one NED vector into ROS axes."""
+    return ned.x, -ned.y, -ned.z
+
+
+def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> list[Shape]:
+    """Colour triangles (T, 3, 3) by how they face the sun, one shape for each brightness."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    light = np.clip(normals @ SUN / np.linalg.norm(normals, axis=1), 0.0, 1.0)
+    classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)
+    shapes = []
+    for shade in range(SHADES):
+        points = np.rint(triangles[classes == shade].reshape(-1, 3) * CORNERS_PER_M) / CORNERS_PER_M
+        if len(points):
+            bright = 0.45 + 0.75 * (shade + 0.5) / SHADES
+            red, green, blue = (min(1.0, bright * part) for part in color)
+            shapes.append(Shape(f"{name}_{shade}", "triangles", (red, green, blue, 1.0), points))
+    return shapes
+
+
+def _firs() -> Floats:
+    return np.concatenate([camera.tree_triangles(tree) for tree in world.trees()])
+
+
+def _lattice(tower: world.Tower) -> Floats:
+    """Give a tower's beams in ROS axes as pairs of points, (N, 3)."""
+    foot = np.array([tower.x_m, -tower.y_m, -tower.foot_z_m])
+    height_m = tower.foot_z_m - tower.arm_z_m
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    rings = []
+    for storey in range(CROSSINGS + 1):
+        share = storey / CROSSINGS
+        side_m = camera.MAST_FOOT_M + share * (camera.MAST_TOP_M - camera.MAST_FOOT_M)
+        ring = np.column_stack([side_m * corners, np.full(4, share * height_m)])
+        rings.append(foot + ring)
+    pairs = []
+    for lower, upper in itertools.pairwise(rings):
+        for i in range(4):
+            j = (i + 1) % 4
+            pairs += [lower[i], upper[i], lower[i], upper[j], upper[i], upper[j]]
+    return np.array(pairs)
+
+
+def _arm(index: int, tower: world.Tower) -> list[Shape]:
+    """Give a tower's arm, and the insulators on it."""
+    right = np.array([tower.right[0], -tower.right[1], 0.0])
+    middle = np.array([tower.x_m, -tower.y_m, -tower.arm_z_m])
+    yaw_rad = math.atan2(right[1], right[0])
+    size = (2 * world.ARM_HALF_LENGTH_M, 0.5, 0.4)
+    at = (float(middle[0]), float(middle[1]), float(middle[2]))
+    shapes = [Shape(f"arm_{index}", "box", STEEL, size=size, position=at, yaw_rad=yaw_rad)]
+    for phase, phase_m in enumerate(world.PHASES_M):
+        x_m, y_m, z_m = middle + phase_m * right + [0.0, 0.0, world.ARM_BELOW_WIRES_M / 2]
+        shapes.append(
+            Shape(
+                name=f"insulator_{index}_{phase}",
+                kind="cylinder",
+                color=CERAMIC,
+                size=(0.25, 0.25, world.ARM_BELOW_WIRES_M),
+                position=(float(x_m), float(y_m), float(z_m)),
+            )
+        )
+    return shapes
+
+
+def _line() -> list[Shape]:
+    shapes = [Shape("route", "line", ROUTE, world.to_ros(world.POINTS_M), size=(0.12, 0.0, 0.0))]
+    for index, tower in enumerate(world.towers()):
+        lattice = _lattice(tower)
+        shapes.append(Shape(f"tower_{index}", "segments", STEEL, lattice, size=(0.16, 0.0, 0.0)))
+        shapes += _arm(index, tower)
+    wires = camera.world_wires().reshape(-1, 3)
+    shapes.append(Shape("conductors", "segments", COPPER, wires, size=(0.10, 0.0, 0.0)))
+    return shapes
+
+
+def _drone() -> list[Shape]:
+    """Give the drone's parts in its own frame."""
+    arm_m = DRONE_SCALE * ROTOR_OFFSET_M
+    turns = ((1, 1), (-1, -1), (1, -1), (-1, 1))
+    names = ("front_left", "rear_right", "front_right", "rear_left")
+    long = (2 * math.sqrt(2) * arm_m, 0.12, 0.08)
+    shapes = [
+        Shape("drone_body", "box", BODY, size=(0.9, 0.55, 0.3), frame="drone"),
+        Shape(
+            "drone_nose",
+            "box",
+            PAINT,
+            size=(0.3, 0.4, 0.2),
+            position=(0.5, 0.0, 0.05),
+            frame="drone",
+        ),
+        Shape("drone_arms_a", "box", BODY, size=long, yaw_rad=math.pi / 4, frame="drone"),
+        Shape("drone_arms_b", "box", BODY, size=long, yaw_rad=-math.pi / 4, frame="drone"),
+        Shape(
+            "drone_camera",
+            "sphere",
+            BODY,
+            size=(0.3, 0.3, 0.3),
+            position=(0.3, 0.0, -0.25),
+            frame="drone",
+        ),
+    ]
+    for name, (forward, left) in zip(names, turns, strict=True):
+        shapes.append(
+            Shape(
+                name=f"drone_rotor_{name}",
+                kind="cylinder",
+                color=DISC,
+                size=(1.2, 1.2, 0.04),
+                position=(forward * arm_m, left * arm_m, 0.16),
+                frame="drone",
+            )
+        )
+    return shapes
+
+
+@functools.cache
+def ground_shapes() -> tuple[Shape, ...]:
+    """Give the ground and the firs."""
+    ground = _shaded("ground", camera.ground_triangles(), GRASS)
+    return (*ground, *_shaded("firs", _firs(), NEEDLES))
+
+
+@functools.cache
+def static_shapes() -> tuple[Shape, ...]:
+    """Give what never changes: the world in `map`, ground first, and the drone's parts."""
+    return (*ground_shapes(), *_line(), *_drone())
+
+
+def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple[Shape, ...]:
+    """Give what changes with each step.
+
+    Args:
+        flight: now.
+        trail_m: the last positions of the drone, NED; at least one.
+    """
+    position = flight.drone.position_m
+    place = world.nearest_on_line(position)
+    here = np.array(ros(position))
+    # What starts at the drone is given from there: it hangs on it, and repeats itself in a log.
+    level, origin = "base_stabilized", np.zeros(3)
+    link = np.array([origin, ros(place.point_m) - here])
+    ahead = np.array([ros(world.point_on_line(place.along_m + 6.0)) - here])
+    arrow = np.array([origin, np.array(ros(flight.command_m_s)) + UP_A_LITTLE])
+    speed_m_s = norm(flight.drone.velocity_m_s)
+    return (
+        Shape("trail", "line", TRAIL, world.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
+        Shape("offset", "line", LOOK, link, size=(0.08, 0.0, 0.0), frame=level),
+        Shape("ahead", "points", LOOK, ahead, size=(0.4, 0.4, 0.4), frame=level),
+        Shape("command", "arrow", WHITE, arrow, size=(0.12, 0.3, 0.4), frame=level),
+        Shape(
+            name="speed",
+            kind="text",
+            color=WHITE,
+            size=(1.0, 1.0, 0.8),
+            position=(0.0, 0.0, 1.6),
+            frame=level,
+            text=f"{speed_m_s:.1f} m/s",
+        ),
+    )
+
+
+def drone_frames(drone: Drone) -> tuple[Frame, ...]:
+    """Give where the drone is, level, in the map; and its attitude there.
+
+    Turning the axes of the world and of the body by half a turn about x makes NED of ROS axes, so a
+    rotation's y and z parts change sign, as a vector's.
+    """
+    q = drone.attitude
+    return (
+        Frame("base_stabilized", ros(drone.position_m), (0.0, 0.0, 0.0, 1.0)),
+        Frame("drone", (0.0, 0.0, 0.0), (q.x, -q.y, -q.z, q.w), parent="base_stabilized"),
+    )
+
+
+def camera_frame(view: str) -> Frame:
+    """Give the camera in the drone: optical axes."""
+    half = math.sqrt(0.5)
+    rotations = {"front": (-0.5, 0.5, -0.5, 0.5), "down": (half, -half, 0.0, 0.0)}
+    return Frame("camera", ros(camera.CAMERA_AT_M[view]), rotations[view], parent="drone")
+
+
+def telemetry(flight: Flight) -> dict[str, float]:
+    """Give what `info` does not tell of a drone, in ROS axes; the units are in the names."""
+    drone = flight.drone
+    x_m, y_m, z_m = ros(drone.position_m)
+    tilt_cosine = 1.0 - 2.0 * (drone.attitude.x**2 + drone.attitude.y**2)
+    return {
+        "x_m": x_m,
+        "y_m": y_m,
+        "z_m": z_m,
+        "tilt_rad": math.acos(min(1.0, max(-1.0, tilt_cosine))),
+        "wire_distance_m": world.wire_distance(drone.position_m),
+        "height_m": z_m - world.ground_height(drone.position_m.x, drone.position_m.y),
+    }

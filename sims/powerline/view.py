@@ -1,0 +1,122 @@
+"""The powerline sim from above, and from the side along the line in a strip below.
+
+From above, x (north) points right and y (west) up, as in the ROS axes of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.canvas import rgb
+from mcaprl.sims.drawing.follow_view import SIDE_PX, Body, FollowView
+from mcaprl.sims.geometry.vectors import norm
+from mcaprl.sims.powerline import scene
+from mcaprl.sims.powerline.rules import DECISION_S, Flight
+from mcaprl.sims.powerline.world import (
+    ALONG_M,
+    CHORDS,
+    LENGTH_M,
+    PHASES_M,
+    POINTS_M,
+    WIRES_M,
+    Place,
+    ground_height,
+    nearest_on_line,
+    point_on_line,
+    towers,
+)
+
+Floats = NDArray[np.float64]
+
+VIEW_M = 50.0
+STRIP_TOP_PX, STRIP_BOTTOM_PX = 430, SIDE_PX - 34
+STRIP_M = 180.0
+"""Length of the line in the strip; heights have the same scale."""
+DRONE_DOWN_PX = 45
+"""Place of the drone in the strip, from its top."""
+_SKY = (158, 188, 212)
+_GROUND = (88, 112, 74)
+_SAMPLE_M = 2.0
+
+
+class PowerlineView:
+    """Draws one picture for each step, and shows it in a window in mode `human`."""
+
+    def __init__(self, render_mode: Literal["human", "rgb_array"]) -> None:
+        """Prepare the parts of the picture that never change.
+
+        Raises:
+            MissingExtraError: pygame is not installed.
+        """
+        frames_per_s = round(1.0 / DECISION_S)
+        floor = scene.ground_shapes()
+        above = scene.static_shapes()[len(floor) :]
+        self._view = FollowView(render_mode, "powerline", above, VIEW_M, frames_per_s, floor)
+
+    def draw(
+        self, flight: Flight, trail_m: Sequence[tuple[float, ...]], reward: float
+    ) -> NDArray[np.uint8]:
+        """Draw the drone where it is, and give the picture, (600, 600, 3).
+
+        Args:
+            flight: now.
+            trail_m: the last positions, NED; at least one.
+            reward: of the last step.
+        """
+        drone = flight.drone
+        x_m, y_m, z_m = scene.ros(drone.position_m)
+        place = nearest_on_line(drone.position_m)
+        text = (
+            f"{norm(drone.velocity_m_s):4.1f} m/s   {place.distance_m:.2f} m off the line   "
+            f"at {place.along_m:.0f} m   reward {reward:+.2f}"
+        )
+        body = Body("drone", x_m, y_m, 0.0, z_m)
+        self._view.draw(scene.moving_shapes(flight, trail_m), body, text)
+        self._draw_strip(place, z_m)
+        return self._view.show()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._view.close()
+
+    def _draw_strip(self, place: Place, height_m: float) -> None:
+        """Draw the line from its side, with the drone where it is on it."""
+        draw = self._view.canvas.pygame.draw
+        box_px = (0, STRIP_TOP_PX, SIDE_PX, STRIP_BOTTOM_PX - STRIP_TOP_PX)
+        strip = self._view.canvas.strip(box_px, _SKY)
+
+        def pixels(along_m: Floats, heights_m: Floats) -> list[tuple[float, float]]:
+            scale_px = SIDE_PX / STRIP_M
+            across = SIDE_PX / 2 + scale_px * (along_m - place.along_m)
+            down = DRONE_DOWN_PX - scale_px * (heights_m - height_m)
+            return list(zip(across.tolist(), down.tolist(), strict=True))
+
+        along_m = np.arange(0.0, LENGTH_M + _SAMPLE_M, _SAMPLE_M)
+        ground = pixels(along_m, _ground_under(along_m))
+        below = [(ground[-1][0], 10.0 * SIDE_PX), (ground[0][0], 10.0 * SIDE_PX)]
+        draw.polygon(strip, _GROUND, [*ground, *below])
+        for index, tower in enumerate(towers()):
+            ends = pixels(ALONG_M[[index, index]], -np.array([tower.foot_z_m, tower.arm_z_m]))
+            draw.line(strip, rgb(scene.STEEL), *ends, 4)
+        draw.aalines(strip, rgb(scene.COPPER), False, pixels(*_middle_wire()))
+        draw.aalines(strip, rgb(scene.ROUTE), False, pixels(ALONG_M, -POINTS_M[:, 2]))
+        here = pixels(np.array([place.along_m]), np.array([height_m]))[0]
+        draw.circle(strip, rgb(scene.PAINT), here, 5)
+
+
+def _ground_under(along_m: Floats) -> Floats:
+    """Give the ground's heights (N,) under points of the line."""
+    points = [point_on_line(along) for along in along_m]
+    return np.array([ground_height(point.x, point.y) for point in points])
+
+
+def _middle_wire() -> tuple[Floats, Floats]:
+    """Give places along the line and heights of the middle conductor, from end to end."""
+    shares = np.linspace(0.0, 1.0, CHORDS + 1)
+    spans = WIRES_M[len(PHASES_M) // 2 :: len(PHASES_M)]
+    along_m = ALONG_M[:-1, None] + shares * np.diff(ALONG_M)[:, None]
+    return along_m.ravel(), -spans[:, :, 2].ravel()

@@ -1,0 +1,298 @@
+"""The world of the powerline sim: the line to follow, its towers, conductors, and the ground.
+
+Axes are those of the published line, NED: x north, y east, z down; metres. `to_ros` turns them
+into ROS axes for viewers. Nothing here is random: the same world stands on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.vectors import Vector, cross, minus, norm
+
+Floats = NDArray[np.float64]
+
+POINTS_M: Floats = np.array(
+    [
+        (-0.55265, -31.9786, -19.0225),
+        (48.59735, -63.3286, -60.07256),
+        (193.5974, -55.0786, -46.32256),
+        (369.2474, 35.32137, -62.5725),
+        (541.3474, 143.6714, -32.07256),
+    ]
+)
+"""(5, 3) the flight line; a tower stands under each point."""
+LEGS = len(POINTS_M) - 1
+_LEG_M = np.diff(POINTS_M, axis=0)
+LEG_LENGTHS_M: Floats = np.sqrt((_LEG_M**2).sum(axis=1))
+TANGENTS: Floats = _LEG_M / LEG_LENGTHS_M[:, None]
+"""(4, 3) unit vectors along the legs."""
+ALONG_M: Floats = np.concatenate([[0.0], np.cumsum(LEG_LENGTHS_M)])
+"""(5,) distance of each point from the first, along the line."""
+LENGTH_M = float(ALONG_M[-1])
+
+BELOW_LINE_M = 6.0
+"""The conductors' ends hang this far below the points of the flight line."""
+PHASES_M = (-4.0, 0.0, 4.0)
+"""Sideways places of the three conductors, right positive."""
+SAG = 0.02
+"""Of a conductor in the middle of its span, as a share of the span's length."""
+CHORDS = 16
+"""Straight pieces that a conductor is made of."""
+
+ARM_BELOW_WIRES_M = 1.0
+"""Length of the insulators, which stand on the towers' arms."""
+ARM_HALF_LENGTH_M = 4.8
+TOWER_HEIGHTS_M = (21.0, 26.0, 24.0, 28.0, 23.0)
+TREE_COUNT = 240
+
+
+class Place(NamedTuple):
+    """The point of the line nearest to a position."""
+
+    leg: int
+    along_m: float
+    """Distance from the first point, along the line."""
+    point_m: Vector
+    distance_m: float
+
+
+class Tower(NamedTuple):
+    """A mast with an arm on top, across the line."""
+
+    x_m: float
+    y_m: float
+    foot_z_m: float
+    arm_z_m: float
+    right: tuple[float, float]
+    """Unit vector along the arm, to the right of the line."""
+
+
+class Tree(NamedTuple):
+    """A fir."""
+
+    x_m: float
+    y_m: float
+    height_m: float
+
+
+def to_ros(ned: Floats) -> Floats:
+    """Turn NED coordinates (..., 3) into ROS axes: x stays, y and z change sign."""
+    turned: Floats = ned * np.array([1.0, -1.0, -1.0])
+    return turned
+
+
+@compiled
+def point_on_line(along_m: float) -> Vector:
+    """Give the point at a distance along the line; its ends are the limits."""
+    rest_m = min(max(along_m, 0.0), LENGTH_M)
+    leg = 0
+    while leg + 1 < LEGS and ALONG_M[leg + 1] <= rest_m:
+        leg += 1
+    rest_m -= ALONG_M[leg]
+    return Vector(
+        POINTS_M[leg, 0] + rest_m * TANGENTS[leg, 0],
+        POINTS_M[leg, 1] + rest_m * TANGENTS[leg, 1],
+        POINTS_M[leg, 2] + rest_m * TANGENTS[leg, 2],
+    )
+
+
+@compiled
+def nearest_on_line(position_m: Vector) -> Place:
+    """Find the nearest point of the line, between its ends."""
+    best = Place(0, 0.0, Vector(0.0, 0.0, 0.0), math.inf)
+    for leg in range(LEGS):
+        rest_m = 0.0
+        for k in range(3):
+            rest_m += (position_m[k] - POINTS_M[leg, k]) * TANGENTS[leg, k]
+        along_m = ALONG_M[leg] + min(max(rest_m, 0.0), LEG_LENGTHS_M[leg])
+        point = point_on_line(along_m)
+        distance_m = norm(minus(position_m, point))
+        if distance_m < best.distance_m:
+            best = Place(leg, along_m, point, distance_m)
+    return best
+
+
+@compiled
+def distance_to_endless_line(position_m: Vector, leg: int) -> float:
+    """Give the distance to the straight line through a leg, without its ends; metres.
+
+    For a point p, |(p - a) x t|, with a on the line and the unit vector t along it.
+    """
+    start = Vector(POINTS_M[leg, 0], POINTS_M[leg, 1], POINTS_M[leg, 2])
+    tangent = Vector(TANGENTS[leg, 0], TANGENTS[leg, 1], TANGENTS[leg, 2])
+    return norm(cross(minus(position_m, start), tangent))
+
+
+@compiled
+def ground_height(x_m: float, y_m: float) -> float:
+    """Give how high the ground is, metres above z = 0.
+
+    Under the line it rises and falls smoothly between the towers' feet; hills stand beside it.
+    """
+    span = 0
+    while span + 1 < LEGS and POINTS_M[span + 1, 0] <= x_m:
+        span += 1
+    start, end = POINTS_M[span], POINTS_M[span + 1]
+    share = min(max((x_m - start[0]) / (end[0] - start[0]), 0.0), 1.0)
+    low, high = _foot_height(span), _foot_height(span + 1)
+    base_m: float = low + (high - low) * share * share * (3.0 - 2.0 * share)
+    beside_m = y_m - (start[1] + share * (end[1] - start[1]))
+    away = 1.0 - math.exp(-((beside_m / 60.0) ** 2))
+    hills_m = 9.0 * math.sin(x_m / 47.0 + 1.0) * math.cos(y_m / 39.0) + 4.0 * math.sin(y_m / 61.0)
+    return base_m + away * hills_m
+
+
+@compiled
+def _foot_height(tower: int) -> float:
+    arm_m: float = -POINTS_M[tower, 2] - BELOW_LINE_M - ARM_BELOW_WIRES_M
+    return arm_m - TOWER_HEIGHTS_M[tower]
+
+
+@compiled
+def wire_distance(position_m: Vector) -> float:
+    """Give the distance to the nearest conductor, metres.
+
+    In each span, only the pieces around the one beside the position are tried. Of wires nearer than
+    4 m, the distance is exact; a farther one may be a little nearer than the answer.
+    """
+    nearest_m = math.inf
+    for wire in range(len(WIRES_M)):
+        start, end = WIRES_M[wire, 0], WIRES_M[wire, CHORDS]
+        ux, uy = end[0] - start[0], end[1] - start[1]
+        along = (position_m.x - start[0]) * ux + (position_m.y - start[1]) * uy
+        middle = math.floor(min(max(along / (ux * ux + uy * uy), 0.0), 1.0) * CHORDS)
+        for chord in range(max(0, middle - 2), min(CHORDS, middle + 3)):
+            chord_m = distance_to_piece(position_m, WIRES_M[wire, chord], WIRES_M[wire, chord + 1])
+            nearest_m = min(nearest_m, chord_m)
+    return nearest_m
+
+
+@compiled
+def tower_distance(position_m: Vector) -> float:
+    """Give the distance to the nearest axis of a tower's mast or arm, metres."""
+    nearest_m = math.inf
+    for beam in range(len(BEAMS_M)):
+        beam_m = distance_to_piece(position_m, BEAMS_M[beam, 0], BEAMS_M[beam, 1])
+        nearest_m = min(nearest_m, beam_m)
+    return nearest_m
+
+
+@compiled
+def distance_to_piece(position_m: Vector, start_m: Floats, end_m: Floats) -> float:
+    """Give the distance to a straight piece between two points (3,), metres."""
+    along, length = 0.0, 0.0
+    for k in range(3):
+        piece = end_m[k] - start_m[k]
+        along += (position_m[k] - start_m[k]) * piece
+        length += piece * piece
+    share = min(max(along / length, 0.0), 1.0)
+    square = 0.0
+    for k in range(3):
+        square += (position_m[k] - start_m[k] - share * (end_m[k] - start_m[k])) ** 2
+    return math.sqrt(square)
+
+
+def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
+    """Give the heights of a hanging wire over the level through its first end, metres.
+
+    y = a cosh((x - x0) / a) + c. With a given, x0 follows from the rise; and a, found by halving,
+    from the sag: how far the wire's middle is below the straight line between its ends.
+
+    Args:
+        span_m: horizontal distance of the ends.
+        rise_m: the second end's height over the first one's.
+        sag_m: above 0.
+        x_m: (N,) horizontal distances from the first end.
+    """
+
+    def lowest(a: float) -> float:
+        return span_m / 2 - a * math.asinh(rise_m / (2 * a * math.sinh(span_m / (2 * a))))
+
+    low, high = span_m / 20, span_m * span_m / sag_m
+    for _ in range(100):
+        a = (low + high) / 2
+        ends = math.cosh(span_m / (2 * a)) - 1.0
+        if a * math.cosh((span_m / 2 - lowest(a)) / a) * ends > sag_m:
+            low = a
+        else:
+            high = a
+    x0 = lowest(a)
+    heights: Floats = a * (np.cosh((x_m - x0) / a) - math.cosh(x0 / a))
+    return heights
+
+
+def towers() -> tuple[Tower, ...]:
+    """Give the five towers; the arms halve the angle of the spans."""
+    level = TANGENTS[:, :2] / np.hypot(*TANGENTS[:, :2].T)[:, None]
+    forward = np.vstack([level[:1], level[:-1] + level[1:], level[-1:]])
+    forward /= np.hypot(*forward.T)[:, None]
+    return tuple(
+        Tower(
+            float(x),
+            float(y),
+            -_foot_height(i),
+            float(z) + BELOW_LINE_M + ARM_BELOW_WIRES_M,
+            (-float(forward[i, 1]), float(forward[i, 0])),
+        )
+        for i, (x, y, z) in enumerate(POINTS_M)
+    )
+
+
+def _wires() -> Floats:
+    """Hang the conductors: (12, CHORDS + 1, 3), three for each span, along the line."""
+    shares = np.linspace(0.0, 1.0, CHORDS + 1)
+    found = towers()
+    wires = []
+    for leg in range(LEGS):
+        for phase_m in PHASES_M:
+            start, end = (
+                np.array([t.x_m, t.y_m, t.arm_z_m - ARM_BELOW_WIRES_M])
+                + phase_m * np.array([*t.right, 0.0])
+                for t in found[leg : leg + 2]
+            )
+            span_m = float(np.hypot(*(end - start)[:2]))
+            sag_m = SAG * float(LEG_LENGTHS_M[leg])
+            wire = start + shares[:, None] * (end - start)
+            heights = catenary(span_m, float(start[2] - end[2]), sag_m, shares * span_m)
+            wire[:, 2] = start[2] - heights
+            wires.append(wire)
+    return np.array(wires)
+
+
+def _beams() -> Floats:
+    """Give each tower's mast and arm as pairs of ends, (10, 2, 3)."""
+    beams = []
+    for x_m, y_m, foot_z_m, arm_z_m, right in towers():
+        across = ARM_HALF_LENGTH_M * np.array([*right, 0.0])
+        top = np.array([x_m, y_m, arm_z_m])
+        beams += [[np.array([x_m, y_m, foot_z_m]), top], [top - across, top + across]]
+    return np.array(beams)
+
+
+WIRES_M: Floats = _wires()
+BEAMS_M: Floats = _beams()
+
+
+def _spread(index: int, low: float, high: float) -> float:
+    """Give the index-th number of an evenly spread sequence (multiples of the golden ratio)."""
+    return low + (high - low) * (index * 0.6180339887498949 % 1.0)
+
+
+def trees() -> tuple[Tree, ...]:
+    """Give the firs: bushes in the cleared strip under the line, tall trees on both its sides."""
+    found = []
+    for index in range(TREE_COUNT):
+        along_m = (index + 0.5) / TREE_COUNT * LENGTH_M
+        side = 1.0 if index % 2 else -1.0
+        small = index % 3 == 0
+        beside_m = side * (_spread(index, 2.0, 12.0) if small else _spread(7 * index, 14.0, 80.0))
+        height_m = _spread(5 * index, 1.0, 2.5) if small else _spread(5 * index, 6.0, 13.0)
+        x_m, y_m, _ = point_on_line(along_m)
+        found.append(Tree(x_m, y_m + beside_m, height_m))
+    return tuple(found)

@@ -1,0 +1,1 @@
+"""The ray-cast racer, `mcaprl/Racer-v0`."""

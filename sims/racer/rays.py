@@ -1,0 +1,176 @@
+"""What a car of the racer sim sees: the lengths of 18 rays to the walls."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.paths import heading_of
+from mcaprl.sims.geometry.ray_code import FAR_M
+from mcaprl.sims.racer.car import Racer, corner_at
+from mcaprl.sims.racer.track import METRES_PER_PX
+
+FAR_PX = FAR_M / METRES_PER_PX
+JOINT = 1e-9
+"""Walls are longer by this share at both ends, so that no ray slips through between two."""
+CENTRE_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
+"""Directions of the rays from the car's centre; right is positive."""
+CENTRE_RAYS_RAD = tuple(math.radians(angle) for angle in CENTRE_RAYS_DEG)
+_COS: NDArray[np.float64] = np.cos(CENTRE_RAYS_RAD)
+_SIN: NDArray[np.float64] = np.sin(CENTRE_RAYS_RAD)
+CENTRE_RAYS = len(CENTRE_RAYS_DEG)
+RAYS = CENTRE_RAYS + 4
+RAY_NAMES = (
+    "ahead",
+    "left_30",
+    "right_30",
+    "right_45",
+    "left_45",
+    "right_90",
+    "left_90",
+    "behind",
+    "right_10",
+    "left_10",
+    "right_135",
+    "left_135",
+    "right_20",
+    "left_20",
+    "left_corner_sideways",
+    "right_corner_sideways",
+    "left_corner_ahead",
+    "right_corner_ahead",
+)
+
+
+@compiled
+def crossing(
+    x: float, y: float, dx: float, dy: float, line: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Find where the line through two points meets another.
+
+    Args:
+        x: of the first point.
+        y: of the first point.
+        dx: from the first point to the second.
+        dy: from the first point to the second.
+        line: (4,) x1, y1, x2, y2.
+
+    Returns:
+        The shares of the way from the first point to the second, and along `line`; both lie
+        between 0 and 1 where the segments cross. Infinite for parallels.
+    """
+    ex, ey = line[2] - line[0], line[3] - line[1]
+    cross = dx * ey - dy * ex
+    if cross == 0.0:
+        return math.inf, math.inf
+    ax, ay = line[0] - x, line[1] - y
+    return (ax * ey - ay * ex) / cross, (ax * dy - ay * dx) / cross
+
+
+@compiled
+def aim(car: Racer, classic: bool, rays: NDArray[np.float64]) -> None:
+    """Write a car's rays (4, 18): where each starts, x and y, and from there to 1000 pixels away.
+
+    The left corner's sideways ray looks to the left; in the classic rules across the car's nose.
+    """
+    cos, sin = heading_of(car.heading_rad)
+    for ray in range(CENTRE_RAYS):
+        rays[0, ray], rays[1, ray] = car.x_px, car.y_px
+        rays[2, ray] = FAR_PX * (cos * _COS[ray] - sin * _SIN[ray])
+        rays[3, ray] = FAR_PX * (sin * _COS[ray] + cos * _SIN[ray])
+    for corner in range(2):
+        right = 2.0 * corner - 1.0
+        side = -right if classic else right
+        sideways, ahead = CENTRE_RAYS + corner, CENTRE_RAYS + 2 + corner
+        x_px, y_px = corner_at(car, 1.0, right)
+        rays[0, sideways], rays[1, sideways] = x_px, y_px
+        rays[0, ahead], rays[1, ahead] = x_px, y_px
+        rays[2, sideways], rays[3, sideways] = -FAR_PX * side * sin, FAR_PX * side * cos
+        rays[2, ahead], rays[3, ahead] = FAR_PX * cos, FAR_PX * sin
+
+
+@compiled
+def cast(
+    walls: NDArray[np.float64], rays: NDArray[np.float64], shares: NDArray[np.float64]
+) -> None:
+    """Find where rays first meet a wall.
+
+    As `crossing` has it, for all rays at once: without a branch, so that the compiler can do
+    several together. Parallels give inf or NaN, which are in no interval.
+
+    Args:
+        walls: (W, 4).
+        rays: (4, R) as `aim` writes them.
+        shares: (R,) to be filled with the share of each ray's length; 1 without a wall.
+    """
+    x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
+    shares[:] = 1.0
+    for wall in range(len(walls)):
+        x1, y1 = walls[wall, 0], walls[wall, 1]
+        ex, ey = walls[wall, 2] - x1, walls[wall, 3] - y1
+        for ray in range(len(shares)):
+            ax, ay = x1 - x_px[ray], y1 - y_px[ray]
+            inverse = 1.0 / (dx[ray] * ey - dy[ray] * ex)
+            share = (ax * ey - ay * ex) * inverse
+            along = (ax * dy[ray] - ay * dx[ray]) * inverse
+            is_nearer = (share > 0.0) & (share < shares[ray])
+            is_hit = is_nearer & (along >= -JOINT) & (along <= 1.0 + JOINT)
+            shares[ray] = share if is_hit else shares[ray]
+
+
+@compiled
+def floored_distance(car: Racer, line: NDArray[np.float64], share: float) -> float:
+    """Give the distance from a car's centre to the pixel at a share of the way along a line."""
+    hit_x = math.floor(line[0] + share * (line[2] - line[0]))
+    hit_y = math.floor(line[1] + share * (line[3] - line[1]))
+    return math.hypot(hit_x - car.x_px, hit_y - car.y_px)
+
+
+@compiled
+def floored_ray_length(
+    walls: NDArray[np.float64], car: Racer, rays: NDArray[np.float64], ray: int
+) -> float:
+    """Give the classic length of a ray: from the car's centre to the nearest floored hit.
+
+    Hits are floored to whole pixels before they are compared; without a hit it is 1000.
+    """
+    nearest = math.inf
+    for wall in walls:
+        share, along_wall = crossing(rays[0, ray], rays[1, ray], rays[2, ray], rays[3, ray], wall)
+        if 0.0 < share < 1.0 and 0.0 < along_wall < 1.0:
+            nearest = min(nearest, floored_distance(car, wall, along_wall))
+    return nearest if nearest < math.inf else FAR_PX
+
+
+@compiled
+def measure(
+    walls: NDArray[np.float64], car: Racer, classic: bool, lengths_px: NDArray[np.float64]
+) -> None:
+    """Write the lengths (18,) of the car's rays; the classic ones are all from its centre."""
+    rays = np.empty((4, RAYS))
+    aim(car, classic, rays)
+    if classic:
+        for ray in range(RAYS):
+            lengths_px[ray] = floored_ray_length(walls, car, rays, ray)
+    else:
+        cast(walls, rays, lengths_px)
+        for ray in range(RAYS):
+            lengths_px[ray] *= FAR_PX
+
+
+def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
+    """Give the rays as lines (18, 2, 2) from their start to the wall, x and y in pixels."""
+    rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
+    aim(car, False, rays)
+    cast(walls, rays, shares)
+    starts = rays[:2].T
+    return np.stack([starts, starts + shares[:, np.newaxis] * rays[2:].T], axis=1)
+
+
+@compiled
+def classic_code(length_px: float) -> float:
+    """Pack a length into (1000 px - d) / 1000 px: 1 is near."""
+    return (FAR_PX - length_px) / FAR_PX

@@ -1,0 +1,150 @@
+"""What a 3D viewer shows of the racer sim: track, walls, gates, the car and its rays.
+
+Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's middle, x
+forward, y left). One pixel of the rules is 0.1 m here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.car_parts import part, wheel
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
+from mcaprl.sims.racer.car import Racer
+from mcaprl.sims.racer.rays import ray_ends
+from mcaprl.sims.racer.track import (
+    METRES_PER_PX,
+    PICTURE_HEIGHT_PX,
+    PICTURE_WIDTH_PX,
+    Track,
+    asphalt,
+    to_map,
+)
+
+Floats = NDArray[np.float64]
+
+GRASS: Color = (0.33, 0.45, 0.32, 1.0)
+ASPHALT: Color = (0.23, 0.24, 0.26, 1.0)
+WHITE: Color = (0.93, 0.93, 0.91, 1.0)
+RED: Color = (0.80, 0.20, 0.17, 1.0)
+GATE: Color = (0.42, 0.45, 0.48, 1.0)
+NEXT_GATE: Color = (0.25, 0.85, 0.42, 1.0)
+RAY: Color = (0.98, 0.80, 0.28, 0.8)
+HIT: Color = (0.99, 0.55, 0.10, 1.0)
+TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
+PAINT: Color = (0.12, 0.36, 0.84, 1.0)
+CARBON: Color = (0.10, 0.10, 0.12, 1.0)
+RUBBER: Color = (0.05, 0.05, 0.06, 1.0)
+HELMET: Color = (0.97, 0.88, 0.30, 1.0)
+
+WALL_HEIGHT_M, WALL_THICKNESS_M = 0.6, 0.3
+WHEEL_RADIUS_M, WHEEL_WIDTH_M = 0.3, 0.26
+
+
+def _ground() -> Shape:
+    width_m, height_m = PICTURE_WIDTH_PX * METRES_PER_PX, PICTURE_HEIGHT_PX * METRES_PER_PX
+    return Shape(
+        name="ground",
+        kind="box",
+        color=GRASS,
+        size=(width_m, height_m, 0.1),
+        position=(width_m / 2, height_m / 2, -0.1),
+    )
+
+
+def _wall(index: int, ends_m: Floats) -> Shape:
+    """Build a wall between two points (2, 2); its colour changes from one to the next."""
+    along, middle = ends_m[1] - ends_m[0], ends_m.mean(axis=0)
+    length_m = float(np.hypot(*along)) + WALL_THICKNESS_M
+    return Shape(
+        name=f"wall_{index}",
+        kind="box",
+        color=RED if index % 2 else WHITE,
+        size=(length_m, WALL_THICKNESS_M, WALL_HEIGHT_M),
+        position=(float(middle[0]), float(middle[1]), WALL_HEIGHT_M / 2),
+        yaw_rad=math.atan2(along[1], along[0]),
+    )
+
+
+def _car() -> list[Shape]:
+    wheels = {
+        "front_left": (0.95, 0.55),
+        "front_right": (0.95, -0.55),
+        "rear_left": (-1.0, 0.55),
+        "rear_right": (-1.0, -0.55),
+    }
+    return [
+        part("floor", CARBON, (2.0, 0.9, 0.10), (-0.2, 0.0, 0.16)),
+        part("body", PAINT, (2.1, 0.5, 0.32), (-0.35, 0.0, 0.37)),
+        part("pods", PAINT, (0.9, 0.86, 0.24), (-0.3, 0.0, 0.33)),
+        part("nose", PAINT, (0.8, 0.26, 0.18), (1.05, 0.0, 0.32)),
+        part("front_wing", WHITE, (0.28, 1.4, 0.06), (1.36, 0.0, 0.16)),
+        part("rear_wing", WHITE, (0.26, 1.1, 0.08), (-1.37, 0.0, 0.80)),
+        part("rear_wing_left", CARBON, (0.3, 0.05, 0.45), (-1.35, 0.55, 0.62)),
+        part("rear_wing_right", CARBON, (0.3, 0.05, 0.45), (-1.35, -0.55, 0.62)),
+        Shape(
+            name="car_helmet",
+            kind="sphere",
+            color=HELMET,
+            size=(0.3, 0.3, 0.3),
+            position=(-0.1, 0.0, 0.6),
+            frame="car",
+        ),
+        *(
+            wheel(name, RUBBER, (x_m, y_m, WHEEL_RADIUS_M), WHEEL_RADIUS_M, WHEEL_WIDTH_M)
+            for name, (x_m, y_m) in wheels.items()
+        ),
+    ]
+
+
+def static_shapes(track: Track) -> tuple[Shape, ...]:
+    """Give what never changes: the world in `map`, and the car's parts in `car`."""
+    walls_m = to_map(track.walls_px.reshape(-1, 2, 2))
+    gates_m = to_map(track.gates_px.reshape(-1, 2, 2))
+    return (
+        _ground(),
+        Shape("road", "triangles", ASPHALT, raised(to_map(asphalt(track)), 0.0)),
+        Shape("gates", "segments", GATE, raised(gates_m, 0.02), size=(0.15, 0.0, 0.0)),
+        *(_wall(index, ends_m) for index, ends_m in enumerate(walls_m)),
+        *_car(),
+    )
+
+
+def moving_shapes(
+    track: Track, car: Racer, trail_m: Sequence[tuple[float, ...]]
+) -> tuple[Shape, ...]:
+    """Give what changes with each step.
+
+    Args:
+        track: that the car drives on.
+        car: now.
+        trail_m: the last positions of the car, (x, y) in the map; at least one.
+    """
+    gate_m = to_map(track.gates_px[int(car.next_gate)].reshape(2, 2))
+    rays_m = to_map(ray_ends(track.walls_px, car))
+    return (
+        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.15, 0.0, 0.0)),
+        Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
+        Shape("rays", "segments", RAY, raised(rays_m, 0.4), size=(0.1, 0.0, 0.0)),
+        Shape("hits", "points", HIT, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),
+        Shape(
+            name="speed",
+            kind="text",
+            color=WHITE,
+            size=(1.0, 1.0, 0.8),
+            position=(0.0, 0.0, 2.0),
+            frame="car",
+            text=f"{car.speed_px:.0f} px/step, {int(car.gates)} gates",
+        ),
+    )
+
+
+def car_frame(car: Racer) -> Frame:
+    """Give the car's frame in the map."""
+    x_m = METRES_PER_PX * car.x_px
+    y_m = METRES_PER_PX * (PICTURE_HEIGHT_PX - car.y_px)
+    return Frame("car", (x_m, y_m, 0.0), yaw_rotation(-car.heading_rad))

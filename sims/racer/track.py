@@ -1,0 +1,252 @@
+"""The tracks of the racer sim: a closed spline, walls along both sides of it, and gates across.
+
+Pixels are those of a 1000 x 600 picture: x to the right, y down, angles clockwise. One pixel is
+0.1 m; the map of viewers has its origin in the picture's lower left corner, y up, and angles
+counter-clockwise.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.sims.geometry.paths import Path, closed_path, project
+
+Floats = NDArray[np.float64]
+
+PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX = 1000, 600
+METRES_PER_PX = 0.1
+HALF_WIDTH_PX = 41.5
+GATES = 37
+WALLS_PER_SIDE = 24
+PATH_LEGS = 12 * GATES
+
+CONTROL_POINTS_PX = (
+    (50.0, 300.0),
+    (58.0, 415.0),
+    (115.0, 520.0),
+    (225.0, 538.0),
+    (308.0, 475.0),
+    (362.0, 390.0),
+    (455.0, 350.0),
+    (545.0, 400.0),
+    (605.0, 490.0),
+    (710.0, 540.0),
+    (840.0, 538.0),
+    (935.0, 455.0),
+    (925.0, 325.0),
+    (825.0, 265.0),
+    (725.0, 225.0),
+    (640.0, 130.0),
+    (520.0, 65.0),
+    (395.0, 90.0),
+    (310.0, 160.0),
+    (240.0, 165.0),
+    (125.0, 150.0),
+    (58.0, 205.0),
+)
+"""Of the track that all know; counter-clockwise on the picture, from the start line on."""
+
+_SAMPLES_PER_SPAN = 32
+_STRAIGHT_PX = 220.0
+"""A straight wall of this length counts as much as a turn of 1 rad when walls are shared out."""
+_MARGIN_PX = 6.0
+_TIGHTEST_PX = 62.0
+"""Random tracks keep clear of the picture's edge, and turn no tighter than this radius."""
+
+
+class Track(NamedTuple):
+    """Where the walls and gates of one track are."""
+
+    walls_px: Floats
+    """(W, 4) x1, y1, x2, y2 of each wall."""
+    gates_px: Floats
+    """(G, 4) likewise, from the left wall to the right one; gate i of G stands (i + 1/2) / G of a
+    lap behind the start line."""
+    path: Path
+    """The centre line in the map, in the direction of travel, from the start line on."""
+    start_px: tuple[float, float, float]
+    """x, y and heading (radians, clockwise from x) on the start line."""
+
+
+def to_map(points_px: Floats) -> Floats:
+    """Give the map coordinates, metres, of picture points (..., 2)."""
+    return np.stack(
+        [
+            METRES_PER_PX * points_px[..., 0],
+            METRES_PER_PX * (PICTURE_HEIGHT_PX - points_px[..., 1]),
+        ],
+        axis=-1,
+    )
+
+
+def asphalt(track: Track) -> Floats:
+    """Cover the track between its walls with one triangle a wall: corners (3 walls, 2), pixels."""
+    left, right = track.walls_px[:WALLS_PER_SIDE, :2], track.walls_px[WALLS_PER_SIDE:, :2]
+    left_m, right_m = _progress(track.path, left), _progress(track.path, right)
+    i = j = 0
+    corners: list[Floats] = []
+    while i < WALLS_PER_SIDE or j < WALLS_PER_SIDE:
+        here_left, here_right = left[i % WALLS_PER_SIDE], right[j % WALLS_PER_SIDE]
+        if j == WALLS_PER_SIDE or (i < WALLS_PER_SIDE and left_m[i + 1] <= right_m[j + 1]):
+            i += 1
+            corners += [here_left, here_right, left[i % WALLS_PER_SIDE]]
+        else:
+            j += 1
+            corners += [here_left, here_right, right[j % WALLS_PER_SIDE]]
+    return np.array(corners)
+
+
+def _progress(path: Path, corners_px: Floats) -> list[float]:
+    """Give how far along the path a wall's corners are, and the first one again a lap later."""
+    rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
+    return [0.0, *rest, path.length_m]
+
+
+@functools.cache
+def make_track(seed: int | None = None) -> Track:
+    """Build the track of a seed; None is the one that all know."""
+    if seed is None:
+        return track_through(np.array(CONTROL_POINTS_PX))
+    random = np.random.default_rng(seed)
+    while True:
+        controls = _random_controls(random)
+        if _drivable(controls):
+            return track_through(controls)
+
+
+def track_through(controls_px: Floats) -> Track:
+    """Build the track whose centre line runs through control points (N, 2)."""
+    centre = _spline(controls_px)
+    normals = _left_normals(centre)
+    walls = np.concatenate([_wall(centre + side * HALF_WIDTH_PX * normals) for side in (1.0, -1.0)])
+    along = _along(centre)
+    places = (np.arange(GATES) + 0.5) / GATES * along[-1]
+    middles = _at(centre, along, places)
+    across = _at(normals, along, places)
+    gates = np.array([_gate(*pair, walls) for pair in zip(middles, across, strict=True)])
+    corners = _at(centre, along, np.linspace(0.0, along[-1], PATH_LEGS + 1))
+    corners[-1] = corners[0]
+    path = closed_path(to_map(corners))
+    toward = controls_px[1] - controls_px[-1]
+    start_x, start_y = controls_px[0].tolist()
+    return Track(walls, gates, path, (start_x, start_y, math.atan2(toward[1], toward[0])))
+
+
+def _spline(controls: Floats) -> Floats:
+    """Sample the closed Catmull-Rom spline through (N, 2) points; the last sample is the first.
+
+    E. Catmull and R. Rom, "A class of local interpolating splines", 1974.
+    """
+    t = np.arange(_SAMPLES_PER_SPAN)[:, None] / _SAMPLES_PER_SPAN
+    spans = []
+    for i in range(len(controls)):
+        before, start, end, after = (controls[(i + k) % len(controls)] for k in (-1, 0, 1, 2))
+        spans.append(
+            start
+            + 0.5 * t * (end - before)
+            + 0.5 * t**2 * (2.0 * before - 5.0 * start + 4.0 * end - after)
+            + 0.5 * t**3 * (3.0 * start - before - 3.0 * end + after)
+        )
+    return np.concatenate([*spans, controls[:1]])
+
+
+def _tangents(centre: Floats) -> Floats:
+    """Give the unit tangents (M, 2) of a closed line whose last point is the first."""
+    around = np.concatenate([centre[-2:-1], centre, centre[1:2]])
+    chords = around[2:] - around[:-2]
+    tangents: Floats = chords / np.hypot(chords[:, 0], chords[:, 1])[:, None]
+    return tangents
+
+
+def _left_normals(centre: Floats) -> Floats:
+    """Give the unit vectors to the left, as a driver sees it on a picture whose y points down."""
+    tangents = _tangents(centre)
+    return np.column_stack([tangents[:, 1], -tangents[:, 0]])
+
+
+def _along(line: Floats) -> Floats:
+    """Give the distance of each point from the first, along the line."""
+    steps = np.diff(line, axis=0)
+    return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+
+
+def _at(values: Floats, along: Floats, places: Floats) -> Floats:
+    """Interpolate values (M, 2), known at distances `along`, at other distances."""
+    return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
+
+
+def _wall(line: Floats) -> Floats:
+    """Replace a closed line by `WALLS_PER_SIDE` straight walls (.., 4), shorter where it bends."""
+    tangents = _tangents(line)
+    yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
+    bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(yaw)))])
+    measure = bend + _along(line) / _STRAIGHT_PX
+    corners = _at(line, measure, np.linspace(0.0, measure[-1], WALLS_PER_SIDE + 1))
+    corners[-1] = corners[0]
+    return np.concatenate([corners[:-1], corners[1:]], axis=1)
+
+
+def _gate(middle: Floats, normal: Floats, walls: Floats) -> Floats:
+    """Reach from a point of the centre line to the walls on both sides."""
+    ends = [middle + side * _reach(middle, side * normal, walls) * normal for side in (1.0, -1.0)]
+    return np.concatenate(ends)
+
+
+def _reach(start: Floats, direction: Floats, walls: Floats) -> float:
+    """Give the distance to the nearest wall in a direction, pixels."""
+    edge = walls[:, 2:] - walls[:, :2]
+    to_wall = walls[:, :2] - start
+    cross = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
+    # Parallel walls are never met.
+    cross[cross == 0.0] = math.inf
+    distance = (to_wall[:, 0] * edge[:, 1] - to_wall[:, 1] * edge[:, 0]) / cross
+    share = (to_wall[:, 0] * direction[1] - to_wall[:, 1] * direction[0]) / cross
+    met = (distance > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return float(distance[met].min())
+
+
+def _random_controls(random: np.random.Generator) -> Floats:
+    """Draw control points around the picture's middle, counter-clockwise from the left."""
+    count = int(random.integers(11, 16))
+    angles = math.pi - (np.arange(count) + random.uniform(-0.25, 0.25, count)) * (
+        2 * math.pi / count
+    )
+    radii = random.uniform(0.45, 1.0, count)
+    half = np.array([PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX]) / 2
+    room = half - HALF_WIDTH_PX - _MARGIN_PX
+    away: Floats = radii[:, None] * room * np.column_stack([np.cos(angles), np.sin(angles)])
+    return half + away
+
+
+def _drivable(controls: Floats) -> bool:
+    """Say whether a track through these points is on the picture, wide and not too tight."""
+    centre = _spline(controls)
+    room = HALF_WIDTH_PX + _MARGIN_PX
+    limits = np.array([PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX]) - room
+    if (centre < room).any() or (centre > limits).any():
+        return False
+    tangents = _tangents(centre)
+    turns = np.abs(np.diff(np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))))
+    steps = np.diff(_along(centre))
+    if (turns > steps / _TIGHTEST_PX).any():
+        return False
+    return _apart(centre)
+
+
+def _apart(centre: Floats) -> bool:
+    """Say whether parts of the line that are far apart along it are so across, too."""
+    along = _along(centre)
+    places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
+    points = _at(centre, along, places)
+    for i, j in itertools.combinations(range(len(points)), 2):
+        between = min(places[j] - places[i], along[-1] - places[j] + places[i])
+        distance = math.hypot(*(points[i] - points[j]))
+        if between > 4.0 * HALF_WIDTH_PX and distance < 2.0 * (HALF_WIDTH_PX + _MARGIN_PX):
+            return False
+    return True

@@ -1,0 +1,1 @@
+"""What the sims share: single and batched environments, fleets, seeded draws."""

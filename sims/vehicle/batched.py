@@ -1,0 +1,241 @@
+"""The batched environments: N vehicles in one array step, as Gymnasium's vector environments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.sims.vehicle.arguments import check_actions, check_name
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+
+Bools = NDArray[np.bool_]
+
+
+class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
+    """N vehicles of one sim, stepped together.
+
+    What vehicle i does is what a single environment of the sim does, seeded with `seed + i` and
+    wrapped in a TimeLimit: bit for bit the same observations, rewards, ends and infos. Infos have
+    Gymnasium's vector format: an array for each key, and a mask `_key` of those that have it.
+
+    `reset` takes the options of the sim's single environment for all vehicles; a `pose` of shape
+    (N, K) gives each its own. With `reset_mask`, (N,) bools, only some are reset.
+
+    The autoreset mode is one of Gymnasium's: `NextStep` resets in the step after an end and ignores
+    the action, `SameStep` at once, with the last observation in `final_obs` and the info in
+    `final_info`; `Disabled` leaves it to the caller, by a `reset_mask`.
+    """
+
+    fleet_type: ClassVar[type[Fleet]]
+    render_mode = None
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **kwargs: Any,
+    ) -> None:
+        """Make N vehicles.
+
+        Args:
+            num_envs: N, at least 1.
+            max_episode_steps: an episode is truncated after so many.
+            autoreset_mode: when an ended episode makes place for the next.
+            **kwargs: arguments of the sim's single environment; none of them draws pictures.
+
+        Raises:
+            UnknownNameError: an argument has a value that is not in its list.
+            UsageError: a number is outside its range.
+        """
+        if kwargs.pop("render_mode", None) is not None:
+            raise UsageError("batched sims draw no pictures: make a single one with render_mode")
+        _check_count("num_envs", num_envs)
+        if max_episode_steps is not None:
+            _check_count("max_episode_steps", max_episode_steps)
+        self.num_envs = num_envs
+        self.autoreset_mode = _mode_of(autoreset_mode)
+        self.fleet = self.fleet_type(num_envs, **kwargs)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        self._take_spaces(self.fleet)
+        self._truncates = np.array(self.fleet.truncates)
+        self._some_truncate = bool(self._truncates.any())
+        # Whoever goes on has none.
+        self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
+        self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._ended = np.ones(num_envs, dtype=np.bool_)
+        self._is_started = False
+
+    def _take_spaces(self, fleet: Fleet) -> None:
+        """Have the fleet's names and spaces, for one and for all."""
+        self.step_duration_s = fleet.step_duration_s
+        self.action_meanings = fleet.action_meanings
+        self.observation_names = fleet.observation_names
+        self.single_observation_space = fleet.observation_space
+        self.single_action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes.
+
+        Args:
+            seed: of the first vehicle, the others' counting on; or one for each; None goes on with
+                the random numbers as they are.
+            options: see above.
+
+        Raises:
+            UsageError: there is not one seed for each, or an option is unknown or malformed.
+        """
+        others = dict(options or {})
+        chosen = _mask_of(others.pop("reset_mask", None), self.num_envs)
+        seeds = _seeds_of(seed, self.num_envs)
+        starts = _starts_of(others, self.num_envs)
+        for i in np.flatnonzero(chosen).tolist():
+            if seeds[i] is not None:
+                self._randoms[i] = seeding.np_random(seeds[i])[0]
+            self.fleet.begin(i, self._randoms[i], starts[i])
+        self._steps[chosen], self._ended[chosen] = 0, False
+        self._is_started = True
+        return self.fleet.observations(), self._told(chosen, np.zeros_like(chosen))
+
+    def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Bools, Bools, dict[str, Any]]:
+        """Take one step with each vehicle.
+
+        Args:
+            actions: (N,) whole numbers.
+
+        Raises:
+            UsageError: the actions are not so many valid ones; or an episode has ended and, as
+                autoreset is disabled, was not reset.
+            ResetNeeded: there was no `reset`.
+        """
+        self.fleet.actions[:] = check_actions(actions, self.num_envs, len(self.action_meanings))
+        fresh = self._check_can_step()
+        fleet = self.fleet
+        if fleet.noise.size:
+            for i in np.flatnonzero(~fresh).tolist():
+                fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
+        fleet.advance()
+        self._steps += 1
+        # These were at their end already: their step is a reset.
+        self._begin_all(np.flatnonzero(fresh))
+        ended_itself = fleet.ends != GOING_ON
+        terminated, truncated = ended_itself, self._steps >= self._max_steps
+        if self._some_truncate:
+            cut = self._truncates[fleet.ends]
+            terminated, truncated = ended_itself & ~cut, cut | truncated
+        rewards = fleet.rewards.copy()
+        self._ended = terminated | truncated
+        infos = self._infos(ended_itself)
+        return fleet.observations(), rewards, terminated, truncated, infos
+
+    def places(self) -> NDArray[np.float64]:
+        """Give where all vehicles are, (N, 2) x and y in the map, metres."""
+        return self.fleet.places()
+
+    def _check_can_step(self) -> Bools:
+        """Give which episodes are at their end, and to be reset in this step."""
+        if not self._is_started:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
+            raise UsageError(
+                f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
+                " disabled: reset(options={'reset_mask': terminated | truncated}) first"
+            )
+        return self._ended.copy()
+
+    def _begin_all(self, chosen: NDArray[np.int64]) -> None:
+        if len(chosen):
+            self.fleet.begin_all(chosen, self._randoms)
+            self._steps[chosen], self._ended[chosen] = 0, False
+
+    def _infos(self, ended_itself: Bools) -> dict[str, Any]:
+        """Give the infos of a step; in mode `SameStep`, reset what has ended."""
+        ended = self._ended.copy()
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
+            return self._told(np.ones_like(ended), ended_itself)
+        last = np.full(self.num_envs, None, dtype=object)
+        final = self._told(ended, ended_itself)
+        chosen = np.flatnonzero(ended)
+        for i in chosen.tolist():
+            last[i] = self.fleet.observation(i)
+        self._begin_all(chosen)
+        return {
+            "final_obs": last,
+            "_final_obs": ended,
+            "final_info": final,
+            "_final_info": ended.copy(),
+            **self._told(np.ones_like(ended), np.zeros_like(ended)),
+        }
+
+    def _told(self, chosen: Bools, ended_itself: Bools) -> dict[str, Any]:
+        """Give the infos of some vehicles, with the reasons of those that ended by themselves."""
+        infos: dict[str, Any] = {}
+        are_all = chosen.all()
+        for key, values in self.fleet.infos().items():
+            infos[key] = values if are_all else np.where(chosen, values, 0)
+            infos[f"_{key}"] = chosen.copy()
+        if ended_itself.any():
+            infos["reason"] = self._reasons[self.fleet.ends]
+            infos["_reason"] = ended_itself.copy()
+        return infos
+
+
+def _check_count(argument: str, value: object) -> None:
+    if not isinstance(value, int | np.integer) or value < 1:
+        raise UsageError(f"{argument} is a whole number of 1 or more, not {value!r}")
+
+
+def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
+    if not isinstance(mode, AutoresetMode):
+        check_name("autoreset_mode", mode, [known.value for known in AutoresetMode])
+    return AutoresetMode(mode)
+
+
+def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """Give each vehicle its seed."""
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + i for i in range(count)]
+    seeds = list(seed)
+    if len(seeds) != count:
+        raise UsageError(f"{len(seeds)} seeds for {count} environments: give one for each")
+    return seeds
+
+
+def _mask_of(mask: Any, count: int) -> Bools:
+    """Give which vehicles to reset: all, if there is no mask."""
+    if mask is None:
+        return np.ones(count, dtype=np.bool_)
+    chosen = np.asarray(mask)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
+        raise UsageError(f"reset_mask is an array of {count} bools, one of them true; not {mask!r}")
+    return chosen
+
+
+def _starts_of(options: dict[str, Any], count: int) -> list[dict[str, Any] | None]:
+    """Give each vehicle its options: the same to all, but for a pose of shape (N, K)."""
+    poses: Any = options.get("pose")
+    if np.ndim(poses) != 2:
+        return [options] * count
+    if len(poses) != count:
+        raise UsageError(f"{len(poses)} poses for {count} environments: give one, or one for each")
+    return [{**options, "pose": pose} for pose in poses]

@@ -1,0 +1,142 @@
+"""The single environments: one vehicle of a fleet, and what viewers show of it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import deque
+from operator import index
+from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.sims.vehicle.arguments import check_action, check_name
+from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+
+RenderMode = Literal["human", "rgb_array"]
+RENDER_MODES = ("human", "rgb_array")
+
+
+class View(Protocol):
+    """What draws a sim."""
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+
+
+AnyFleet = TypeVar("AnyFleet", bound=Fleet)
+AnyView = TypeVar("AnyView", bound=View)
+
+
+class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
+    """An environment of one vehicle: seeds, steps, ends and pictures, the same for all sims."""
+
+    trail_length: int = 40
+    success_reasons: ClassVar[tuple[str, ...]]
+    """Ends that are what one hopes for; `time_limit` is that of the TimeLimit, too."""
+
+    def __init__(self, fleet: AnyFleet, render_mode: RenderMode | None) -> None:
+        """Take over a fleet of one.
+
+        Raises:
+            UnknownNameError: there is no such render mode.
+        """
+        check_name("render_mode", render_mode, (None, *RENDER_MODES))
+        self.fleet = fleet
+        self.render_mode = self._render_mode = render_mode
+        self.step_duration_s = fleet.step_duration_s
+        self.action_meanings = fleet.action_meanings
+        self.observation_names = fleet.observation_names
+        self.action_space = spaces.Discrete(len(fleet.action_meanings))
+        self.observation_space = fleet.observation_space
+        self._noise_size = fleet.noise.shape[1]
+        # Looked up in each step.
+        self._step_one = fleet.step_one
+        self._n_actions = len(fleet.action_meanings)
+        self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
+        self._is_watched = render_mode == "human"
+        self._view: AnyView | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; see "Starting State".
+
+        Raises:
+            UsageError: `options` has an unknown key, or a pose that cannot be started from.
+        """
+        if seed is not None:
+            super().reset(seed=seed)
+        self.fleet.begin(0, self.np_random, options)
+        self._trail.clear()
+        if self._is_watched:
+            self._watch()
+        return self.fleet.observation(0), self.fleet.info(0)
+
+    def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drive or fly on for one decision.
+
+        Raises:
+            UsageError: there is no such action.
+        """
+        try:
+            number = index(action)
+        except TypeError:
+            number = -1
+        if not 0 <= number < self._n_actions:
+            # It says what is wrong; a call in each step would take longer than this.
+            number = check_action(action, self._n_actions)
+        if self._noise_size:
+            self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
+        observation, reward, end, info = self._step_one(number)
+        if self._is_watched:
+            self._watch()
+        if end == GOING_ON:
+            return observation, reward, False, False, info
+        info["reason"] = self.fleet.reasons[end]
+        truncated = self.fleet.truncates[end]
+        return observation, reward, not truncated, truncated, info
+
+    @property
+    @abstractmethod
+    def place(self) -> tuple[float, ...]:
+        """Where the vehicle is now, for its trail."""
+
+    @property
+    def trail(self) -> list[tuple[float, ...]]:
+        """The vehicle's last places, at least one: from when they were first asked for."""
+        self._is_watched = True
+        if not self._trail:
+            self._trail.append(self.place)
+        return list(self._trail)
+
+    @abstractmethod
+    def _open_view(self, render_mode: RenderMode) -> AnyView:
+        """Make what draws the sim; the only place where pygame is imported."""
+
+    @abstractmethod
+    def _draw(self, view: AnyView) -> NDArray[np.uint8]:
+        """Draw the vehicle where it is: (H, W, 3)."""
+
+    def _watch(self) -> None:
+        """Take note of where the vehicle is, and show it."""
+        self._trail.append(self.place)
+        if self.render_mode == "human":
+            self.render()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the sim: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
+        if self._render_mode is None:
+            return None
+        if self._view is None:
+            self._view = self._open_view(self._render_mode)
+        image = self._draw(self._view)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None

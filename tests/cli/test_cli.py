@@ -1,0 +1,449 @@
+"""The commands as a user types them: what they print, what they write, how they exit."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.recorder.columns.reader import McapReader
+from tests.support.paths import GOLDEN
+
+LANE_LOG = GOLDEN / "lane-1.mcap"
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def fails(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
+    """Run a command that must fail with one line on stderr; returns that line."""
+    assert run(arguments) == code
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1, f"not one line: {err!r}"
+    assert err.startswith("mcaprl: ")
+    assert "Traceback" not in out + err
+    return err
+
+
+def as_json(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> Any:
+    assert run(arguments) == code
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture
+def cartpole() -> Path:
+    path = Path("cartpole.mcap")
+    assert (
+        run(["record", "CartPole-v1", "--policy", "random", "--episodes", "4", "--out", str(path)])
+        == 0
+    )
+    return path
+
+
+def test_record_info_check(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    facts = as_json(capsys, "info", str(cartpole), "--json")
+    data = mcaprl.open(cartpole)
+    assert facts["env_id"] == "CartPole-v1"
+    assert (facts["episodes"], facts["steps"]) == (4, len(data))
+    assert facts["mean_return"] == data.statistics.mean_return
+    assert facts["size_bytes"] == cartpole.stat().st_size
+    assert facts["duration_s"] == pytest.approx(len(data) * 0.02)
+    assert facts["ends"] == {"terminated": 4}
+    assert facts["problems"] == []
+    assert {"observations", "actions"} <= set(facts)
+    assert as_json(capsys, "check", str(cartpole), "--json") == {"ok": True, "problems": []}
+    assert run(["info", str(cartpole)]) == 0
+    assert "CartPole-v1" in capsys.readouterr().out
+    assert (data.behavior_probs == 0.5).all()
+
+
+def test_info_report_and_strict(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["info", str(cartpole), "--report", "report", "--strict"]) == 0
+    assert Path("report/dataset.png").read_bytes()[:4] == b"\x89PNG"
+    assert json.loads(Path("report/dataset.json").read_text())["episodes"] == 4
+    cut = cartpole.read_bytes()
+    Path("cut.mcap").write_bytes(cut[: -len(cut) // 3])
+    capsys.readouterr()
+    facts = as_json(capsys, "info", "cut.mcap", "--strict", "--json", code=1)
+    assert "was cut off" in facts["problems"][0]
+
+
+def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = ["--updates", "30", "--batch-size", "16", "--hidden", "8", "--seeds", "2"]
+    assert run(["train-offline", str(cartpole), "--algo", "bc", "--out", "bc", *few]) == 0
+    capsys.readouterr()
+    ask = ["evaluate", "random", "bc", "--data", str(cartpole), "--updates", "5"]
+    result = as_json(capsys, *ask, "--json")
+    assert result["episodes"] == 4
+    assert {estimate["policy"] for estimate in result["estimates"]} == {
+        "random",
+        "bc/seed-0",
+        "bc/seed-1",
+    }
+    for estimate in result["estimates"]:
+        assert estimate.keys() == {
+            "policy",
+            "estimator",
+            "value",
+            "interval",
+            "effective_sample_size",
+            "verdict",
+        }
+        # Four episodes are too few to say anything.
+        assert estimate["verdict"].startswith("refused: ")
+    random = {e["estimator"]: e for e in result["estimates"] if e["policy"] == "random"}
+    assert random["PDIS"]["value"] == pytest.approx(result["behavior_return"]), "random acted"
+    assert result["behavior_calibration"]["text"] == "2.00 +- 0.00 of 2 actions"
+    assert result["coverage"]["random"] == pytest.approx(0.5)
+    assert result["ranking"]["trusted"] is False
+    assert run(ask) == 0
+    assert "do not choose by this order" in capsys.readouterr().out
+    line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
+    assert "pilot has no network to ask about a log" in line
+
+
+def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "CartPole-v1", "--policy=random", "--steps=1", "--out=one.mcap"]) == 0
+    assert "one.mcap: 1 episode, 1 step, mean return 1.00" in capsys.readouterr().out
+    assert run(["recover", "one.mcap", "two.mcap"]) == 0
+    assert "two.mcap: 1 episode, 5 messages" in capsys.readouterr().out
+
+
+def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        arguments = ["--policy", "pilot", "--epsilon", "0.3", "--steps", "50", "--seed", "3"]
+        assert run(["record", "lane", *arguments, "--out", f"{name}.mcap"]) == 0
+    first, second = mcaprl.open("a.mcap"), mcaprl.open("b.mcap")
+    assert len(first) == 50
+    assert first.fingerprint == second.fingerprint
+    assert first.episodes[0].policy == "pilot"
+    assert first.episodes[0].epsilon == 0.3
+    own, other = 0.3 / 6 + 0.7, 0.3 / 6
+    assert set(first.behavior_probs) == {np.float32(own), np.float32(other)}
+
+
+def test_appended_and_rotated_recordings_are_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["record", "CartPole-v1", "--policy", "random", "--seed", "2"]
+    assert run([*common, "--episodes", "5", "--out", "one.mcap"]) == 0
+    expected = mcaprl.open("one.mcap").fingerprint
+    for episodes in ("3", "2"):
+        assert run([*common, "--episodes", episodes, "--out", "two.mcap", "--append"]) == 0
+    assert mcaprl.open("two.mcap").fingerprint == expected
+    for episodes in ("3", "2"):
+        arguments = ["--episodes", episodes, "--out", "parts/a.mcap", "--rotate-mb", "0.005"]
+        assert run([*common, *arguments, "--append"]) == 0
+    assert len(list(Path("parts").iterdir())) > 1
+    assert mcaprl.open("parts").fingerprint == expected
+    capsys.readouterr()
+    assert run([*common, "--episodes", "2", "--out", "x", "--append", "--envs", "2"]) == 2
+    assert "leave out one" in capsys.readouterr().err
+
+
+def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["record", "CartPole-v1", "--policy", "random", "--episodes", "5", "--seed", "2"]
+    assert run([*common, "--out", "one.mcap"]) == 0
+    assert run([*common, "--out", "shards", "--envs", "2"]) == 0
+    assert sorted(path.name for path in Path("shards").iterdir()) == [
+        "shard-00.mcap",
+        "shard-01.mcap",
+    ]
+    assert mcaprl.open("shards").fingerprint == mcaprl.open("one.mcap").fingerprint
+    assert "exists" in fails_after(capsys, 2, *common, "--out", "shards", "--envs", "2")
+    assert run([*common, "--out", "shards", "--envs", "3", "--overwrite"]) == 0
+    assert len(mcaprl.open("shards").episodes) == 5
+
+
+def test_shards_touch_nothing_when_the_request_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["--policy", "random", "--episodes", "2", "--envs", "2", "--overwrite", "--out", "d"]
+    Path("d").mkdir()
+    Path("d/shard-00.mcap").write_text("old")
+    assert "CartPole-v1" in fails_after(capsys, 2, "record", "CartPol-v1", *common)
+    common[1] = "nobody"
+    assert "unknown policy" in fails_after(capsys, 2, "record", "CartPole-v1", *common)
+    assert Path("d/shard-00.mcap").read_text() == "old"
+    Path("d/precious.mcap").write_text("mine")
+    common[1] = "random"
+    assert "precious.mcap" in fails_after(capsys, 2, "record", "CartPole-v1", *common)
+
+
+def test_names_are_no_markup(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cartpole.rename("run[red].mcap")
+    capsys.readouterr()
+    assert run(["info", "run[red].mcap"]) == 0
+    assert "run[red].mcap" in capsys.readouterr().out
+
+
+def fails_after(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
+    capsys.readouterr()
+    return fails(capsys, code, *arguments)
+
+
+def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
+    """The main job at a small size: record, train, evaluate, record the trained one."""
+    common = ["record", "lane", "--no-scene", "--out"]
+    assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
+    assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
+    small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
+    # Enough copies of the target for the horizon of gamma, or it warns.
+    small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
+    assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
+    assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
+    capsys.readouterr()
+    result = as_json(
+        capsys, "evaluate", "run", "--sim", "lane", "--episodes", "3", "--behavior", "data",
+        "--report", "report", "--record", "episodes.mcap", "--json",
+    )  # fmt: skip
+    assert result["sim"] == "lane"
+    scores = {score["policy"]: score for score in result["policies"]}
+    assert list(scores) == ["run", "pilot", "random"], "what was asked for comes first"
+    assert scores["run"]["episodes"] == 6
+    assert len(scores["run"]["returns"]) == 6
+    assert len(scores["run"]["seed_means"]) == 2
+    low, high = scores["run"]["interval"]
+    assert low <= scores["run"]["mean_return"] <= high
+    assert scores["pilot"]["normalized_score"] == 1.0
+    assert scores["random"]["normalized_score"] == 0.0
+    assert result["behavior"]["episodes"] == len(mcaprl.open("data").episodes)
+    for name in ("comparison.png", "trajectories.png", "evaluation.json"):
+        assert (Path("report") / name).stat().st_size > 500
+    recorded = mcaprl.open("episodes.mcap")
+    assert [episode.total_reward for episode in recorded.episodes] == scores["run"]["returns"]
+    assert {episode.policy for episode in recorded.episodes} == {"run/seed-0", "run/seed-1"}
+    replay = [
+        "record",
+        "lane",
+        "--policy",
+        "run/seed-1",
+        "--steps",
+        "5",
+        "--camera",
+        "--out",
+        "r.mcap",
+    ]
+    assert run(replay) == 0
+    assert mcaprl.open("r.mcap").episodes[0].policy == "seed-1"
+    policy = mcaprl.load_policy("run")
+    assert policy.act(recorded.observations[:7]).shape == (7,)
+
+
+def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["record", "lane", "--steps", "200", "--no-scene", "--out", "d.mcap"]) == 0
+    train = [
+        "train-offline",
+        "d.mcap",
+        "--algo",
+        "bc",
+        "--out",
+        "run",
+        "--updates",
+        "20",
+        "--hidden",
+        "8",
+    ]
+    assert run(train) == 0
+    assert "resume" in fails_after(capsys, 2, *train)
+    capsys.readouterr()
+    assert run(["train-offline", "d.mcap", "--out", "run", "--resume"]) == 0, (
+        "settings are the run's"
+    )
+    assert "0 updates" in capsys.readouterr().out
+    more = ["--resume", "--updates", "30"]
+    assert "has updates 20" in fails_after(capsys, 1, *train, *more)
+    Path("run/config.json").write_text("[]")
+    assert "no JSON object" in fails_after(capsys, 1, *train, "--resume")
+
+
+def test_check_goes_on_behind_a_missing_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["check", "missing.mcap", str(LANE_LOG)]) == 1
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    result = as_json(capsys, "check", "missing.mcap", str(LANE_LOG), "--json", code=1)
+    assert [problem["file"] for problem in result["problems"]] == ["missing.mcap"]
+
+
+def test_logs_are_not_overwritten_by_what_is_no_log(
+    cartpole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = cartpole.read_bytes()
+    for source in ("lane", str(cartpole)):
+        line = fails_after(capsys, 2, "layout", source, "--out", str(cartpole), "--overwrite")
+        assert "a layout is JSON" in line
+    evaluate = ["evaluate", "random", "--sim", "CartPole-v1", "--episodes", "1", "--overwrite"]
+    both = ["--behavior", str(cartpole), "--record", str(cartpole)]
+    assert "record the episodes elsewhere" in fails_after(capsys, 2, *evaluate, *both)
+    assert cartpole.read_bytes() == before
+    line = fails_after(capsys, 2, "evaluate", "pilot", "--sim", "lane", "--behavior", str(cartpole))
+    assert "is of CartPole-v1, not of mcaprl/LaneKeeping-v0" in line
+
+
+def test_policies_of_one_name_keep_their_paths(capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        run(["record", "CartPole-v1", "--policy", "random", "--steps", "60", "--out", "d.mcap"])
+        == 0
+    )
+    for folder in ("a/bc", "b/bc"):
+        small = ["--algo", "bc", "--updates", "3", "--hidden", "4", "--out", folder]
+        assert run(["train-offline", "d.mcap", *small]) == 0
+    capsys.readouterr()
+    evaluate = ["evaluate", "a/bc", "b/bc", "a/bc", "--sim", "CartPole-v1", "--episodes", "1"]
+    result = as_json(capsys, *evaluate, "--json")
+    assert [score["policy"] for score in result["policies"]] == ["a/bc", "b/bc", "random"]
+    assert result["policies"][0]["normalized_score"] is None, "CartPole has no pilot"
+
+
+def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["layout", str(LANE_LOG), "--out", "a.json"]) == 0
+    attached = McapReader(LANE_LOG).attachment("foxglove-layout.json")
+    assert attached is not None
+    assert json.loads(Path("a.json").read_text()) == json.loads(attached)
+    assert run(["layout", "lane", "--out", "b.json"]) == 0
+    assert "3D!scene" in json.loads(Path("b.json").read_text())["configById"]
+    assert run(["layout", "CartPole-v1", "--out", "c.json"]) == 0
+    assert "exists" in fails_after(capsys, 2, "layout", "lane", "--out", "c.json")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "told"),
+    [
+        (["record", "lan", "--steps", "5", "--out", "x"], 2, "did you mean lane?"),
+        (["record", "CartPol-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
+        (["record", "a:b:c", "--steps", "5", "--out", "x"], 2, "a:b:c"),
+        (["record", "lane", "--policy", "pilt", "--steps", "5", "--out", "x"], 2, "mean pilot?"),
+        (["record", "CartPole-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
+        (["record", "lane", "--out", "x"], 2, "--episodes N or --steps N"),
+        (["record", "lane", "--steps", "5"], 2, "Missing option '--out'"),
+        (["record", "lane", "--steps", "-1", "--out", "x"], 2, "--steps"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "2"], 2, "--epsilon"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--rules", "odd"], 2, "classic-code"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--observation", "sound"], 2, "depth, "),
+        (["record", "lane", "--steps", "5", "--out", "taken/x.mcap"], 1, "cannot write taken/"),
+        (["record", "lane", "--steps", "5", "--out", "taken"], 2, "taken exists"),
+        (["info", "nothing.mcap"], 1, "no such file"),
+        (["info", "taken"], 1, "no MCAP file"),
+        (["info", "empty.mcap"], 1, "it is empty"),
+        (["check", "nothing.mcap"], 1, "no such file"),
+        (["train-offline", "taken", "--out", "run"], 1, "no MCAP file"),
+        (["train-offline", str(LANE_LOG), "--out", "taken"], 2, "taken exists"),
+        (["train-offline", str(LANE_LOG), "--out", "taken/r"], 1, "cannot write taken/r"),
+        (["evaluate", "pilot", "--sim", "lane", "--episodes=1", "--report", "taken"], 1, "cann"),
+        (["info", str(LANE_LOG), "--report", "taken"], 1, "cannot write taken/"),
+        (["train-offline", str(LANE_LOG), "--out", "r", "--algo", "cqk"], 2, "did you mean cql"),
+        (
+            ["train-offline", str(LANE_LOG), "--out", "r", "--algo", "bc", "--alpha", "1"],
+            2,
+            "has --",
+        ),
+        (["train-offline", str(LANE_LOG), "--out", "r", "--hidden", "a,b"], 2, "256,256"),
+        (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
+        (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
+        (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
+        (["evaluate", "pilot"], 2, "--sim SIM or --data DATA, one of the two"),
+        (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "one of the two"),
+        (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma is of use"),
+        (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record is of use"),
+        (["evaluate", "random", "--data", "nothing"], 1, "no such file"),
+        (["layout", "lane"], 2, "--out"),
+        (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "nan"], 2, "0 to 1"),
+        (["record", "lane", "--steps", "5", "--out", "x.mcap", "--envs", "2"], 2, "into a folder"),
+        (["layout", "nothing.mcap", "--out", "x.json"], 1, "cannot read nothing.mcap"),
+        (["info", "x" * 300], 1, "name too long"),
+        (["evaluate", "pilot", "--sim", "lane", "--behavior", "nothing"], 1, "no such file"),
+        (["recrod"], 2, "No such command 'recrod'"),
+        (["info", "--jsn", str(LANE_LOG)], 2, "--json"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, told: str
+) -> None:
+    Path("taken").write_text("not a log")
+    Path("empty.mcap").touch()
+    assert told in fails(capsys, code, *arguments)
+    assert Path("taken").read_text() == "not a log"
+
+
+def test_spaces_that_differ(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    both = [str(cartpole), str(LANE_LOG)]
+    assert "do not fit together" in fails_after(capsys, 1, "info", *both)
+    assert "do not fit together" in fails_after(capsys, 1, "train-offline", *both, "--out", "r")
+    small = ["--updates", "5", "--hidden", "8", "--algo", "bc"]
+    assert run(["train-offline", str(cartpole), "--out", "run", *small]) == 0
+    line = fails_after(capsys, 1, "evaluate", "run", "--sim", "lane")
+    assert "was trained on observation_space" in line
+    assert not Path("r").exists()
+
+
+def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    real_find = importlib.import_module
+
+    def without(name: str, *rest: Any) -> Any:
+        if name.split(".")[0] in ("matplotlib", "numba"):
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+        return real_find(name, *rest)
+
+    monkeypatch.setattr("mcaprl.errors.importlib.import_module", without)
+    line = fails(capsys, 2, "record", "lane", "--steps", "5", "--out", "x.mcap")
+    assert "numba is not installed: pip install 'mcaprl[sims]'" in line
+
+
+def test_check_tells_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> None:
+    broken = bytearray(LANE_LOG.read_bytes())
+    broken[len(broken) // 2] ^= 1
+    Path("broken.mcap").write_bytes(broken)
+    result = as_json(capsys, "check", "broken.mcap", str(LANE_LOG), "--json", code=1)
+    assert result["ok"] is False
+    assert all(set(problem) == {"file", "what", "where", "next"} for problem in result["problems"])
+    assert {problem["file"] for problem in result["problems"]} == {"broken.mcap"}
+    assert run(["check", "broken.mcap"]) == 1
+    assert "broken.mcap" in capsys.readouterr().out
+
+
+def test_golden_log_reads_as_ever(capsys: pytest.CaptureFixture[str]) -> None:
+    data = mcaprl.open(LANE_LOG)
+    assert (len(data), len(data.episodes)) == (60, 2)
+    assert data.fingerprint == (LANE_LOG.with_suffix(".sha256").read_text().strip())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_recording_is_readable(number: signal.Signals) -> None:
+    command = [sys.executable, "-m", "mcaprl.cli", "record", "lane", "--episodes", "100000"]
+    process = subprocess.Popen(
+        [*command, "--out", "stopped.mcap"],
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in the background may ignore SIGINT, and its children would, too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    deadline = time.monotonic() + 120
+    path = Path("stopped.mcap")
+    while not (path.exists() and path.stat().st_size > 200_000):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err.strip() == "mcaprl: interrupted; what was finished is kept"
+    assert run(["check", "stopped.mcap"]) == 0
+    assert len(mcaprl.open(path).episodes) >= 1
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--help"]) == 0
+    listed = capsys.readouterr().out
+    for command in ("record", "train-offline", "evaluate", "info", "check", "layout"):
+        assert command in listed
+        assert run([command, "--help"]) == 0
+    assert "--alpha" in capsys.readouterr().out or run(["train-offline", "--help"]) == 0

@@ -1,0 +1,360 @@
+"""Each algorithm on tasks small enough to solve by value iteration."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mcaprl.offline.algorithms.bc import BCConfig
+from mcaprl.offline.algorithms.bcq import BCQ, BCQConfig
+from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.dqn import DQN, DoubleDQN, DoubleDQNConfig, DQNConfig
+from mcaprl.offline.algorithms.iql import IQL, IQLConfig
+from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
+from mcaprl.offline.algorithms.registry import ALGORITHMS
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.policy import Scores
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.support.offline_tasks import (
+    ACTION_SPACE,
+    GAMMA,
+    corridor,
+    inner_observations,
+    optimal_values,
+)
+
+SMALL: dict[str, Any] = {"updates": 600, "batch_size": 64, "learning_rate": 5e-3, "hidden": (32,)}
+SMALL_Q: dict[str, Any] = {**SMALL, "gamma": GAMMA, "target_interval": 20}
+ALL = list(ALGORITHMS.values())
+
+
+def learner_of(config: TrainingConfig, dataset: Dataset, *seeds: int) -> Learner:
+    learner_type = next(each for each in ALL if type(config) is each.config_type)
+    return learner_type(
+        config, TransitionBuffer.from_dataset(dataset, config.packing), seeds or (0,)
+    )
+
+
+def trained(learner: Learner) -> Learner:
+    torch.set_num_threads(1)
+    while learner.step < learner.config.updates:
+        learner.update()
+    return learner
+
+
+def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q") -> Tensor:
+    """(B, A) of the first seed."""
+    network = learner.network(name, learner.seeds[0])
+    with torch.no_grad():
+        found = network(Observations(torch.from_numpy(observations)))
+    values: Tensor = found.mean(2) if found.ndim == 3 else found
+    return values
+
+
+def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
+    """The actions, counted from 0, that the first seed's policy takes."""
+    networks = {name: learner.network(name, learner.seeds[0]) for name in learner.policy_models}
+    scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
+    found: list[int] = scores(Observations(torch.from_numpy(observations))).argmax(1).tolist()
+    return found
+
+
+def lone_state(*, terminated: bool, gamma: float, reward: float = 1.0, **settings: Any) -> float:
+    """Q of a state that pays `reward` and leads to itself, learned by DQN."""
+    observation = np.ones((8, 1), np.float32)
+    dataset = Dataset.from_arrays(
+        observations=observation,
+        actions=np.zeros(8, np.int64),
+        rewards=np.full(8, reward),
+        terminated=np.full(8, terminated),
+        truncated=np.full(8, not terminated),
+        next_observations=observation,
+    )
+    config = DQNConfig(**{**SMALL_Q, "gamma": gamma, **settings})
+    return float(outputs(trained(learner_of(config, dataset)), observation[:1])[0, 0])
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        DQNConfig(**SMALL_Q),
+        DQNConfig(**SMALL_Q, dueling=True),
+        DQNConfig(**SMALL_Q, n_quantiles=5),
+        DoubleDQNConfig(**SMALL_Q),
+        DoubleDQNConfig(**SMALL_Q, n_quantiles=5),
+        DoubleDQNConfig(**SMALL_Q, layer_norm=True, normalize=True),
+        CQLConfig(**SMALL_Q, alpha=0.0),
+        BCQConfig(**SMALL_Q),
+    ],
+)
+def test_values_are_those_of_value_iteration(config: Any) -> None:
+    learner = trained(learner_of(config, corridor(), 0, 1))
+    encoder = learner.buffer.encoder
+    for seed in learner.seeds:
+        with torch.no_grad():
+            found = learner.network("q", seed)(encoder.encode(inner_observations()))
+        values = found.mean(2) if found.ndim == 3 else found
+        np.testing.assert_allclose(values, optimal_values(), atol=0.03)
+
+
+def test_the_truth_of_the_corridor() -> None:
+    # Written out: right is worth 1, .9, .81 counted from the far exit; the near exit pays .3.
+    np.testing.assert_allclose(optimal_values(), [[0.3, 0.81], [0.729, 0.9], [0.81, 1.0]])
+
+
+def test_termination_stops_the_bootstrap_and_truncation_does_not() -> None:
+    assert lone_state(terminated=True, gamma=0.5) == pytest.approx(1.0, abs=0.01)
+    assert lone_state(terminated=False, gamma=0.5) == pytest.approx(2.0, abs=0.01)
+
+
+def test_with_gamma_zero_only_the_reward_counts() -> None:
+    assert lone_state(terminated=False, gamma=0.0, reward=-3.0) == pytest.approx(-3.0, abs=0.01)
+
+
+def test_quantiles_know_termination_too() -> None:
+    settings = {"gamma": 0.5, "n_quantiles": 4}
+    assert lone_state(terminated=True, **settings) == pytest.approx(1.0, abs=0.01)
+    assert lone_state(terminated=False, **settings) == pytest.approx(2.0, abs=0.02)
+
+
+def test_n_steps_carry_a_reward_over_the_corridor_at_once() -> None:
+    # One episode from cell 1 to the far exit; with one copy of the target, only returns tell.
+    walk = corridor_walk()
+    config = DQNConfig(**{**SMALL_Q, "n_steps": 3, "target_interval": 600})
+    values = outputs(trained(learner_of(config, walk)), inner_observations())[:, 1]
+    torch.testing.assert_close(values, torch.tensor([0.81, 0.9, 1.0]), rtol=0, atol=0.02)
+
+
+def corridor_walk() -> Dataset:
+    cells = np.eye(5, dtype=np.float32)
+    return Dataset.from_arrays(
+        observations=cells[1:4],
+        actions=np.full(3, ACTION_SPACE.start + 1),
+        rewards=[0, 0, 1],
+        terminated=[False, False, True],
+        truncated=[False] * 3,
+        next_observations=cells[2:5],
+        action_space=ACTION_SPACE,
+    )
+
+
+@pytest.mark.parametrize("learner_type", [DQN, DoubleDQN, BCQ, IQL])
+@pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
+def test_looking_up_the_target_is_the_same_as_computing_it(
+    learner_type: type[Learner], seeds: tuple[int, ...]
+) -> None:
+    # With as many updates between copies as there are rows or more, a table of targets is kept.
+    learner = learner_of(learner_type.config_type(**SMALL_Q), corridor(), *seeds)
+    for _ in range(25):
+        learner.update()
+    batch = learner.buffer.batch(
+        learner.buffer.sample_rows(64 * len(seeds), torch.Generator().manual_seed(0))
+    )
+    if isinstance(learner, IQL):
+        target, seen = learner.copies["q_twin"], batch.observations
+    else:
+        assert isinstance(learner, DQN)
+        target, seen = learner.target, batch.next_observations
+    torch.testing.assert_close(target.outputs(batch), target.model(seen))
+
+
+def test_the_target_stands_still_between_two_copies() -> None:
+    learner = learner_of(DQNConfig(**{**SMALL_Q, "target_interval": 5}), corridor())
+    assert isinstance(learner, DQN)
+    batch = learner.buffer.sample(16, torch.Generator().manual_seed(0))
+    seen = [learner.target.outputs(batch)]
+    for _ in range(10):
+        learner.update()
+        seen.append(learner.target.outputs(batch))
+    changes = [not torch.equal(before, after) for before, after in pairwise(seen)]
+    assert changes == [False, False, False, False, True] * 2
+
+
+ONLY_LEFT = {(cell, 0): 1 for cell in (1, 2, 3)}
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CQLConfig(**SMALL_Q),
+        CQLConfig(**SMALL_Q, n_quantiles=5),
+        BCQConfig(**SMALL_Q),
+        IQLConfig(**SMALL_Q),
+    ],
+)
+def test_what_the_data_never_show_is_not_done(config: Any) -> None:
+    # Nobody ever went right: whatever lies there, the log cannot tell.
+    for seed in range(3):
+        learner = trained(learner_of(config, corridor(ONLY_LEFT), seed))
+        assert best(learner, inner_observations()) == [0, 0, 0]
+
+
+def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
+    gaps = []
+    for alpha in (0.0, 0.1, 1.0):
+        learner = trained(learner_of(CQLConfig(**SMALL_Q, alpha=alpha), corridor(ONLY_LEFT)))
+        values = outputs(learner, inner_observations())
+        gaps.append(float((values[:, 0] - values[:, 1]).min()))
+    assert gaps == sorted(gaps)
+    assert gaps[2] > gaps[0] + 1
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        CQLConfig(**SMALL_Q, alpha=0.01),
+        BCQConfig(**SMALL_Q),
+        # Twice as often left: a weight of exp(10 * .3) is needed to outvote it.
+        IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0),
+    ],
+)
+def test_what_pays_is_found_where_the_data_show_both(config: Any) -> None:
+    # One in three visits goes right; imitation pulls towards left and the reward wins.
+    mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
+    assert best(trained(learner_of(config, mostly_left)), inner_observations()) == [1, 1, 1]
+    clone = trained(learner_of(BCConfig(**SMALL), mostly_left))
+    assert best(clone, inner_observations()) == [0, 0, 0]
+
+
+def test_iql_values_lie_between_the_mean_and_the_best() -> None:
+    values = []
+    for expectile in (0.5, 0.7, 0.99):
+        config = IQLConfig(**{**SMALL_Q, "updates": 1500}, expectile=expectile)
+        learner = trained(learner_of(config, corridor()))
+        values.append(outputs(learner, inner_observations()[1:2], "v").item())
+    # Both actions are logged alike. The mean is a random walk's: v1 = (.3 + .9 v2) / 2,
+    # v2 = .9 (v1 + v3) / 2, v3 = (.9 v2 + 1) / 2, so v2 = .585 / .595 / 2 = .492; the best .9.
+    assert values[0] == pytest.approx(0.45 * 1.3 / 2 / (1 - 0.45 * 0.9), abs=0.02)
+    assert values[0] < values[1] < values[2]
+    assert values[2] == pytest.approx(0.9, abs=0.05)
+
+
+def test_a_bcq_threshold_of_one_is_imitation_and_of_zero_double_dqn() -> None:
+    mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
+    found = [
+        best(
+            trained(learner_of(BCQConfig(**SMALL_Q, threshold=threshold), mostly_left)),
+            inner_observations(),
+        )
+        for threshold in (0.0, 1.0)
+    ]
+    assert found == [[1, 1, 1], [0, 0, 0]]
+
+
+def test_bc_learns_how_often_each_action_was_taken() -> None:
+    counts = {(1, 0): 3, (1, 1): 1, (2, 0): 1, (2, 1): 1, (3, 0): 1, (3, 1): 9}
+    learner = trained(learner_of(BCConfig(**{**SMALL, "batch_size": 320}), corridor(counts)))
+    right = outputs(learner, inner_observations(), "logits").softmax(dim=1)[:, 1]
+    torch.testing.assert_close(right, torch.tensor([0.25, 0.5, 0.9]), rtol=0, atol=0.05)
+
+
+def masked_corridor() -> Dataset:
+    """The corridor, in whose middle one may not go right."""
+    data = corridor(ONLY_LEFT | {(1, 1): 1, (3, 1): 1})
+    blocked: dict[str, Any] = {
+        name: {
+            "action_mask": ~((getattr(data, name)[:, 2:3] == 1) & [[False, True]]),
+            "cell": getattr(data, name),
+        }
+        for name in ("observations", "next_observations")
+    }
+    columns: dict[str, Any] = {
+        name: getattr(data, name) for name in ("actions", "rewards", "terminated", "truncated")
+    }
+    space = spaces.Dict(
+        {"action_mask": spaces.Box(0, 1, (2,), np.bool_), "cell": data.observation_space}
+    )
+    return Dataset.from_arrays(
+        **columns, **blocked, observation_space=space, action_space=ACTION_SPACE
+    )
+
+
+@pytest.mark.parametrize("config", [DQNConfig(**SMALL_Q), DoubleDQNConfig(**SMALL_Q)])
+def test_what_is_not_allowed_is_worth_nothing_to_anybody(config: Any) -> None:
+    values = outputs(trained(learner_of(config, masked_corridor())), inner_observations())
+    # From cell 1 the near exit pays .3 at once; going right leads to a cell that only leads back.
+    assert values[0].tolist() == pytest.approx([0.3, 0.9 * 0.9 * 0.3], abs=0.02)
+    assert values[1, 0].item() == pytest.approx(0.9 * 0.3, abs=0.02)
+    assert values[2].tolist() == pytest.approx([0.81 * 0.3, 1.0], abs=0.02)
+
+
+@pytest.mark.parametrize("learner_type", ALL)
+def test_the_same_seed_gives_the_same_weights_whoever_learns_beside_it(
+    learner_type: type[Learner],
+) -> None:
+    config = learner_type.config_type(**{**SMALL, "updates": 30})
+    alone = trained(learner_of(config, corridor(), 3))
+    again = trained(learner_of(config, corridor(), 3))
+    together = trained(learner_of(config, corridor(), 4, 3, 7))
+    for name, tensor in alone.state(3).items():
+        assert torch.equal(tensor, again.state(3)[name])
+        assert torch.equal(tensor, together.state(3)[name]), name
+    assert not torch.equal(
+        alone.state(3)["generator.sampler"], together.state(4)["generator.sampler"]
+    )
+
+
+@pytest.mark.parametrize("learner_type", ALL)
+def test_a_restored_learner_goes_on_bit_for_bit(learner_type: type[Learner]) -> None:
+    values: dict[str, Any] = (
+        {"target_interval": 20} if issubclass(learner_type.config_type, BootstrapConfig) else {}
+    )
+    config = learner_type.config_type(**{**SMALL, "updates": 60}, weight_decay=0.1, **values)
+    whole = learner_of(config, corridor(), 0, 1)
+    for _ in range(25):
+        whole.update()
+    saved = [{name: t.clone() for name, t in whole.state(seed).items()} for seed in (0, 1)]
+    trained(whole)
+    # Seed 1 goes on alone.
+    resumed = learner_of(config, corridor(), 1)
+    resumed.load_state(1, saved[1], 25)
+    after, expected = trained(resumed).state(1), whole.state(1)
+    assert after.keys() == expected.keys()
+    assert all(torch.equal(after[name], tensor) for name, tensor in expected.items())
+
+
+def test_weight_decay_shrinks_the_weights() -> None:
+    sizes = []
+    for weight_decay in (0.0, 1.0):
+        config = CQLConfig(**SMALL_Q, weight_decay=weight_decay)
+        learner = trained(learner_of(config, corridor()))
+        sizes.append(learner.models["q"].weights.square().sum().item())
+    assert sizes[1] < 0.9 * sizes[0]
+
+
+def test_a_loss_that_is_not_finite_is_named_and_leaves_the_weights_alone() -> None:
+    learner = learner_of(CQLConfig(**SMALL_Q), corridor(), 2, 5)
+    learner.buffer.returns[0] = torch.inf
+    before = learner.models["q"].weights.clone()
+    with pytest.raises(NotFiniteError, match="td_loss of seed 2 is inf"):
+        learner.update()
+    assert torch.equal(learner.models["q"].weights, before)
+    assert learner.step == 0
+
+
+def test_pictures_are_learned_from() -> None:
+    # The brighter of two pictures asks for action 1.
+    images: NDArray[np.uint8] = np.zeros((40, 36, 36), np.uint8)
+    images[::2] = 200
+    dataset = Dataset.from_arrays(
+        observations=images,
+        actions=np.arange(40) % 2,
+        rewards=np.ones(40),
+        terminated=np.ones(40, bool),
+        truncated=np.zeros(40, bool),
+        next_observations=images,
+    )
+    config = BCConfig(updates=30, batch_size=16, hidden=(16,))
+    learner = trained(learner_of(config, dataset, 0, 1))
+    seen = learner.buffer.encoder.encode(images[:2])
+    for seed in (0, 1):
+        assert learner.network("logits", seed)(seen).argmax(1).tolist() == [0, 1]

@@ -1,0 +1,229 @@
+"""The equations of offline learning, against numbers worked by hand and automatic derivatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import hypothesis.strategies as st
+import pytest
+import torch
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+from numpy import float32, int64
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mcaprl.offline.algorithms.cql import conservative_penalty
+from mcaprl.offline.algorithms.losses import (
+    Loss,
+    allowed_only,
+    cross_entropy,
+    double_q_learning_target,
+    expected_sarsa_target,
+    expectile_regression,
+    huber,
+    huber_regression,
+    likely_actions,
+    q_learning_target,
+    quantile_regression,
+    scaled,
+    square_penalty,
+    square_regression,
+)
+
+# Three transitions, two actions: one in mid-episode, one that terminated, one with gamma 0.
+Q_TM1 = torch.tensor([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+A_TM1 = torch.tensor([0, 1, 0])
+R_T = torch.tensor([0.5, -1.0, 2.0])
+DISCOUNT_T = torch.tensor([0.9, 0.0, 0.0])
+Q_T = torch.tensor([[10.0, 20.0], [30.0, 40.0], [50.0, 60.0]])
+SELECTOR_T = torch.tensor([[7.0, 3.0], [1.0, 2.0], [2.0, 1.0]])
+
+finite_values = arrays(float32, (4, 3), elements=st.floats(-50, 50, width=32))
+actions_of_three = arrays(int64, (4,), elements=st.integers(0, 2))
+
+
+def test_q_learning_bootstraps_from_the_largest_value() -> None:
+    target = q_learning_target(R_T, DISCOUNT_T, Q_T)
+    torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 20, -1.0, 2.0]))
+
+
+def test_double_q_learning_values_the_action_that_the_other_network_selects() -> None:
+    target = double_q_learning_target(R_T, DISCOUNT_T, Q_T, SELECTOR_T)
+    torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 10, -1.0, 2.0]))
+
+
+def test_expected_sarsa_weights_the_next_values_with_the_policy() -> None:
+    pi_t = torch.tensor([[0.25, 0.75], [0.5, 0.5], [1.0, 0.0]])
+    target = expected_sarsa_target(R_T, DISCOUNT_T, Q_T, pi_t)
+    torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 17.5, -1.0, 2.0]))
+
+
+def test_of_quantiles_those_of_the_largest_mean_are_the_target() -> None:
+    # Means 2 and 2.5; the largest quantile is the other action's.
+    z_t = torch.tensor([[[0.0, 4.0], [2.0, 3.0]]])
+    target = q_learning_target(torch.tensor([1.0]), torch.tensor([0.5]), z_t)
+    torch.testing.assert_close(target, torch.tensor([[2.0, 2.5]]))
+
+
+def test_what_is_not_allowed_is_not_aimed_at() -> None:
+    q_t = allowed_only(torch.tensor([[5.0, 1.0]]), torch.tensor([[False, True]]))
+    assert q_learning_target(torch.tensor([0.0]), torch.tensor([1.0]), q_t).item() == 1.0
+
+
+def test_huber_is_squared_near_zero_and_straight_beyond_one() -> None:
+    error = torch.tensor([0.0, 0.5, -0.5, 1.0, 3.0, -3.0])
+    loss = huber(error)
+    torch.testing.assert_close(loss.value, torch.tensor([0.0, 0.125, 0.125, 0.5, 2.5, 2.5]))
+    torch.testing.assert_close(loss.slope, torch.tensor([0.0, 0.5, -0.5, 1.0, 1.0, -1.0]))
+
+
+def test_huber_regression_pulls_only_at_the_action_taken() -> None:
+    loss = huber_regression(Q_TM1, A_TM1, torch.tensor([1.5, 9.0, 5.0]))
+    torch.testing.assert_close(loss.value, torch.tensor([0.125, 4.5, 0.0]))
+    torch.testing.assert_close(
+        loss.slope, torch.tensor([[-0.5, 0.0], [0.0, -1.0], [0.0, 0.0]]), rtol=0, atol=0
+    )
+
+
+def test_quantile_regression_by_hand() -> None:
+    # Quantiles at tau 1/4 and 3/4, both 0; samples -2 and 1. Quantile 1: the sample above pulls up
+    # with 1/4 (Huber of 1 is 1/2), the one below down with 3/4 (Huber of 2 is 3/2).
+    z_tm1 = torch.zeros(1, 2, 2)
+    loss = quantile_regression(z_tm1, torch.tensor([1]), torch.tensor([[-2.0, 1.0]]))
+    first = (0.75 * 1.5 + 0.25 * 0.5) / 2
+    second = (0.25 * 1.5 + 0.75 * 0.5) / 2
+    torch.testing.assert_close(loss.value, torch.tensor([first + second]))
+    expected = [[[0.0, 0.0], [(0.75 - 0.25) / 2, (0.25 - 0.75) / 2]]]
+    torch.testing.assert_close(loss.slope, torch.tensor(expected))
+
+
+def test_quantile_regression_finds_the_quantiles_of_its_samples() -> None:
+    # A third is 0, the rest 10: the quantile at 1/8 is 0, those from 3/8 up are 10, but for the
+    # Huber loss, whose pull weakens within 1 of a sample. At 3/8, u below 10:
+    # 2/3 * 3/8 * u = 1/3 * 5/8.
+    z_tm1 = torch.full((3, 1, 4), 5.0)
+    target = torch.tensor([[0.0] * 4, [10.0] * 4, [10.0] * 4])
+    for _ in range(400):
+        slope = quantile_regression(z_tm1, torch.zeros(3, dtype=torch.int64), target).slope
+        z_tm1 = z_tm1 - 0.2 * slope.sum(0)
+    expected = torch.tensor([2 / 7, 10 - 5 / 6, 10 - 3 / 10, 10 - 1 / 14])
+    torch.testing.assert_close(z_tm1[0, 0], expected, rtol=0, atol=1e-3)
+
+
+def test_conservative_penalty_by_hand() -> None:
+    q_tm1 = torch.tensor([[0.0, 0.0], [math.log(3.0), 0.0]])
+    # Row 0: log(1 + 1) - 0. Row 1: log(3 + 1) - log 3.
+    expected = torch.tensor([math.log(2.0), math.log(4.0 / 3.0)])
+    torch.testing.assert_close(conservative_penalty(q_tm1, torch.tensor([1, 0])).value, expected)
+
+
+def test_conservative_penalty_pushes_unseen_actions_down_and_the_logged_one_up() -> None:
+    slope = conservative_penalty(torch.tensor([[1.0, 0.0, -1.0]]), torch.tensor([1])).slope[0]
+    # softmax(q) - onehot(a); descent goes against it.
+    weights = [math.exp(q) / (math.e + 1 + 1 / math.e) for q in (1.0, 0.0, -1.0)]
+    torch.testing.assert_close(slope, torch.tensor([weights[0], weights[1] - 1, weights[2]]))
+    assert slope[1] < 0 < slope[2] < slope[0]
+
+
+def test_cross_entropy_by_hand() -> None:
+    logits_tm1 = torch.log(torch.tensor([[0.25, 0.75], [0.5, 0.5]]))
+    expected = torch.tensor([math.log(4.0), math.log(2.0)])
+    torch.testing.assert_close(cross_entropy(logits_tm1, torch.tensor([0, 1])).value, expected)
+
+
+def test_an_action_that_is_not_allowed_has_no_part_in_the_penalty() -> None:
+    q_tm1 = allowed_only(torch.tensor([[1.0, 9.0, 1.0]]), torch.tensor([[True, False, True]]))
+    loss = cross_entropy(q_tm1, torch.tensor([0]))
+    torch.testing.assert_close(loss.value, torch.tensor([math.log(2.0)]))
+    torch.testing.assert_close(loss.slope, torch.tensor([[-0.5, 0.0, 0.5]]))
+
+
+def test_expectile_regression_leans_upwards() -> None:
+    loss = expectile_regression(torch.zeros(2, 1), torch.tensor([2.0, -2.0]), 0.9)
+    torch.testing.assert_close(loss.value, torch.tensor([0.9 * 4, 0.1 * 4]))
+    torch.testing.assert_close(loss.slope, torch.tensor([[-0.9 * 4], [0.1 * 4]]))
+
+
+def test_likely_actions_are_measured_by_the_likeliest() -> None:
+    logits = torch.log(torch.tensor([[0.6, 0.3, 0.1]]))
+    assert likely_actions(logits, 0.4).tolist() == [[True, True, False]]
+    assert likely_actions(logits, 0.0).all()
+    assert likely_actions(logits, 1.0).tolist() == [[True, False, False]]
+
+
+def slopes_to_check() -> dict[str, tuple[Callable[[Tensor], Loss], tuple[int, ...]]]:
+    a_tm1, target = torch.tensor([0, 2, 1, 1]), torch.tensor([0.3, -4.0, 2.0, 0.0])
+    samples = torch.linspace(-3, 3, 20).view(4, 5)
+    return {
+        "huber": (lambda q: huber_regression(q, a_tm1, target), (4, 3)),
+        "square regression": (lambda q: square_regression(q, a_tm1, target), (4, 3)),
+        "quantiles": (lambda z: quantile_regression(z, a_tm1, samples), (4, 3, 5)),
+        "cross entropy": (lambda q: cross_entropy(q, a_tm1), (4, 3)),
+        "penalty of quantiles": (lambda z: conservative_penalty(z, a_tm1), (4, 3, 5)),
+        "square": (square_penalty, (4, 3)),
+        "expectile": (lambda v: expectile_regression(v, target, 0.8), (4, 1)),
+        "scaled": (lambda q: scaled(cross_entropy(q, a_tm1), target), (4, 3)),
+        "halved": (lambda q: scaled(cross_entropy(q, a_tm1), 0.5), (4, 3)),
+    }
+
+
+@pytest.mark.parametrize("name", slopes_to_check())
+@given(data=st.data())
+def test_a_slope_is_the_derivative_of_its_value(name: str, data: st.DataObject) -> None:
+    loss_of, shape = slopes_to_check()[name]
+    # Eighths, moved off the kinks at whole numbers.
+    grid = arrays(int64, shape, elements=st.integers(-40, 40))
+    outputs = torch.from_numpy(data.draw(grid) / 8 + 0.03).float().requires_grad_()
+    loss = loss_of(outputs)
+    (derivative,) = torch.autograd.grad(loss.value.sum(), outputs)
+    torch.testing.assert_close(loss.slope.detach(), derivative, rtol=1e-5, atol=1e-6)
+
+
+@given(values=finite_values, shift=st.floats(-10, 10, width=32), actions=actions_of_three)
+def test_penalty_is_never_negative_and_ignores_a_common_shift(
+    values: NDArray[Any], shift: float, actions: NDArray[Any]
+) -> None:
+    q_tm1, a_tm1 = torch.from_numpy(values), torch.from_numpy(actions)
+    penalty = conservative_penalty(q_tm1, a_tm1).value
+    assert (penalty >= 0).all()
+    torch.testing.assert_close(
+        conservative_penalty(q_tm1 + shift, a_tm1).value, penalty, rtol=1e-4, atol=1e-4
+    )
+
+
+@given(q_t=finite_values, selector=finite_values)
+def test_double_q_learning_never_aims_above_q_learning(
+    q_t: NDArray[Any], selector: NDArray[Any]
+) -> None:
+    zeros, q_t_value = torch.zeros(4), torch.from_numpy(q_t)
+    plain = q_learning_target(zeros, zeros + 0.97, q_t_value)
+    double = double_q_learning_target(zeros, zeros + 0.97, q_t_value, torch.from_numpy(selector))
+    assert (double <= plain).all()
+
+
+def test_noise_in_the_values_lifts_q_learning_but_not_double_q_learning() -> None:
+    # Ten actions are all worth 0 and two networks guess them with independent noise.
+    generator = torch.Generator().manual_seed(0)
+    noise, other_noise = torch.randn(2, 20_000, 10, generator=generator)
+    r_t, discount_t = torch.zeros(len(noise)), torch.ones(len(noise))
+    plain = q_learning_target(r_t, discount_t, noise)
+    double = double_q_learning_target(r_t, discount_t, noise, other_noise)
+    # The largest of ten standard normal numbers is 1.539 on average.
+    assert plain.mean().item() == pytest.approx(1.539, abs=0.02)
+    assert double.mean().item() == pytest.approx(0.0, abs=0.03)
+
+
+@pytest.mark.parametrize("wrong", ["r_t", "discount_t"])
+def test_a_shape_that_would_broadcast_is_refused(wrong: str) -> None:
+    tensors = {"r_t": R_T, "discount_t": DISCOUNT_T, "q_t": Q_T}
+    tensors[wrong] = tensors[wrong][:1]
+    with pytest.raises(AssertionError, match=wrong):
+        q_learning_target(**tensors)
+
+
+def test_a_column_of_actions_is_refused() -> None:
+    with pytest.raises(AssertionError, match="actions"):
+        cross_entropy(Q_TM1, A_TM1.unsqueeze(1))

@@ -1,0 +1,194 @@
+"""Networks: what they take, what they give, and K of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from mcaprl.offline.algorithms.models import AnyModel, Model, StackedMLP, build_model
+from mcaprl.offline.algorithms.networks import Architecture, Network
+from mcaprl.offline.batches.observations import ImageInput, Observations
+
+
+def vectors(rows: int, width: int, seed: int = 0) -> Observations:
+    return Observations(torch.randn(rows, width, generator=torch.Generator().manual_seed(seed)))
+
+
+def pictures(rows: int, *shapes: tuple[int, ...], width: int = 0) -> Observations:
+    images = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
+    return Observations(torch.randn(rows, width), tuple(images))
+
+
+def weights_of(network: torch.nn.Module) -> list[tuple[int, ...]]:
+    return [tuple(p.shape) for p in network.parameters() if p.ndim > 1]
+
+
+def test_vectors_go_through_the_hidden_layers() -> None:
+    network = Network(12, [], (9,), Architecture((256, 128)))
+    assert weights_of(network) == [(256, 12), (128, 256), (9, 128)]
+    assert network(vectors(5, 12)).shape == (5, 9)
+
+
+def test_without_hidden_layers_the_network_is_linear() -> None:
+    network = Network(3, [], (2,), Architecture(()))
+    left, right = torch.randn(2, 4, 3)
+    outputs = [network(Observations(x)) for x in (left, right, left + right, torch.zeros(4, 3))]
+    torch.testing.assert_close(outputs[0] + outputs[1], outputs[2] + outputs[3])
+
+
+def test_the_nature_network_has_its_published_size() -> None:
+    network = Network(0, [ImageInput((84, 84, 4))], (18,), Architecture((512,)))
+    convolutions = [(32, 4, 8, 8), (64, 32, 4, 4), (64, 64, 3, 3)]
+    assert weights_of(network) == [*convolutions, (512, 3136), (18, 512)]
+
+
+def test_channels_are_as_many_as_asked_for() -> None:
+    architecture = Architecture((256,), channels=(16, 32, 24))
+    network = Network(0, [ImageInput((84, 84, 1))], (6,), architecture)
+    convolutions = [(16, 1, 8, 8), (32, 16, 4, 4), (24, 32, 3, 3)]
+    assert weights_of(network) == [*convolutions, (256, 24 * 49), (6, 256)]
+
+
+@pytest.mark.parametrize("shape", [(84, 84, 1), (36, 48, 3)])
+def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
+    network = Network(0, [ImageInput(shape)], (4,), Architecture((16,)))
+    assert network(pictures(2, shape)).shape == (2, 4)
+
+
+def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
+    network = Network(
+        3, [ImageInput((36, 36, 1)), ImageInput((40, 36, 2))], (4,), Architecture((8, 6))
+    )
+    assert weights_of(network.body) == [(6, 24)]
+    both = pictures(2, (36, 36, 1), (40, 36, 2), width=3)
+    assert network(both).shape == (2, 4)
+    for part in (*both.images, both.vector):
+        before = network(both)
+        part.add_(1)
+        assert not torch.equal(network(both), before)
+
+
+def test_channels_are_kept_apart_from_rows() -> None:
+    # Equal channels must give the same in any order of the weights.
+    network = Network(0, [ImageInput((36, 36, 2))], (3,), Architecture((16,)))
+    image = torch.randint(0, 256, (1, 36, 36, 1), dtype=torch.uint8)
+    twice = Observations(torch.empty(1, 0), (torch.cat([image, image], dim=3),))
+    first = next(network.parameters())
+    with torch.no_grad():
+        before = network(twice)
+        first.copy_(first.flip(1))
+        torch.testing.assert_close(network(twice), before)
+
+
+@pytest.mark.parametrize("output_shape", [(4,), (4, 5)])
+def test_dueling_advantages_have_mean_zero(output_shape: tuple[int, ...]) -> None:
+    network = Network(3, [], output_shape, Architecture((16, 8), dueling=True))
+    seen = vectors(6, 3)
+    head: Any = network.head
+    value = head.value(network.body(network.stems[0](seen.vector)))
+    torch.testing.assert_close(network(seen).mean(1).flatten(), value.flatten())
+
+
+def test_layer_norm_makes_outputs_blind_to_the_scale_of_the_first_layer() -> None:
+    network = Network(3, [], (2,), Architecture((32, 16), layer_norm=True))
+    seen = vectors(4, 3)
+    before = network(seen)
+    with torch.no_grad():
+        for parameter in list(network.stems[0].parameters())[:2]:
+            parameter.mul_(10)
+    torch.testing.assert_close(network(seen), before, rtol=1e-3, atol=1e-3)
+
+
+def networks(count: int, hidden: tuple[int, ...] = (32, 16)) -> list[Network]:
+    torch.manual_seed(3)
+    return [Network(5, [], (4,), Architecture(hidden)) for _ in range(count)]
+
+
+def gradients(model: Model, observations: Observations, slope: Tensor) -> tuple[Tensor, Tensor]:
+    outputs = model.learn_from(observations)
+    model.backward(slope)
+    return outputs, model.gradients.clone()
+
+
+@pytest.mark.parametrize("hidden", [(), (32,), (32, 16, 24)])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_written_out_backward_pass_is_that_of_autograd(
+    seeds: int, hidden: tuple[int, ...]
+) -> None:
+    seen, slope = vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
+    by_hand = gradients(StackedMLP(networks(seeds, hidden)), seen, slope)
+    automatic = gradients(AnyModel(networks(seeds, hidden)), seen, slope)
+    for mine, reference in zip(by_hand, automatic, strict=True):
+        torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_learning_from_some_beside_others_is_learning_from_them_alone(
+    model_type: type[Model], seeds: int
+) -> None:
+    seen, others, slope = vectors(seeds * 7, 5), vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
+    model = model_type(networks(seeds))
+    outputs, alone = gradients(model, seen, slope)
+    beside, looked_up = model.learn_beside(seen, others)
+    model.backward(slope)
+    for found, reference in ((beside, outputs), (looked_up, model(others))):
+        torch.testing.assert_close(found, reference, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(model.gradients, alone, rtol=1e-5, atol=1e-6)
+
+
+def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
+    seen, slope = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
+    together = gradients(model_type(networks(4)), seen, slope)
+    pairs = []
+    for k, network in enumerate(networks(4)):
+        mine = slice(k * rows, (k + 1) * rows)
+        alone = gradients(model_type([network]), Observations(seen.vector[mine]), slope[mine])
+        pairs += [(alone[0], together[0][mine]), (alone[1][0], together[1][k])]
+    return pairs
+
+
+@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
+@pytest.mark.parametrize("rows", [1, 32, 256])
+def test_a_seed_gets_the_same_bits_alone_and_beside_others(
+    model_type: type[Model], rows: int
+) -> None:
+    assert all(torch.equal(alone, beside) for alone, beside in alone_and_together(model_type, rows))
+
+
+def test_a_network_shows_the_weights_of_its_model() -> None:
+    model = build_model(networks(2))
+    seen = vectors(6, 5)
+    model.weights.mul_(0.5)
+    expected = torch.cat(
+        [net(part) for net, part in zip(model.networks, seen.split(3), strict=True)]
+    )
+    torch.testing.assert_close(model(seen), expected)
+
+
+def test_a_clone_has_weights_of_its_own() -> None:
+    model = build_model(networks(2))
+    clone = model.clone()
+    before = clone(vectors(4, 5))
+    model.weights.zero_()
+    assert torch.equal(clone(vectors(4, 5)), before)
+    assert before.abs().min() > 0
+
+
+@pytest.mark.parametrize(
+    ("network", "kind"),
+    [
+        (Network(5, [], (4,), Architecture((8,))), StackedMLP),
+        (Network(5, [], (4, 3), Architecture((8,))), StackedMLP),
+        (Network(5, [], (4,), Architecture((8,), layer_norm=True)), AnyModel),
+        (Network(5, [], (4,), Architecture((8,), dueling=True)), AnyModel),
+        (Network(5, [], (1,), Architecture((8,))), AnyModel),
+        (Network(0, [ImageInput((36, 36, 1))], (4,), Architecture((8,))), AnyModel),
+    ],
+)
+def test_plain_networks_are_stacked(network: Network, kind: type[Model]) -> None:
+    assert type(build_model([network])) is kind

@@ -1,0 +1,265 @@
+"""The buffer: columns packed into tensors, rows drawn at random."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from mcaprl.errors import McaprlError, SpaceError, TrainingError
+from mcaprl.offline.batches.buffer import Packing, TransitionBuffer
+from mcaprl.recorder.dataset.dataset import Dataset
+
+
+def numbered(n_rows: int, **changes: Any) -> Dataset:
+    """Row k goes from (k, -k) to (k + 100, 100 - k) by action 3 + k % 2 and earns k / 2."""
+    k = np.arange(n_rows)
+    observations = np.stack([k, -k], axis=1).astype(np.float32)
+    columns: dict[str, Any] = {
+        "observations": observations,
+        "actions": 3 + k % 2,
+        "rewards": k / 2,
+        "terminated": k % 3 == 0,
+        "truncated": k % 3 == 1,
+        "next_observations": observations + 100,
+        "action_space": spaces.Discrete(2, start=3),
+    }
+    return Dataset.from_arrays(**{**columns, **changes})
+
+
+def walks(lengths: list[int], terminated: list[bool]) -> Dataset:
+    """Episodes that count 0, 1, 2, ... from ten times their number; step t earns 2^t."""
+    steps = [np.arange(length) for length in lengths]
+    here = np.concatenate([10 * number + t for number, t in enumerate(steps)])
+    last = np.concatenate([t == length - 1 for t, length in zip(steps, lengths, strict=True)])
+    ends = np.repeat(terminated, lengths)
+    return Dataset.from_arrays(
+        observations=here[:, None].astype(np.float32),
+        actions=np.zeros(len(here), np.int64),
+        rewards=np.concatenate([2.0**t for t in steps]),
+        terminated=last & ends,
+        truncated=last & ~ends,
+        next_observations=here[:, None].astype(np.float32) + 1,
+    )
+
+
+def whole(buffer: TransitionBuffer) -> Any:
+    return buffer.batch(torch.arange(len(buffer)))
+
+
+def test_columns_become_tensors() -> None:
+    batch = whole(TransitionBuffer.from_dataset(numbered(4)))
+    assert batch.observations.vector.tolist() == [[0, 0], [1, -1], [2, -2], [3, -3]]
+    assert batch.next_observations.vector[1].tolist() == [101, 99]
+    assert batch.rewards.tolist() == [0, 0.5, 1, 1.5]
+    assert batch.rewards.dtype == batch.observations.vector.dtype == torch.float32
+
+
+def test_actions_are_counted_from_zero() -> None:
+    assert TransitionBuffer.from_dataset(numbered(4)).actions.tolist() == [0, 1, 0, 1]
+
+
+def test_only_termination_ends_the_return() -> None:
+    # Rows 0 and 3 terminated, row 1 was truncated, row 2 neither.
+    assert whole(TransitionBuffer.from_dataset(numbered(4))).discounts.tolist() == [0, 1, 1, 0]
+
+
+def test_each_frame_is_stored_once() -> None:
+    buffer = TransitionBuffer.from_dataset(walks([3, 2], [True, False]))
+    assert buffer.frames.vector.flatten().tolist() == [0, 1, 2, 3, 10, 11, 12]
+
+
+def test_n_step_returns_by_hand() -> None:
+    buffer = TransitionBuffer.from_dataset(
+        walks([3, 2], [True, False]), Packing(gamma=0.5, n_steps=2)
+    )
+    batch = whole(buffer)
+    # Rewards 1, 2, 4 and 1, 2: two of them each, as far as the episode goes.
+    assert batch.rewards.tolist() == [1 + 0.5 * 2, 2 + 0.5 * 4, 4, 1 + 0.5 * 2, 2]
+    assert batch.next_observations.vector.flatten().tolist() == [2, 3, 3, 12, 12]
+    # Behind the first episode there is nothing; the second was only cut off.
+    assert batch.discounts.tolist() == [0.25, 0, 0, 0.25, 0.5]
+
+
+def test_with_gamma_zero_only_the_first_reward_counts() -> None:
+    packing = Packing(gamma=0.0, n_steps=3)
+    batch = whole(TransitionBuffer.from_dataset(walks([3], [False]), packing))
+    assert batch.rewards.tolist() == [1, 2, 4]
+    assert batch.discounts.tolist() == [0, 0, 0]
+
+
+@given(
+    lengths=st.lists(st.integers(1, 6), min_size=1, max_size=4),
+    n_steps=st.integers(1, 7),
+    gamma=st.floats(0, 1),
+    data=st.data(),
+)
+def test_n_step_returns_are_those_of_a_loop(
+    lengths: list[int], n_steps: int, gamma: float, data: st.DataObject
+) -> None:
+    ends = data.draw(st.lists(st.booleans(), min_size=len(lengths), max_size=len(lengths)))
+    dataset = walks(lengths, ends)
+    batch = whole(TransitionBuffer.from_dataset(dataset, Packing(gamma=gamma, n_steps=n_steps)))
+    expected = []
+    for episode in dataset.episodes:
+        for start in range(episode.length):
+            total, discount, step = 0.0, 1.0, start
+            while step < min(start + n_steps, episode.length):
+                total += discount * episode.rewards[step]
+                discount *= gamma
+                step += 1
+            over = step == episode.length and episode.terminated[-1]
+            seen = episode.next_observations[step - 1, 0]
+            expected.append((total, 0.0 if over else discount, seen))
+    found = torch.stack([batch.rewards, batch.discounts, batch.next_observations.vector[:, 0]], 1)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-7)
+
+
+def test_stacks_repeat_the_first_frame_of_their_episode() -> None:
+    buffer = TransitionBuffer.from_dataset(walks([3, 1], [True, True]), Packing(frame_stack=3))
+    batch = whole(buffer)
+    assert batch.observations.vector.tolist() == [[0, 0, 0], [0, 0, 1], [0, 1, 2], [10, 10, 10]]
+    assert batch.next_observations.vector.tolist() == [
+        [0, 0, 1],
+        [0, 1, 2],
+        [1, 2, 3],
+        [10, 10, 11],
+    ]
+    assert buffer.vector_width == 3
+
+
+def test_stacked_pictures_are_channels() -> None:
+    images = np.arange(4, dtype=np.uint8).reshape(4, 1, 1, 1) * np.ones((36, 36, 1), np.uint8)
+    dataset = Dataset.from_arrays(
+        observations=images[:3],
+        actions=[0, 0, 0],
+        rewards=[0, 0, 0],
+        terminated=[False, False, True],
+        truncated=[False] * 3,
+        next_observations=images[1:],
+    )
+    buffer = TransitionBuffer.from_dataset(dataset, Packing(frame_stack=2))
+    batch = whole(buffer)
+    assert [image.shape for image in buffer.image_inputs] == [(36, 36, 2)]
+    assert len(buffer.frames) == 4
+    assert batch.observations.images[0].dtype == torch.uint8
+    assert batch.observations.images[0][:, 0, 0].tolist() == [[0, 0], [0, 1], [1, 2]]
+    assert batch.next_observations.images[0][:, 0, 0].tolist() == [[0, 1], [1, 2], [2, 3]]
+
+
+@given(n_rows=st.integers(1, 40), batch_size=st.integers(1, 64), seed=st.integers(0, 99))
+def test_a_batch_is_made_of_whole_rows(n_rows: int, batch_size: int, seed: int) -> None:
+    buffer = TransitionBuffer.from_dataset(numbered(n_rows))
+    batch = buffer.sample(batch_size, torch.Generator().manual_seed(seed))
+    k = batch.rows
+    assert k.shape == (batch_size,)
+    assert 0 <= k.min() <= k.max() < n_rows
+    assert torch.equal(batch.observations.vector, torch.stack([k, -k], dim=1).float())
+    assert torch.equal(batch.next_observations.vector, batch.observations.vector + 100)
+    assert torch.equal(batch.actions, k % 2)
+    assert torch.equal(batch.rewards, k / 2)
+    assert torch.equal(batch.discounts, (k % 3 != 0).float())
+
+
+def test_the_generator_decides_the_draw() -> None:
+    buffer = TransitionBuffer.from_dataset(numbered(50))
+    draws = [buffer.sample(8, torch.Generator().manual_seed(seed)).rows for seed in (1, 1, 2)]
+    assert torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+
+
+def test_every_row_is_drawn_equally_often() -> None:
+    buffer = TransitionBuffer.from_dataset(numbered(10))
+    rows = buffer.sample_rows(100_000, torch.Generator().manual_seed(0))
+    # 10,000 each with a standard deviation of 95.
+    assert (torch.bincount(rows) - 10_000).abs().max() < 5 * 95
+
+
+@pytest.mark.parametrize("weights", [[3.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+def test_rows_are_drawn_by_the_weights_of_their_episodes(weights: list[float]) -> None:
+    buffer = TransitionBuffer.from_dataset(walks([2, 3, 1], [True] * 3), weights=np.array(weights))
+    rows = buffer.sample_rows(60_000, torch.Generator().manual_seed(0))
+    share = torch.bincount(rows, minlength=6) / 60_000
+    each = np.repeat(weights, [2, 3, 1])
+    # The largest standard deviation of a share is .002.
+    np.testing.assert_allclose(share.numpy(), each / each.sum(), atol=0.01)
+    assert share[2:5].sum() == 0
+
+
+def test_weights_that_leave_nothing_are_refused() -> None:
+    with pytest.raises(TrainingError, match="all weights are 0"):
+        TransitionBuffer.from_dataset(walks([2], [True]), weights=np.zeros(1))
+
+
+def test_normalisation_counts_each_frame_once() -> None:
+    buffer = TransitionBuffer.from_dataset(walks([3, 2], [True, True]), Packing(normalize=True))
+    torch.testing.assert_close(buffer.frames.vector.mean(0), torch.zeros(1), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        buffer.frames.vector.std(0, correction=0), torch.ones(1), atol=1e-6, rtol=0
+    )
+
+
+def test_a_given_encoder_keeps_its_normalisation() -> None:
+    packing = Packing(normalize=True)
+    encoder = TransitionBuffer.from_dataset(walks([3], [True]), packing).encoder
+    scale = encoder.scale.copy()
+    other = TransitionBuffer.from_dataset(walks([9], [True]), packing, encoder=encoder)
+    assert np.array_equal(other.encoder.scale, scale)
+
+
+def masked(actions: list[int]) -> Dataset:
+    """Three states in which only action 1 is allowed, and an end in which nothing is."""
+    mask = np.array([[0, 1], [0, 1], [0, 1], [0, 0]], np.int8)
+    x = np.zeros((4, 1), np.float32)
+    return Dataset.from_arrays(
+        observations={"action_mask": mask[:3], "x": x[:3]},
+        actions=actions,
+        rewards=[0, 0, 1],
+        terminated=[False, False, True],
+        truncated=[False] * 3,
+        next_observations={"action_mask": mask[1:], "x": x[1:]},
+        action_space=spaces.Discrete(2),
+    )
+
+
+def test_masks_come_with_the_observations() -> None:
+    batch = whole(TransitionBuffer.from_dataset(masked([1, 1, 1])))
+    assert batch.observations.mask.tolist() == [[False, True]] * 3
+
+
+def test_a_logged_action_that_was_not_allowed_is_refused() -> None:
+    with pytest.raises(TrainingError, match="action 0 of row 1 is masked out"):
+        TransitionBuffer.from_dataset(masked([1, 0, 1]))
+
+
+def test_continuous_actions_are_refused() -> None:
+    actions = np.zeros((4, 1), np.float32)
+    dataset = numbered(4, actions=actions, action_space=spaces.Box(-1, 1, (1,)))
+    with pytest.raises(SpaceError, match="needs discrete actions, got Box"):
+        TransitionBuffer.from_dataset(dataset)
+
+
+def test_an_action_outside_its_space_is_refused() -> None:
+    dataset = numbered(4, actions=np.array([3, 4, 5, 3]))
+    with pytest.raises(SpaceError, match="5"):
+        TransitionBuffer.from_dataset(dataset)
+
+
+def test_an_empty_dataset_is_refused() -> None:
+    with pytest.raises(McaprlError):
+        TransitionBuffer.from_dataset(numbered(4).filter(lambda _: False))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", ["observations", "rewards", "next_observations"])
+def test_a_number_that_is_not_finite_is_named(column: str, bad: float) -> None:
+    values: NDArray[Any] = np.array(getattr(numbered(4), column))
+    values[2] = bad
+    with pytest.raises(TrainingError, match=f"{column} of row 2"):
+        TransitionBuffer.from_dataset(numbered(4, **{column: values}))

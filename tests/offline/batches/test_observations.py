@@ -1,0 +1,211 @@
+"""Observations of any space as one vector, pictures and an action mask."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.spaces import utils
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaprl.errors import SpaceError
+from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+
+IMAGE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
+CAR = spaces.Dict(
+    {
+        "camera": IMAGE,
+        "speed": spaces.Box(-np.inf, np.inf, (2,), np.float64),
+        "gear": spaces.Discrete(3, start=-1),
+    }
+)
+
+
+def batch(space: spaces.Space[Any], rows: int, seed: int = 0) -> Any:
+    """(rows, *shape) samples of a space, in nested dicts."""
+    if isinstance(space, spaces.Dict):
+        return {key: batch(part, rows, seed) for key, part in space.spaces.items()}
+    space.seed(seed)
+    return np.stack([space.sample() for _ in range(rows)])
+
+
+def test_a_vector_stays_as_it_is() -> None:
+    values = np.array([[1.5, -2.0], [3.0, 4.0]], np.float32)
+    seen = ObservationEncoder(spaces.Box(-9, 9, (2,)), 2).encode(values)
+    assert seen.vector.tolist() == values.tolist()
+    assert seen.images == ()
+    assert seen.mask is None
+
+
+def test_float64_becomes_float32_and_arrays_are_flattened() -> None:
+    encoder = ObservationEncoder(spaces.Box(-9, 9, (3, 4), np.float64), 2)
+    assert encoder.encode(np.ones((5, 3, 4))).vector.shape == (5, 12)
+    assert encoder.encode(np.ones((5, 3, 4))).vector.dtype == torch.float32
+
+
+def test_bytes_that_are_no_picture_are_scaled_to_one() -> None:
+    encoder = ObservationEncoder(spaces.Box(0, 255, (3,), np.uint8), 2)
+    seen = encoder.encode(np.array([[0, 51, 255]], np.uint8))
+    torch.testing.assert_close(seen.vector, torch.tensor([[0.0, 0.2, 1.0]]))
+
+
+def test_pictures_stay_bytes_and_gain_a_channel() -> None:
+    space = spaces.Box(0, 255, (36, 40), np.uint8)
+    pictures = batch(space, 2)
+    seen = ObservationEncoder(space, 2).encode(pictures)
+    assert seen.vector.shape == (2, 0)
+    assert seen.images[0].shape == (2, 36, 40, 1)
+    assert np.array_equal(seen.images[0].numpy()[..., 0], pictures)
+
+
+def test_a_dict_becomes_a_vector_and_pictures() -> None:
+    encoder = ObservationEncoder(CAR, 2)
+    observations = batch(CAR, 4)
+    seen = encoder.encode(observations)
+    assert encoder.width == 5
+    assert [image.shape for image in encoder.image_inputs] == [(36, 40, 1)]
+    # In the order of the space's keys: camera, gear (one-hot), speed.
+    assert seen.vector[:, :3].argmax(1).tolist() == (observations["gear"] + 1).tolist()
+    np.testing.assert_array_equal(
+        seen.vector[:, 3:].numpy(), observations["speed"].astype(np.float32)
+    )
+
+
+@given(seed=st.integers(0, 99))
+def test_counters_and_flags_are_flattened_as_gymnasium_does(seed: int) -> None:
+    space = spaces.Dict(
+        {
+            "a": spaces.Discrete(4, start=2),
+            "b": spaces.MultiDiscrete([2, 5], start=[0, -3]),
+            "c": spaces.MultiBinary(3),
+            "d": spaces.Dict({"e": spaces.Box(-1, 1, (2, 2))}),
+        }
+    )
+    space.seed(seed)
+    sample = space.sample()
+    one = {key: np.asarray(sample[key])[None] for key in "abc"} | {
+        "d": {"e": sample["d"]["e"][None]}
+    }
+    encoded = ObservationEncoder(space, 2).encode(one).vector[0].numpy()
+    expected: Any = utils.flatten(space, sample)
+    np.testing.assert_allclose(encoded, expected)
+
+
+def test_normalisation_gives_mean_zero_and_deviation_one() -> None:
+    values = np.random.default_rng(0).normal([100, -3], [20, 0.01], (500, 2)).astype(np.float32)
+    encoder = ObservationEncoder(spaces.Box(-np.inf, np.inf, (2,)), 2)
+    encoder.normalize_to(values)
+    vector = encoder.encode(values).vector.numpy()
+    np.testing.assert_allclose(vector.mean(0), 0, atol=2e-3)
+    np.testing.assert_allclose(vector.std(0), 1, atol=2e-3)
+
+
+@pytest.mark.parametrize("constant", [0.0, 7.0, -1e6])
+def test_a_constant_column_becomes_zero_and_a_new_value_is_no_catastrophe(constant: float) -> None:
+    values = np.full((50, 1), constant, np.float32)
+    encoder = ObservationEncoder(spaces.Box(-np.inf, np.inf, (1,)), 2)
+    encoder.normalize_to(values)
+    assert encoder.encode(values).vector.abs().max() == 0
+    assert encoder.encode(values + 1).vector.abs().max() == 1
+
+
+def test_a_picture_loses_its_mean_and_keeps_one_scale() -> None:
+    encoder = ObservationEncoder(CAR, 2)
+    pictures = np.zeros((4, 36, 40, 1), np.uint8)
+    pictures[:, 0, 0, 0] = [10, 10, 30, 30]
+    pictures[:, 1, 1] = 255
+    observations = {**batch(CAR, 4), "camera": pictures}
+    encoder.normalize_to(observations)
+    (image,) = encoder.image_inputs
+    assert image.shift is not None
+    assert image.shift[0, 0, 0] == 20
+    assert image.shift[1, 1, 0] == 255, "what never changes becomes 0, however bright"
+    assert np.count_nonzero(image.shift) == 2
+    # One pixel of 1,440 differs from its mean, by 10 each time: sqrt(100 / 1440).
+    assert image.scale == pytest.approx(math.sqrt(100 / 1440))
+    assert encoder.encode(observations).images[0].dtype == torch.uint8, "frames stay small"
+
+
+def test_pictures_that_are_all_alike_keep_their_scale() -> None:
+    alike = np.full((300, 36, 36, 3), 77, np.uint8)
+    image = ImageInput((36, 36, 3)).normalized_to(alike)
+    assert image.scale == 255
+    assert image.shift is not None
+    assert (image.shift == 77).all()
+
+
+def test_a_stack_of_pictures_is_shifted_frame_by_frame() -> None:
+    shift = np.arange(36 * 36 * 2, dtype=np.float32).reshape(36, 36, 2)
+    stacked = ImageInput((36, 36, 2), shift, 7.0).stacked(3)
+    assert (stacked.shape, stacked.scale) == ((36, 36, 6), 7)
+    assert stacked.shift is not None
+    for frame in range(3):
+        np.testing.assert_array_equal(stacked.shift[:, :, 2 * frame : 2 * frame + 2], shift)
+
+
+def test_a_mask_is_no_input() -> None:
+    space = spaces.Dict({"action_mask": spaces.MultiBinary(3), "x": spaces.Box(-1, 1, (2,))})
+    encoder = ObservationEncoder(space, 3)
+    mask = np.array([[1, 0, 1], [0, 0, 0]], np.int8)
+    seen = encoder.encode({"action_mask": mask, "x": np.zeros((2, 2), np.float32)})
+    assert encoder.width == 2
+    assert seen.mask is not None
+    # Where nothing is allowed the episode is over, and all count alike.
+    assert seen.mask.tolist() == [[True, False, True], [True, True, True]]
+
+
+def test_a_mask_of_another_length_is_refused() -> None:
+    space = spaces.Dict({"action_mask": spaces.MultiBinary(3), "x": spaces.Box(-1, 1, (2,))})
+    with pytest.raises(SpaceError, match=r"action_mask has shape \(3,\), there are 2 actions"):
+        ObservationEncoder(space, 2)
+
+
+@pytest.mark.parametrize(
+    ("shape", "says"),
+    [((35, 84, 1), r"36x36.*\(35, 84, 1\)"), ((4, 84, 84), r"\(height, width, channels\)")],
+)
+def test_pictures_that_convolutions_cannot_take_are_refused(
+    shape: tuple[int, ...], says: str
+) -> None:
+    with pytest.raises(SpaceError, match=says):
+        ObservationEncoder(spaces.Box(0, 255, shape, np.uint8), 2)
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 3), (3, 1, 2), ()])
+def test_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(SpaceError, match=r"takes observations \(B, 2\), got"):
+        ObservationEncoder(spaces.Box(-1, 1, (2,)), 2).encode(np.zeros(shape, np.float32))
+
+
+def test_a_missing_part_is_named() -> None:
+    with pytest.raises(SpaceError, match="no gear"):
+        ObservationEncoder(CAR, 2).encode({"camera": batch(IMAGE, 1), "speed": np.zeros((1, 2))})
+
+
+def test_counters_outside_their_space_are_refused() -> None:
+    encoder = ObservationEncoder(spaces.Discrete(3, start=-1), 2)
+    with pytest.raises(SpaceError, match="not in their space"):
+        encoder.encode(np.array([2]))
+
+
+def test_stacked_frames_go_side_by_side() -> None:
+    vector = torch.arange(8.0).view(4, 2)
+    image = torch.arange(4, dtype=torch.uint8).view(4, 1, 1, 1).expand(4, 36, 36, 2)
+    mask = torch.tensor([[True, False], [False, True]]).repeat(2, 1)
+    stacked = Observations(vector, (image,), mask).stacked(2)
+    assert stacked.vector.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    assert stacked.images[0].shape == (2, 36, 36, 4)
+    assert stacked.images[0][1, 0, 0].tolist() == [2, 2, 3, 3]
+    assert stacked.mask is not None
+    assert stacked.mask.tolist() == [[False, True], [False, True]]
+
+
+def test_arrays_that_may_not_be_written_to_are_taken() -> None:
+    frozen = np.zeros((2, 2), np.float32)
+    frozen.flags.writeable = False
+    assert len(ObservationEncoder(spaces.Box(-1, 1, (2,)), 2).encode(frozen)) == 2

@@ -1,0 +1,192 @@
+"""Estimates from a log alone: against true values, on-policy, and when they must refuse."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.estimate.fqe import FQE, FQEConfig, reachable
+from mcaprl.offline.estimate.importance import ESTIMATORS
+from mcaprl.offline.estimate.off_policy import (
+    Estimate,
+    OffPolicyEvaluator,
+    PolicyEstimates,
+)
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.support import two_state_task as task
+
+FAST = FQEConfig(updates=1_500, batch_size=64, target_interval=25, hidden=(32,), gamma=task.GAMMA)
+NO_MODEL = FQEConfig(updates=1, batch_size=2, target_interval=1, hidden=(2,), gamma=task.GAMMA)
+
+
+class Table:
+    """A policy of the two-state task, from its probabilities (states, actions)."""
+
+    def __init__(self, probabilities: NDArray[np.float64]) -> None:
+        self._probabilities = probabilities
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
+        rows: NDArray[np.float64] = self._probabilities[observations.argmax(1)]
+        return rows
+
+
+def log(episodes: int, seed: int = 0, acting: NDArray[np.float64] = task.BEHAVIOR) -> Dataset:
+    """Episodes of the task, as a dataset with one-hot observations."""
+    random = np.random.default_rng(seed)
+    columns: list[tuple[int, int, int, float, bool, float]] = []
+    for _ in range(episodes):
+        state, ended = 0, False
+        while not ended:
+            action = int(random.random() < acting[state, 1])
+            after = int(random.random() < task.TO_ONE[state, action])
+            ended = random.random() < task.ENDS
+            paid = float(task.PAYS[state, action])
+            columns.append((state, action, after, paid, ended, float(acting[state, action])))
+            state = after
+    states, actions, afters, paid_, ends, probs = map(np.array, zip(*columns, strict=True))
+    eye = np.eye(2, dtype=np.float32)
+    return Dataset.from_arrays(
+        observations=eye[states],
+        actions=actions,
+        rewards=paid_,
+        terminated=ends,
+        truncated=np.zeros_like(ends),
+        next_observations=eye[afters],
+        behavior_probs=probs,
+        observation_space=spaces.Box(0, 1, (2,), np.float32),
+        action_space=spaces.Discrete(2),
+    )
+
+
+def by_name(found: PolicyEstimates) -> dict[str, Estimate]:
+    return {estimate.estimator: estimate for estimate in found.estimates}
+
+
+@pytest.mark.parametrize(
+    ("rewards", "gamma", "bounds"),
+    [
+        ([0.0, 1.0], 0.9, (0.0, 10.0)),
+        ([-1.0, 0.5], 0.5, (-2.0, 1.0)),
+        ([2.0, 3.0], 0.5, (2.0, 6.0)),
+        ([-3.0, -2.0], 0.5, (-6.0, -2.0)),
+        ([0.0, 1.0], 1.0, (0.0, math.inf)),
+        ([0.5, 1.0], 0.0, (0.5, 1.0)),
+    ],
+)
+def test_reachable_returns_by_hand(
+    rewards: list[float], gamma: float, bounds: tuple[float, float]
+) -> None:
+    assert reachable(torch.tensor(rewards), gamma) == pytest.approx(bounds)
+
+
+def test_fitted_q_evaluation_learns_the_true_values() -> None:
+    data = log(1_000)
+    buffer = TransitionBuffer.from_dataset(data, FAST.packing)
+    pi_t = torch.from_numpy(task.EVALUATED[data.next_observations.argmax(1)].astype(np.float32))
+    learner = FQE(FAST, buffer, [0], pi_t)
+    for _ in range(FAST.updates):
+        learner.update()
+    values = learner.values(next_states=False).numpy()
+    learned = [values[data.observations[:, state] == 1][0] for state in (0, 1)]
+    np.testing.assert_allclose(learned, task.TRUE_Q, rtol=0.08)
+
+
+def test_every_estimator_finds_the_true_value() -> None:
+    evaluator = OffPolicyEvaluator(log(1_500), FAST)
+    evaluated = evaluator.evaluate(Table(task.EVALUATED), "better")
+    found = by_name(evaluated)
+    assert list(found) == ["FQE", *ESTIMATORS]
+    for estimate in found.values():
+        assert estimate.trusted
+        assert estimate.value == pytest.approx(task.true_value(), rel=0.12)
+    assert 0.4 < evaluated.coverage < 0.65, "the policy's probabilities are .35 to .65"
+    widths = {
+        name: estimate.interval[1] - estimate.interval[0]
+        for name, estimate in found.items()
+        if estimate.interval is not None
+    }
+    assert widths["DR"] < widths["PDIS"] < widths["TIS"]
+
+
+def test_on_policy_they_agree_with_the_logged_returns() -> None:
+    evaluator = OffPolicyEvaluator(log(400), FAST)
+    found = by_name(evaluator.evaluate(Table(task.BEHAVIOR), "behavior"))
+    for name in ("TIS", "WIS", "PDIS", "WPDIS"):
+        assert found[name].value == pytest.approx(evaluator.behavior_return)
+        assert found[name].interval == pytest.approx(evaluator.behavior_interval)
+        assert found[name].effective_sample_size == pytest.approx(400)
+    low, high = evaluator.behavior_interval
+    for name in ("FQE", "DR", "WDR"):
+        value = found[name].value
+        assert value is not None
+        assert low - (high - low) < value < high + (high - low)
+
+
+def test_a_log_of_other_actions_gives_no_verdict() -> None:
+    always_one = np.array([[0.001, 0.999], [0.001, 0.999]])
+    evaluator = OffPolicyEvaluator(log(40, acting=always_one), NO_MODEL)
+    never_one = Table(np.array([[1.0, 0.0], [1.0, 0.0]]))
+    found = by_name(evaluator.evaluate(never_one, "other"))
+    for name in ESTIMATORS:
+        assert not found[name].trusted
+        assert "effective episodes, 10 needed" in found[name].verdict
+
+
+def test_weights_that_do_not_add_up_give_no_verdict() -> None:
+    """Half of the log never does what is asked about: an unbiased mean is half of what it is."""
+    always_one = np.array([[1e-6, 1 - 1e-6], [1e-6, 1 - 1e-6]])
+    data = Dataset.concatenate([log(60), log(60, seed=1, acting=always_one)])
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Table(task.BEHAVIOR), "half"))
+    for name in ("TIS", "PDIS", "DR"):
+        assert found[name].effective_sample_size > 10
+        assert found[name].verdict.startswith("refused: weights of 0.")
+    for name in ("WIS", "WPDIS"):
+        assert found[name].trusted, "these divide by the weights"
+
+
+def test_unknown_probabilities_leave_the_model_alone() -> None:
+    data = log(60)
+    data.behavior_probs[:5] = math.nan
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(None, "random"))
+    assert found["FQE"].value is not None
+    for name in ESTIMATORS:
+        assert found[name].value is None
+        assert found[name].verdict == (
+            f"refused: behavior_prob of 5 of {len(data)} steps is unknown"
+        )
+
+
+def test_a_model_that_saw_too_little_of_the_horizon_says_so() -> None:
+    config = FQEConfig(updates=100, target_interval=25, hidden=(4,), gamma=0.9)
+    estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")
+    assert estimate.estimates[0].verdict.startswith(
+        "refused: 4 target copies are too few for gamma 0.9"
+    )
+
+
+def test_a_single_episode_is_refused() -> None:
+    with pytest.raises(UsageError, match="needs 2 episodes or more"):
+        OffPolicyEvaluator(log(1), NO_MODEL)
+
+
+def test_epsilon_mixes_random_actions_in() -> None:
+    evaluator = OffPolicyEvaluator(log(300), NO_MODEL)
+    greedy = Table(np.array([[0.0, 1.0], [0.0, 1.0]]))
+    half = Table(np.array([[0.25, 0.75], [0.25, 0.75]]))
+    mixed = by_name(evaluator.evaluate(greedy, "greedy", epsilon=0.5))["PDIS"]
+    assert mixed.value == pytest.approx(by_name(evaluator.evaluate(half, "half"))["PDIS"].value)
+
+
+def test_the_same_seed_gives_the_same_estimates() -> None:
+    first, second = (
+        OffPolicyEvaluator(log(50), NO_MODEL, seed=3).evaluate(None, "random") for _ in range(2)
+    )
+    assert first == second

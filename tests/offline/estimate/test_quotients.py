@@ -1,0 +1,112 @@
+"""Intervals of off-policy estimates: by hand, against SciPy, and how often they hold the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from mcaprl.offline.estimate.importance import ESTIMATORS
+from mcaprl.offline.estimate.quotients import Quotients, student_factor
+from tests.support import two_state_task as task
+
+columns = st.integers(2, 9).flatmap(
+    lambda size: arrays(np.float64, size, elements=st.integers(-9, 9).map(float))
+)
+
+
+def resamplings(episodes: int, count: int, seed: int) -> NDArray[np.float64]:
+    random = np.random.default_rng(seed)
+    return random.multinomial(episodes, [1 / episodes] * episodes, count).astype(np.float64)
+
+
+def test_a_quotient_by_hand() -> None:
+    # a is 2 and 6, b is 1 and 3: 8 / 4, the same for both episodes, so nothing can be off.
+    same = Quotients(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
+    # Twice the second: 12 / 6.
+    assert same.values(np.array([[1.0, 1.0], [0.0, 2.0]])) == pytest.approx([1.0, 1.0])
+    assert same.errors(np.ones((1, 2))) == pytest.approx([0.0])
+    assert same.interval(resamplings(2, 50, 0)) == pytest.approx((1.0, 1.0))
+    # a is 2 and 2: 4 / 4 = 1. They move it by (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
+    other = Quotients(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
+    assert other.errors(np.ones((1, 2))) == pytest.approx([np.sqrt(1 / 8)])
+    # Counted twice each, it is as if there were four: half of the variance.
+    assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
+
+
+def test_pairs_add_up_with_their_weights() -> None:
+    one = (np.array([[1.0, 2.0], [3.0, 2.0]]), np.array([[1.0, 0.0], [1.0, 4.0]]))
+    # (4 / 2 + 4 / 4 of the second) and each twice.
+    assert Quotients(np.array([1.0, 10.0]), (one, one)).values(np.ones((1, 2))) == [24.0]
+    # Where b is nought in all episodes, the quotient is nought.
+    nothing = Quotients(np.ones(1), ((np.ones((2, 1)), np.zeros((2, 1))),))
+    assert nothing.values(np.ones((1, 2))) == [0.0]
+    assert nothing.interval(resamplings(2, 20, 0)) == (0.0, 0.0)
+
+
+@given(columns)
+def test_the_error_of_a_mean_is_scipys(values: NDArray[np.float64]) -> None:
+    mean = Quotients.mean(values)
+    once = np.ones((1, len(values)))
+    assert mean.values(once) == pytest.approx([values.mean()])
+    assert mean.errors(once) == pytest.approx([scipy.stats.sem(values, ddof=0)], abs=1e-9)
+
+
+@given(columns, st.integers(0, 3))
+def test_an_interval_moves_and_grows_with_its_values(
+    values: NDArray[np.float64], seed: int
+) -> None:
+    counts = resamplings(len(values), 60, seed)
+    low, high = Quotients.mean(values).interval(counts)
+    assert low <= high
+    moved = Quotients.mean(3 * values + 5).interval(counts)
+    assert moved == pytest.approx((3 * low + 5, 3 * high + 5), rel=1e-6, abs=1e-6)
+
+
+def test_the_error_is_the_spread_of_the_estimates() -> None:
+    """Over 150 logs of 200 episodes, within what chance makes of a standard deviation."""
+    once, logs = np.ones((1, 200)), 150
+    tables = [task.play(None, episodes=200, seed=seed) for seed in range(logs)]
+    for name in ("WPDIS", "DR", "WDR"):
+        found = [ESTIMATORS[name](table) for table in tables]
+        spread = np.std([one.values(once)[0] for one in found])
+        told = np.sqrt(np.mean([one.errors(once)[0] ** 2 for one in found]))
+        assert told == pytest.approx(spread, rel=4 / np.sqrt(2 * logs))
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    """95 % within two points and twice the error of 200 logs; of 50 episodes, which is few."""
+    logs, episodes = 200, 50
+    margin = 0.02 + 2 * np.sqrt(0.95 * 0.05 / logs)
+    held = dict.fromkeys(ESTIMATORS, 0)
+    for seed in range(logs):
+        table = task.play(None, episodes=episodes, seed=seed)
+        counts = resamplings(episodes, 250, seed)
+        for name, estimator in ESTIMATORS.items():
+            low, high = estimator(table).interval(counts)
+            held[name] += low <= task.true_value() <= high
+    for name, times in held.items():
+        assert abs(times / logs - 0.95) <= margin, name
+
+
+def test_degrees_of_freedom_by_hand() -> None:
+    # 0 and 2 lie as far from 1: two episodes tell alike, one degree. 0 0 0 4 lie 1 1 1 3 from it:
+    # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) = 144 / 84 is less than two, and one the least.
+    assert Quotients.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
+    assert Quotients.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
+    alike = Quotients.mean(np.array([-1.0, 1.0] * 10))
+    assert alike.degrees_of_freedom() == pytest.approx(19.0)
+    # 0 0 0 2 2 4 4 4 lie 2 2 2 0 0 2 2 2 from their mean: six of eight tell, five degrees.
+    some = Quotients.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
+    assert some.degrees_of_freedom() == pytest.approx(5.0)
+
+
+def test_students_factor_by_the_table() -> None:
+    # 97.5 % of Student's t: 12.706 of one degree, 2.228 of ten; of the normal distribution 1.960.
+    assert student_factor(1.0) == pytest.approx(12.706 / 1.960, rel=1e-3)
+    assert student_factor(10.0) == pytest.approx(2.228 / 1.960, rel=1e-3)
+    assert student_factor(1e9) == pytest.approx(1.0)

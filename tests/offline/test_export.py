@@ -1,0 +1,107 @@
+"""Exported policies act as the originals do, in a runtime that knows nothing of us."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from mcaprl.cli import run
+from mcaprl.offline.algorithms.bc import BCConfig
+from mcaprl.offline.algorithms.bcq import BCQConfig
+from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.registry import ALGORITHMS
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.export import ExportedPolicy, export_onnx
+from mcaprl.offline.policy import Policy, load_policy, save_policy
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.conftest import need
+
+try:
+    import onnxruntime
+except ImportError:
+    onnxruntime = None
+
+TINY: dict[str, Any] = {"updates": 1, "batch_size": 4, "hidden": (16, 8)}
+VECTOR = spaces.Box(-5, 5, (3,), np.float32)
+PICTURE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
+MIXED = spaces.Dict(
+    {
+        "action_mask": spaces.MultiBinary(4),
+        "camera": PICTURE,
+        "gear": spaces.Discrete(3, start=-1),
+        "state": spaces.Box(-5, 5, (2, 2), np.float64),
+        "switches": spaces.MultiDiscrete([2, 3]),
+    }
+)
+CASES = [
+    (DQNConfig(**TINY, normalize=True), VECTOR),
+    (DQNConfig(**TINY, n_quantiles=3, dueling=True), VECTOR),
+    (BCQConfig(**TINY), VECTOR),
+    (BCConfig(**TINY, frame_stack=2), PICTURE),
+    (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), PICTURE),
+    (DQNConfig(**TINY), MIXED),
+]
+
+
+def policy_of(config: TrainingConfig, space: spaces.Space[Any], folder: Path) -> Policy:
+    space.seed(0)
+    samples = [space.sample() for _ in range(20)]
+    column: Any
+    if isinstance(space, spaces.Dict):
+        for sample in samples:
+            sample["action_mask"][0] = 1
+        column = {key: np.stack([sample[key] for sample in samples]) for key in space.spaces}
+    else:
+        column = np.stack(samples)
+    data = Dataset.from_arrays(
+        observations=column,
+        actions=np.full(20, 7),
+        rewards=np.ones(20),
+        terminated=np.ones(20, bool),
+        truncated=np.zeros(20, bool),
+        next_observations=column,
+        observation_space=space,
+        action_space=spaces.Discrete(4, start=7),
+    )
+    learner_type = next(each for each in ALGORITHMS.values() if type(config) is each.config_type)
+    learner = learner_type(config, TransitionBuffer.from_dataset(data, config.packing), [0])
+    save_policy(folder, learner, 0, "", {})
+    return load_policy(folder)
+
+
+@pytest.mark.parametrize(("config", "space"), CASES)
+def test_the_exported_policy_gives_the_same_scores_and_actions(
+    tmp_path: Path, config: TrainingConfig, space: spaces.Space[Any]
+) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    policy = policy_of(config, space, tmp_path)
+    export_onnx(policy, tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
+    module = ExportedPolicy(policy)
+    for batch_size in (1, 5):
+        arrays = [tensor.numpy() for tensor in module.examples(batch_size, seed=batch_size)]
+        named = dict(zip(module.input_names, arrays, strict=True))
+        action, scores = session.run(["action", "scores"], named)
+        leaves = [leaf.path[0] for leaf in policy.encoder.leaves if leaf.path]
+        observations = dict(zip(leaves, arrays, strict=True)) if leaves else arrays[0]
+        assert action.dtype == np.int64
+        np.testing.assert_array_equal(action, policy.act(observations))
+        if policy.scores.acts_by == "q_values":
+            np.testing.assert_allclose(scores, policy.q_values(observations), atol=1e-5)
+
+
+def test_the_command_writes_a_file_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    need(onnxruntime is not None, "onnxruntime is not installed")
+    policy_of(DQNConfig(**TINY), VECTOR, tmp_path)
+    out = tmp_path / "policy.onnx"
+    assert run(["export", str(tmp_path), "--out", str(out)]) == 0
+    assert f"{out}: dqn policy" in capsys.readouterr().out
+    assert run(["export", str(tmp_path), "--out", str(out)]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert run(["export", str(tmp_path), "--out", str(tmp_path / "no" / "x.onnx")]) == 1
+    assert "cannot write" in capsys.readouterr().err

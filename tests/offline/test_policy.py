@@ -1,0 +1,333 @@
+"""Saved policies: a round trip through files, and files that are not one."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import PolicyError
+from mcaprl.offline.algorithms.bc import BC, BCConfig
+from mcaprl.offline.algorithms.bcq import BCQ
+from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline.algorithms.cql import CQL, CQLConfig
+from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.algorithms.iql import IQL
+from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.algorithms.networks import NatureConvolutions
+from mcaprl.offline.algorithms.registry import ALGORITHMS
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.policy import Policy, load_policies, load_policy, save_policy
+from mcaprl.offline.training.train import train
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.support.offline_tasks import ACTION_SPACE, N_CELLS, corridor, inner_observations
+
+TINY: dict[str, Any] = {"updates": 20, "batch_size": 16, "hidden": (16, 8)}
+
+
+@pytest.fixture
+def cql_run(tmp_path: Path) -> Path:
+    config = CQLConfig(**TINY, gamma=0.5)
+    train(corridor(), config, tmp_path / "run", seeds=2, progress=lambda _: None)
+    return tmp_path / "run"
+
+
+def learner_of(config: TrainingConfig, dataset: Dataset) -> Learner:
+    learner_type = next(each for each in ALGORITHMS.values() if type(config) is each.config_type)
+    return learner_type(config, TransitionBuffer.from_dataset(dataset, config.packing), [0])
+
+
+def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> Learner:
+    """A learner whose networks give the same outputs for whatever they see."""
+    learner = learner_of(learner_type.config_type(**{**TINY, "hidden": ()}), corridor())
+    for name, constants in zip(learner.policy_models, outputs, strict=True):
+        *_, weight, bias = learner.network(name, 0).parameters()
+        with torch.no_grad():
+            weight.zero_()
+            bias.copy_(torch.tensor(constants))
+    return learner
+
+
+def saved_and_loaded(folder: Path, learner: Learner) -> Policy:
+    save_policy(folder, learner, 0, "Corridor-v0", {"length": 5})
+    return load_policy(folder)
+
+
+def test_a_loaded_policy_gives_the_values_of_the_network_that_was_saved(tmp_path: Path) -> None:
+    learner = learner_of(CQLConfig(**TINY), corridor())
+    policy = saved_and_loaded(tmp_path, learner)
+    with torch.no_grad():
+        seen = Observations(torch.from_numpy(inner_observations()))
+        expected = learner.network("q", 0)(seen).numpy()
+    np.testing.assert_array_equal(policy.q_values(inner_observations()), expected)
+
+
+def test_a_policy_knows_its_task(tmp_path: Path) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
+    assert (policy.algo, policy.env_id) == ("cql", "Corridor-v0")
+    assert policy.env_kwargs == {"length": 5}
+    assert policy.action_space == ACTION_SPACE
+    assert policy.observation_space == spaces.Box(0, 1, (N_CELLS,), np.float32)
+
+
+def test_actions_are_those_of_the_space_and_greedy(tmp_path: Path) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
+    actions = policy.act(inner_observations())
+    assert actions.dtype == np.int64
+    assert actions.tolist() == [6, 6, 6]
+    assert policy.action_probabilities(inner_observations()).tolist() == [[0, 1]] * 3
+
+
+def test_of_equal_values_the_first_is_chosen(tmp_path: Path) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [2.0, 2.0]))
+    assert policy.act(inner_observations()).tolist() == [5, 5, 5]
+    assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
+
+
+def test_a_clone_gives_the_probabilities_it_learned_and_no_values(tmp_path: Path) -> None:
+    logits = np.log([0.25, 0.75]).tolist()
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(BC, logits))
+    assert policy.act(inner_observations()[:1]).tolist() == [6]
+    np.testing.assert_allclose(
+        policy.action_probabilities(inner_observations()[:1]), [[0.25, 0.75]], rtol=1e-6
+    )
+    with pytest.raises(PolicyError, match="no Q-values"):
+        policy.q_values(inner_observations())
+
+
+def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(BC, [1e4, -1e4]))
+    assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
+
+
+def test_filtered_values_leave_out_what_the_log_hardly_shows(tmp_path: Path) -> None:
+    # The second action is worth more, and a tenth as likely as the first.
+    learner = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(inner_observations()).tolist() == [5, 5, 5]
+    assert policy.q_values(inner_observations()).tolist() == [[1, 2]] * 3
+    assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
+
+
+def test_iql_acts_by_its_policy_and_knows_values(tmp_path: Path) -> None:
+    learner = learner_with_outputs(IQL, np.log([0.75, 0.25]).tolist(), [1.0, 2.0])
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(inner_observations()).tolist() == [5, 5, 5]
+    assert policy.q_values(inner_observations()).tolist() == [[1, 2]] * 3
+    np.testing.assert_allclose(
+        policy.action_probabilities(inner_observations()[:1]), [[0.75, 0.25]], rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        DQNConfig(**TINY, dueling=True),
+        DQNConfig(**TINY, n_quantiles=3),
+        DQNConfig(**TINY, layer_norm=True, normalize=True),
+    ],
+)
+def test_every_kind_of_network_comes_back(tmp_path: Path, config: TrainingConfig) -> None:
+    learner = learner_of(config, corridor())
+    policy = saved_and_loaded(tmp_path, learner)
+    with torch.no_grad():
+        outputs = learner.network("q", 0)(learner.buffer.encoder.encode(inner_observations()))
+    expected = outputs.mean(2) if outputs.ndim == 3 else outputs
+    np.testing.assert_allclose(policy.q_values(inner_observations()), expected, rtol=1e-6)
+
+
+def test_normalised_pictures_come_back(tmp_path: Path) -> None:
+    pictures = np.random.default_rng(0).integers(90, 110, (9, 36, 36, 1), dtype=np.uint8)
+    dataset = Dataset.from_arrays(
+        observations=pictures[:-1],
+        actions=np.arange(8) % 2,
+        rewards=np.ones(8),
+        terminated=np.arange(8) == 7,
+        truncated=np.zeros(8, bool),
+        next_observations=pictures[1:],
+    )
+    learner = learner_of(DQNConfig(**TINY, frame_stack=2, normalize=True), dataset)
+    policy = saved_and_loaded(tmp_path, learner)
+    stacks = np.stack([pictures[:-1], pictures[1:]], 1)
+    codes = stacks[..., 0].transpose(0, 2, 3, 1).astype(np.float32)
+    mean = pictures.astype(np.float64).mean(0)
+    centred = (codes - mean) / np.sqrt(np.square(pictures - mean).mean())
+    network = learner.network("q", 0)
+    convolutions, *layers = cast(torch.nn.Sequential, network.stems[0])
+    with torch.no_grad():
+        seen = cast(NatureConvolutions, convolutions).layers(
+            torch.from_numpy(centred).permute(0, 3, 1, 2).float()
+        )
+        expected = network.head(network.body(torch.nn.Sequential(*layers)(seen)))
+    np.testing.assert_allclose(policy.q_values(stacks), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_an_action_that_is_not_allowed_is_not_taken(tmp_path: Path) -> None:
+    mask = np.array([[1, 1], [1, 0]], np.int8)
+    parts = {"action_mask": mask, "x": np.zeros((2, 1), np.float32)}
+    dataset = Dataset.from_arrays(
+        observations=parts,
+        actions=[1, 0],
+        rewards=[1, 0],
+        terminated=[True, True],
+        truncated=[False, False],
+        next_observations=parts,
+    )
+    learner = learner_of(DQNConfig(**{**TINY, "updates": 200}), dataset)
+    for _ in range(200):
+        learner.update()
+    policy = saved_and_loaded(tmp_path, learner)
+    assert policy.act(parts).tolist() == [1, 0]
+    assert policy.q_values(parts)[1, 1] == -np.inf
+
+
+def walk_policy(folder: Path, count: int) -> Policy:
+    """A policy that looks at the last `count` of one number."""
+    steps = np.arange(8, dtype=np.float32)[:, None]
+    dataset = Dataset.from_arrays(
+        observations=steps[:-1],
+        actions=np.arange(7) % 2,
+        rewards=np.ones(7),
+        terminated=np.arange(7) == 6,
+        truncated=np.zeros(7, bool),
+        next_observations=steps[1:],
+    )
+    return saved_and_loaded(folder, learner_of(DQNConfig(**TINY, frame_stack=count), dataset))
+
+
+def test_a_policy_remembers_the_frames_it_looks_at(tmp_path: Path) -> None:
+    policy = walk_policy(tmp_path, 3)
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        policy.begin()
+        frames = random.normal(0, 5, (6, 4, 1)).astype(np.float32)
+        for step in range(6):
+            stack = frames[[max(step - 2, 0), max(step - 1, 0), step]].swapaxes(0, 1)
+            expected = policy.q_values(stack).argmax(1)
+            assert policy.act(frames[step]).tolist() == expected.tolist()
+            assert policy.act(stack).tolist() == expected.tolist()
+
+
+def test_values_of_lone_frames_are_not_made_up(tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match="looks at 3 observations in a row"):
+        walk_policy(tmp_path, 3).q_values(np.zeros((4, 1), np.float32))
+
+
+def test_images_are_taken_as_bytes(tmp_path: Path) -> None:
+    images: NDArray[np.uint8] = np.random.default_rng(0).integers(
+        0, 256, (6, 36, 40, 1), dtype=np.uint8
+    )
+    dataset = Dataset.from_arrays(
+        observations=images,
+        actions=np.arange(6) % 3,
+        rewards=np.zeros(6),
+        terminated=np.ones(6, bool),
+        truncated=np.zeros(6, bool),
+        next_observations=images,
+    )
+    policy = saved_and_loaded(tmp_path, learner_of(BCConfig(**TINY), dataset))
+    assert policy.action_probabilities(images).shape == (6, 3)
+    np.testing.assert_allclose(
+        policy.action_probabilities(images[2:3]),
+        policy.action_probabilities(images)[2:3],
+        rtol=1e-4,
+    )
+
+
+def test_observations_are_only_read(tmp_path: Path) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
+    observations = inner_observations()
+    observations.flags.writeable = False
+    assert policy.act(observations).tolist() == [6, 6, 6]
+    assert policy.act(np.asfortranarray(observations, np.float64)).tolist() == [6, 6, 6]
+
+
+@pytest.mark.parametrize("shape", [(N_CELLS,), (3, N_CELLS + 1), (3, 1, N_CELLS), ()])
+def test_observations_of_another_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
+    with pytest.raises(PolicyError, match=r"takes observations \(B, 5\), got"):
+        policy.act(np.zeros(shape, np.float32))
+
+
+def test_a_run_stands_for_its_first_seed(cql_run: Path) -> None:
+    both, first = load_policies(cql_run), load_policy(cql_run)
+    values = [policy.q_values(inner_observations()) for policy in (*both, first)]
+    assert len(both) == 2
+    np.testing.assert_array_equal(values[0], values[2])
+    assert not np.array_equal(values[0], values[1])
+    second = load_policy(cql_run / "seed-1")
+    np.testing.assert_array_equal(second.q_values(inner_observations()), values[1])
+    assert both[0].name != both[1].name
+
+
+def test_seeds_are_ordered_as_numbers(tmp_path: Path) -> None:
+    for number, best in ((10, [1.0, 0.0]), (9, [0.0, 1.0])):
+        folder = tmp_path / f"seed-{number}"
+        folder.mkdir()
+        save_policy(folder, learner_with_outputs(CQL, best), 0, "", {})
+    actions = [policy.act(inner_observations()[:1]).item() for policy in load_policies(tmp_path)]
+    assert actions == [6, 5]
+
+
+@pytest.mark.parametrize("load", [load_policy, load_policies])
+def test_a_path_without_a_policy_is_named(tmp_path: Path, load: Any) -> None:
+    with pytest.raises(PolicyError, match=f"{tmp_path / 'nowhere'} has no policy"):
+        load(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("name", ["policy.json", "policy.safetensors"])
+@pytest.mark.parametrize("content", [b"", b"{}", b"nonsense", b"\xff" * 100, b"null", b"[1]"])
+def test_a_broken_file_is_one_line(cql_run: Path, name: str, content: bytes) -> None:
+    (cql_run / "seed-0" / name).write_bytes(content)
+    with pytest.raises(PolicyError) as caught:
+        load_policy(cql_run)
+    assert "\n" not in str(caught.value)
+    assert str(cql_run / "seed-0") in str(caught.value)
+
+
+@pytest.mark.parametrize("cut", [1, 8, 100])
+def test_weights_cut_short_are_refused(cql_run: Path, cut: int) -> None:
+    path = cql_run / "seed-0" / "policy.safetensors"
+    path.write_bytes(path.read_bytes()[:-cut])
+    with pytest.raises(PolicyError, match="seed-0"):
+        load_policy(cql_run)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("format_version", 99),
+        ("architecture", {"hidden": [16, 9]}),
+        ("architecture", "wide"),
+        ("acts_by", "wishes"),
+        ("outputs", {"q": [3]}),
+        ("action_space", {"type": "Box", "low": 0, "high": 1, "shape": [2], "dtype": "float32"}),
+        ("observation_space", {"type": "Cupboard"}),
+    ],
+)
+def test_a_description_that_does_not_fit_is_refused(cql_run: Path, key: str, value: Any) -> None:
+    path = cql_run / "seed-0" / "policy.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    with pytest.raises(PolicyError, match="seed-0"):
+        load_policy(cql_run)
+
+
+class Bomb:
+    """Calls a function when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return (pytest.fail, ("a policy file was unpickled",))
+
+
+def test_nothing_is_unpickled(cql_run: Path) -> None:
+    (cql_run / "seed-0" / "policy.safetensors").write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(PolicyError):
+        load_policy(cql_run)

@@ -1,0 +1,150 @@
+"""Learning from a log that another process is still writing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import LogError
+from mcaprl.offline.algorithms.cql import CQL, CQLConfig
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.training.curves import read_curve
+from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
+from mcaprl.offline.training.train import train
+from mcaprl.progress import TrainingProgress
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, run_episode
+from tests.support.paths import ROOT
+
+SMALL = CQLConfig(
+    updates=2 * CHECK_INTERVAL, hidden=(8,), batch_size=8, log_interval=100, target_interval=5
+)
+
+
+class Recorder:
+    """A log that is being written, one random CartPole episode after the other."""
+
+    def __init__(self, path: Path) -> None:
+        self.env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+        self.behavior = EpsilonGreedy(None, 1.0, self.env.action_space)
+        self.seed = 0
+
+    def record(self, episodes: int) -> None:
+        for _ in range(episodes):
+            run_episode(self.env, self.behavior, seed=self.seed)
+            self.seed += 1
+
+
+def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "log.mcap")
+    recorder.record(2)
+    recorder.env.reset(seed=99)
+    recorder.env.step(0)
+    logs = GrowingLogs([tmp_path / "log.mcap"])
+    assert len(logs.dataset.episodes) == 2
+    assert not logs.grow()
+    recorder.record(3)
+    assert logs.grow()
+    assert not logs.grow()
+    recorder.env.close()
+    # The episode that `record` broke off has one transition.
+    assert not logs.grow()
+    whole = mcaprl.open(tmp_path / "log.mcap")
+    assert [len(e.rewards) for e in logs.dataset.episodes] == [
+        len(e.rewards) for e in whole.episodes
+    ]
+    np.testing.assert_array_equal(logs.dataset.observations, whole.observations)
+    np.testing.assert_array_equal(logs.dataset.next_observations, whole.next_observations)
+
+
+def test_files_may_join_later(tmp_path: Path) -> None:
+    first = Recorder(tmp_path / "b.mcap")
+    first.record(1)
+    logs = GrowingLogs([tmp_path])
+    before = logs.dataset.rewards.sum()
+    second = Recorder(tmp_path / "a.mcap")
+    assert not logs.grow()
+    second.record(2)
+    first.record(1)
+    assert logs.grow()
+    assert len(logs.dataset.episodes) == 4
+    # What was there keeps its place.
+    assert logs.dataset.episodes[0].rewards.sum() == before
+    first.env.close()
+    second.env.close()
+
+
+def test_waiting_has_an_end(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"no episode was finished in .*none"):
+        GrowingLogs([tmp_path / "none.mcap"], patience_s=0.0)
+
+
+def test_a_learner_goes_on_as_it_was(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "log.mcap")
+    recorder.record(12)
+    logs = GrowingLogs([tmp_path / "log.mcap"])
+    learner = CQL(SMALL, TransitionBuffer.from_dataset(logs.dataset), [0, 1])
+    for _ in range(10):
+        learner.update()
+    recorder.record(5)
+    recorder.env.close()
+    assert logs.grow()
+    grown = with_more_data(learner, logs.dataset, np.array([3]))
+    assert (grown.step, grown.seeds) == (10, (0, 1))
+    for seed in (0, 1):
+        old, new = learner.state(seed), grown.state(seed)
+        assert all(torch.equal(old[name], new[name]) for name in old)
+    assert len(grown.buffer) == len(logs.dataset)
+    drawn = grown.buffer.sample_rows(2_000, torch.Generator().manual_seed(0))
+    lengths = logs.dataset.episode_lengths
+    episodes = np.repeat(np.arange(17), lengths)[drawn.numpy()]
+    assert set(episodes.tolist()) == set(range(17)) - {3}
+
+
+def test_new_episodes_are_learned_from(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "log.mcap")
+    recorder.record(3)
+    logs = GrowingLogs([tmp_path / "log.mcap"])
+    seen: list[int] = []
+
+    def report(now: TrainingProgress) -> None:
+        seen.append(len(logs.dataset.episodes))
+        if now.done == 200:
+            recorder.record(4)
+
+    train(logs.dataset, SMALL, tmp_path / "run", follow=logs, progress=report)
+    recorder.env.close()
+    per_check = CHECK_INTERVAL // SMALL.log_interval
+    assert seen == [3] * per_check + [7] * per_check
+    whole = np.cumsum(mcaprl.open(tmp_path / "log.mcap").episode_lengths)
+    metrics = read_curve(tmp_path / "run" / "seed-0" / "metrics.csv")
+    assert metrics["transitions"].tolist() == [whole[2]] * per_check + [whole[6]] * per_check
+
+
+def test_the_command_learns_beside_a_recorder_in_another_process(tmp_path: Path) -> None:
+    code = """
+        import sys, time
+        from pathlib import Path
+        from tests.offline.training.test_follow import Recorder
+        recorder = Recorder(Path(sys.argv[1]))
+        for _ in range(60):
+            recorder.record(1)
+            time.sleep(0.02)
+        recorder.env.close()
+    """
+    path = tmp_path / "log.mcap"
+    command = [sys.executable, "-c", textwrap.dedent(code), str(path)]
+    with subprocess.Popen(command, cwd=ROOT):
+        sizes = {"updates": 600, "hidden": 8, "batch-size": 8, "target-interval": 2}
+        options = ["--follow", *(text for k, v in sizes.items() for text in (f"--{k}", f"{v}"))]
+        arguments = ["train-offline", str(path), "--out", str(tmp_path / "run"), *options]
+        assert run(arguments) == 0
+    assert (tmp_path / "run" / "seed-0" / "policy.json").exists()

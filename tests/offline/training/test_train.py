@@ -1,0 +1,461 @@
+"""Training runs: what is in the folder, and what a stop or a kill leaves of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.offline.algorithms.bc import BCConfig
+from mcaprl.offline.algorithms.bcq import BCQConfig
+from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.dqn import DoubleDQNConfig, DQNConfig
+from mcaprl.offline.algorithms.iql import IQLConfig
+from mcaprl.offline.policy import load_policy
+from mcaprl.offline.training.curves import draw_curves, read_curve
+from mcaprl.offline.training.summary import describe_seeds
+from mcaprl.offline.training.train import train
+from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.support.offline_tasks import corridor, crossing
+from tests.support.paths import ROOT
+
+SHORT: dict[str, Any] = {
+    "updates": 100,
+    "batch_size": 16,
+    "hidden": (16,),
+    "log_interval": 10,
+    "checkpoint_interval": 40,
+}
+SHORT_CQL = CQLConfig(**SHORT, target_interval=30, gamma=0.5)
+
+
+LATE = {**SHORT, "gamma": 0.5, "target_interval": 30}
+RESUMABLE = [
+    SHORT_CQL,
+    replace(SHORT_CQL, n_steps=2, frame_stack=2, normalize=True, n_quantiles=3, weight_decay=0.1),
+    DQNConfig(**LATE, dueling=True, layer_norm=True),
+    BCQConfig(**LATE),
+    IQLConfig(**LATE),
+    BCConfig(**SHORT),
+]
+
+
+class Stopped(Exception):
+    """Raised by a callback, as Ctrl-C would."""
+
+
+class StopAt:
+    """A progress callback that stops the training after an update."""
+
+    def __init__(self, update: int) -> None:
+        self.update = update
+
+    def __call__(self, now: TrainingProgress) -> None:
+        if now.done == self.update:
+            raise Stopped
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+def rows(run: Path, seed: int = 0) -> list[dict[str, str]]:
+    with (run / f"seed-{seed}" / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
+    """Weights, moments, generators and curve, bit for bit."""
+    for name in ("policy.safetensors", "checkpoint.safetensors"):
+        found, wanted = (load_file(folder / f"seed-{seed}" / name) for folder in (run, expected))
+        assert found.keys() == wanted.keys()
+        assert all(torch.equal(found[key], tensor) for key, tensor in wanted.items())
+    curves = [(folder / f"seed-{seed}" / "metrics.csv").read_bytes() for folder in (run, expected)]
+    assert curves[0] == curves[1]
+
+
+def test_a_run_folder_has_settings_policy_checkpoint_and_curve(tmp_path: Path) -> None:
+    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    assert summary.folder == tmp_path / "run" / "seed-0"
+    assert (summary.algo, summary.seed, summary.updates, summary.resumed_at) == ("cql", 0, 100, 0)
+    assert summary.seconds > 0
+    names = {path.name for path in summary.folder.iterdir()}
+    assert names > {"policy.json", "policy.safetensors", "checkpoint.safetensors", "metrics.csv"}
+    assert not any(name.endswith(".tmp") for name in names)
+    settings = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert settings["algo"] == "cql"
+    assert settings["config"]["alpha"] == 1.0
+    assert settings["config"]["hidden"] == [16]
+    assert settings["data"] == corridor().fingerprint
+    assert settings["env_id"] == "Corridor-v0"
+
+
+def test_the_curve_names_the_terms_of_the_loss(tmp_path: Path) -> None:
+    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    curve = rows(tmp_path / "run")
+    assert [int(row["update"]) for row in curve] == list(range(10, 101, 10))
+    assert {"learning_rate", "loss", "td_loss", "conservative_penalty", "mean_q"} < curve[0].keys()
+    for row in curve:
+        total = float(row["td_loss"]) + float(row["conservative_penalty"])
+        assert float(row["loss"]) == pytest.approx(total, abs=1e-5)
+    assert float(curve[-1]["learning_rate"]) == pytest.approx(0.02 * 1e-3)
+    assert float(curve[-1]["loss"]) == summary.terms["loss"]
+
+
+def test_tensorboard_shows_the_same_curve(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    events = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+    events.Reload()
+    shown = {event.step: event.value for event in events.Scalars("train/loss")}
+    written = {int(row["update"]): float(row["loss"]) for row in rows(tmp_path / "run")}
+    assert shown == pytest.approx(written)
+
+
+def test_progress_is_told_each_log_interval(tmp_path: Path) -> None:
+    told: list[TrainingProgress] = []
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=told.append)
+    assert [now.done for now in told] == list(range(10, 101, 10))
+    assert all(now.total == 100 and now.terms["loss"] > 0 for now in told)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [DQNConfig(**SHORT, gamma=0.5), DoubleDQNConfig(**SHORT, gamma=0.5), BCConfig(**SHORT)],
+)
+def test_the_same_seed_gives_the_same_curve_and_weights(tmp_path: Path, config: Any) -> None:
+    for name in ("a", "b"):
+        train(corridor(), config, tmp_path / name, seed=0, progress=silent)
+    assert_same_result(tmp_path / "a", tmp_path / "b")
+
+
+def test_the_global_generator_is_left_as_it_was(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_each_seed_gets_a_folder_and_does_not_depend_on_the_others(tmp_path: Path) -> None:
+    summaries = train(corridor(), SHORT_CQL, tmp_path / "all", seeds=2, seed=3, progress=silent)
+    assert [summary.folder.name for summary in summaries] == ["seed-3", "seed-4"]
+    train(corridor(), SHORT_CQL, tmp_path / "one", seed=4, progress=silent)
+    name = Path("seed-4", "policy.safetensors")
+    weights = [load_file(tmp_path / run / name) for run in ("all", "one")]
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+
+
+@pytest.mark.parametrize(
+    ("config", "stop"),
+    [*((SHORT_CQL, stop) for stop in (20, 40, 100)), *((config, 70) for config in RESUMABLE)],
+)
+def test_a_stopped_run_resumes_bit_for_bit(tmp_path: Path, stop: int, config: Any) -> None:
+    train(corridor(), config, tmp_path / "whole", progress=silent)
+    with pytest.raises(Stopped):
+        train(corridor(), config, tmp_path / "cut", progress=StopAt(stop))
+    (summary,) = train(corridor(), config, tmp_path / "cut", resume=True, progress=silent)
+    assert summary.resumed_at == {20: 0, 40: 40, 70: 40, 100: 100}[stop]
+    assert summary.updates == 100
+    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_a_killed_run_resumes_bit_for_bit(tmp_path: Path) -> None:
+    script = """
+        import sys, time
+        from pathlib import Path
+        from mcaprl.offline.training.train import train
+        from tests.support.offline_tasks import corridor
+        from tests.offline.training.test_train import SHORT_CQL
+
+        def linger(now):
+            if now.done == 70:
+                print("reached", flush=True)
+                time.sleep(60)
+
+        train(corridor(), SHORT_CQL, Path(sys.argv[1]), progress=linger)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "cut")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == b"reached\n"
+        child.kill()
+    assert child.returncode == -signal.SIGKILL
+    assert len(rows(tmp_path / "cut")) == 7
+    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=silent)
+    assert summary.resumed_at == 40
+    train(corridor(), SHORT_CQL, tmp_path / "whole", progress=silent)
+    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+
+
+LONG_CQL = replace(SHORT_CQL, updates=1500, checkpoint_interval=20)
+
+
+def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> None:
+    script = """
+        import sys
+        from pathlib import Path
+        from mcaprl.offline.training.train import train
+        from tests.support.offline_tasks import corridor
+        from tests.offline.training.test_train import LONG_CQL
+
+        tell = lambda now: print(now.done, flush=True)
+        train(corridor(), LONG_CQL, Path(sys.argv[1]), seeds=2, resume=True, progress=tell)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "cut")]
+    root = ROOT
+    for moment in np.random.default_rng().uniform(0, 0.4, 2):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=root) as child:
+            assert child.stdout is not None
+            assert child.stdout.readline()
+            time.sleep(moment)
+            child.kill()
+    resumed = train(corridor(), LONG_CQL, tmp_path / "cut", seeds=2, resume=True, progress=silent)
+    assert resumed[0].resumed_at > 0
+    train(corridor(), LONG_CQL, tmp_path / "whole", seeds=2, progress=silent)
+    for seed in (0, 1):
+        assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
+
+
+def test_a_row_torn_by_a_kill_is_dropped(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "whole", progress=silent)
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "cut", progress=StopAt(50))
+    with (tmp_path / "cut" / "seed-0" / "metrics.csv").open("a") as file:
+        file.write("60,0.00")
+    train(corridor(), SHORT_CQL, tmp_path / "cut", resume=True, progress=silent)
+    assert_same_result(tmp_path / "cut", tmp_path / "whole")
+
+
+def test_the_checkpoint_is_written_after_the_policy(tmp_path: Path) -> None:
+    # The other way round, a kill between the two at the last update would leave an old policy
+    # beside a checkpoint that says all is done.
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    folder = tmp_path / "run" / "seed-0"
+    names = ("policy.safetensors", "policy.json", "checkpoint.safetensors")
+    times_ns = [(folder / name).stat().st_mtime_ns for name in names]
+    assert max(times_ns) == times_ns[-1]
+
+
+def test_resuming_adds_seeds_that_are_not_there_yet(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    summaries = train(
+        corridor(), SHORT_CQL, tmp_path / "run", seeds=2, resume=True, progress=silent
+    )
+    assert [(summary.seed, summary.resumed_at) for summary in summaries] == [(0, 100), (1, 0)]
+    assert summaries[0].terms == {}
+
+
+def test_a_run_resumes_only_with_its_own_data(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    with pytest.raises(TrainingError, match=r"config\.json was trained on other data"):
+        train(corridor(repeat=21), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        (replace(SHORT_CQL, alpha=2.0), "has alpha 1.0, not 2.0"),
+        (replace(SHORT_CQL, updates=200), "has updates 100, not 200"),
+        (BCConfig(**SHORT), "has algo 'cql', not 'bc'"),
+    ],
+)
+def test_a_run_resumes_only_with_its_own_settings(tmp_path: Path, other: Any, says: str) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    with pytest.raises(TrainingError, match=says):
+        train(corridor(), other, tmp_path / "run", resume=True, progress=silent)
+
+
+@pytest.mark.parametrize("content", [b"", b"nonsense", b"\xff" * 64])
+def test_a_broken_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    path = tmp_path / "run" / "seed-0" / "checkpoint.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(TrainingError, match=f"{path} is broken"):
+        train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+
+
+def test_a_checkpoint_of_other_data_is_refused(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    train(corridor(repeat=21), SHORT_CQL, tmp_path / "other", progress=silent)
+    name = Path("seed-0", "checkpoint.safetensors")
+    (tmp_path / "run" / name).write_bytes((tmp_path / "other" / name).read_bytes())
+    with pytest.raises(TrainingError, match=r"checkpoint\.safetensors was trained on other data"):
+        train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+
+
+def test_an_existing_run_is_not_replaced(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
+    before = (tmp_path / "run" / "config.json").read_bytes()
+    with pytest.raises(OutputExistsError, match=f"{tmp_path / 'run'} exists"):
+        train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
+    assert (tmp_path / "run" / "config.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_folder_of_other_things_is_left_alone(tmp_path: Path, resume: bool) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(OutputExistsError, match="choose another folder"):
+        train(corridor(), SHORT_CQL, tmp_path, resume=resume, progress=silent)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_resuming_what_never_began_begins_it(tmp_path: Path) -> None:
+    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+    assert (summary.resumed_at, summary.updates) == (0, 100)
+
+
+def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path: Path) -> None:
+    # One step of 1e15 in each of four layers, and the next output is beyond float32.
+    wild = {"learning_rate": 1e15, "hidden": (16, 16, 16), "checkpoint_interval": 1}
+    with pytest.raises(TrainingError) as caught:
+        train(
+            corridor(),
+            DQNConfig(**{**SHORT, **wild}, gamma=0.5, target_interval=10),
+            tmp_path / "run",
+            progress=silent,
+        )
+    message = str(caught.value)
+    folder = tmp_path / "run" / "seed-0"
+    assert message.startswith(f"update 2 of {tmp_path / 'run'}: mean_q of seed 0 is ")
+    assert f"Last good checkpoint: {folder / 'checkpoint.safetensors'}" in message
+    assert "\n" not in message
+    weights = load_file(folder / "policy.safetensors")
+    assert all(torch.isfinite(tensor).all() for tensor in weights.values())
+
+
+def test_a_loss_that_is_not_finite_at_once_has_no_checkpoint(tmp_path: Path) -> None:
+    huge = Dataset.from_arrays(
+        observations=np.zeros((4, 1), np.float32),
+        actions=np.zeros(4, np.int64),
+        rewards=np.full(4, 3e38),
+        terminated=np.ones(4, bool),
+        truncated=np.zeros(4, bool),
+        next_observations=np.zeros((4, 1), np.float32),
+    )
+    with pytest.raises(TrainingError, match=r"update 1 of .*checkpoint: none yet"):
+        train(huge, DQNConfig(**SHORT, gamma=0.5), tmp_path / "run", progress=silent)
+
+
+def test_a_refused_request_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="unknown algorithm 'ddqn'"):
+        train(corridor(), "ddqn", tmp_path / "run")
+    with pytest.raises(UsageError, match="seeds must be at least 1"):
+        train(corridor(), SHORT_CQL, tmp_path / "run", seeds=0)
+    continuous = Dataset.from_arrays(
+        observations=np.zeros((4, 1), np.float32),
+        actions=np.zeros((4, 1), np.float32),
+        rewards=np.zeros(4),
+        terminated=np.ones(4, bool),
+        truncated=np.zeros(4, bool),
+        next_observations=np.zeros((4, 1), np.float32),
+    )
+    with pytest.raises(SpaceError, match="discrete"):
+        train(continuous, SHORT_CQL, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_printed_where_no_terminal_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run")
+    printed = capsys.readouterr()
+    assert printed.out == printed.err == ""
+
+
+def test_importing_the_package_loads_no_torch() -> None:
+    script = "import sys, mcaprl.offline; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_seeds_that_stopped_at_different_updates_go_on_bit_for_bit(tmp_path: Path) -> None:
+    # As if a kill had come between the two seeds' checkpoints at update 80.
+    train(corridor(), SHORT_CQL, tmp_path / "whole", seeds=2, progress=silent)
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "cut", seeds=2, progress=StopAt(90))
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "early", seeds=2, progress=StopAt(50))
+    name = Path("seed-1", "checkpoint.safetensors")
+    (tmp_path / "cut" / name).write_bytes((tmp_path / "early" / name).read_bytes())
+    summaries = train(
+        corridor(), SHORT_CQL, tmp_path / "cut", seeds=2, resume=True, progress=silent
+    )
+    assert [summary.resumed_at for summary in summaries] == [80, 40]
+    for seed in (0, 1):
+        assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
+
+
+def test_other_data_are_taken_if_asked_for(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, normalize=True)
+    with pytest.raises(Stopped):
+        train(corridor(), config, tmp_path / "run", progress=StopAt(50))
+    before = load_policy(tmp_path / "run").encoder
+    other = corridor({(1, 0): 3, (2, 1): 1, (3, 1): 2})
+    with pytest.raises(TrainingError, match=r"other data;.*--other-data"):
+        train(other, config, tmp_path / "run", resume=True, progress=silent)
+    (summary,) = train(
+        other, config, tmp_path / "run", resume=True, other_data=True, progress=silent
+    )
+    assert summary.resumed_at == 40
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["data"] == other.fingerprint
+    # The weights are used to the old normalisation.
+    after = load_policy(tmp_path / "run").encoder
+    assert np.array_equal(before.shift, after.shift)
+    train(other, config, tmp_path / "run", resume=True, progress=silent)
+
+
+def test_weights_are_part_of_the_data(tmp_path: Path) -> None:
+    data = crossing()
+    weights = np.array([1.0, 2.0, 1.0])
+    train(data, SHORT_CQL, tmp_path / "run", weights=weights, progress=silent)
+    train(data, SHORT_CQL, tmp_path / "run", weights=weights, resume=True, progress=silent)
+    with pytest.raises(TrainingError, match="other data"):
+        train(data, SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+    with pytest.raises(UsageError, match="3 numbers of at least 0"):
+        train(data, SHORT_CQL, tmp_path / "other", weights=-weights, progress=silent)
+
+
+@pytest.mark.parametrize("leave", [True, False])
+def test_a_start_that_came_to_nothing_blocks_no_other(tmp_path: Path, leave: bool) -> None:
+    with pytest.raises(Stopped):
+        train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=StopAt(20))
+    if not leave:
+        (tmp_path / "run" / "seed-0" / "mine.txt").write_text("")
+        with pytest.raises(OutputExistsError):
+            train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
+        return
+    train(corridor(), BCConfig(**SHORT), tmp_path / "run", progress=silent)
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["algo"] == "bc"
+    assert len(rows(tmp_path / "run")) == 10
+    events = EventAccumulator(str(tmp_path / "run" / "seed-0"))
+    events.Reload()
+    assert "train/td_loss" not in events.Tags()["scalars"]
+
+
+def test_seeds_are_described_with_mean_and_interval(tmp_path: Path) -> None:
+    summaries = train(corridor(), BCConfig(**SHORT), tmp_path / "run", seeds=3, progress=silent)
+    *lines, mean = describe_seeds(summaries)
+    assert [str(summary.folder) in line for summary, line in zip(summaries, lines, strict=True)]
+    losses = [summary.terms["loss"] for summary in summaries]
+    assert f"loss {np.mean(losses):.4g} [" in mean
+
+
+def test_curves_are_drawn_from_all_seeds(tmp_path: Path) -> None:
+    train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=silent)
+    path = draw_curves(tmp_path / "run")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    curve = read_curve(tmp_path / "run" / "seed-1" / "metrics.csv")
+    assert curve["update"].tolist() == list(range(10, 101, 10))

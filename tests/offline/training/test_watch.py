@@ -1,0 +1,87 @@
+"""What is watched while learning: held-out episodes, short horizons, values that run away."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mcaprl.offline.algorithms.dqn import DQNConfig
+from mcaprl.offline.training.train import train
+from mcaprl.offline.training.watch import choose_held_out, divergence_warning, monte_carlo_returns
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.offline.training.test_train import SHORT, SHORT_CQL, silent
+from tests.support.offline_tasks import corridor, crossing
+
+
+def test_held_out_episodes_are_not_learned_from_but_judged(tmp_path: Path) -> None:
+    # Rewards are 1 in twelve episodes out of 24, chosen to be those held out.
+    held_out = choose_held_out(24, 0.5)
+    data = crossing((10,) * 24)
+    paid = np.isin(np.arange(24), held_out).repeat(10)
+    columns = {
+        name: getattr(data, name)
+        for name in ("observations", "actions", "terminated", "truncated", "next_observations")
+    }
+    data = Dataset.from_arrays(rewards=paid.astype(float), **columns)
+    config = DQNConfig(**{**SHORT, "held_out": 0.5}, gamma=0.0, learning_rate=0.01)
+    (summary,) = train(data, config, tmp_path / "run", progress=silent)
+    assert summary.terms["mean_q"] == pytest.approx(0.0, abs=0.1)
+    assert summary.terms["held_out_return"] == 1.0
+    assert summary.terms["held_out_td_error"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_returns_of_episodes_by_hand() -> None:
+    data = crossing((3, 2))
+    returns = monte_carlo_returns(data, np.array([0, 1]), 0.5)
+    assert returns.tolist() == [1.75, 1.5, 1, 1.5, 1]
+    assert monte_carlo_returns(data, np.array([1]), 0.0).tolist() == [1, 1]
+
+
+def test_a_return_that_was_cut_off_too_soon_is_not_known() -> None:
+    observations = np.zeros((6, 1), np.float32)
+    data = Dataset.from_arrays(
+        observations=observations,
+        actions=np.zeros(6, np.int64),
+        rewards=np.ones(6),
+        terminated=np.zeros(6, bool),
+        truncated=np.arange(6) == 5,
+        next_observations=observations,
+    )
+    returns = monte_carlo_returns(data, np.array([0]), 0.5)
+    # Five steps before the cut, what is missing counts for 1/32 of its worth; four, for 1/16.
+    assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
+
+
+@pytest.mark.parametrize(("episodes", "count"), [(1, 0), (9, 0), (10, 1), (200, 10)])
+def test_about_a_twentieth_of_the_episodes_is_held_out(episodes: int, count: int) -> None:
+    assert len(choose_held_out(episodes, 0.05)) == count
+
+
+def test_too_few_copies_for_the_horizon_are_told(tmp_path: Path) -> None:
+    config = replace(SHORT_CQL, gamma=0.99)
+    with pytest.warns(UserWarning, match="3 copies .* 3% of what gamma 0.99 looks ahead to"):
+        train(corridor(), config, tmp_path / "run", progress=silent)
+
+
+def test_values_that_run_away_are_told_once(tmp_path: Path) -> None:
+    # The second action is never seen, and chased by its own value.
+    data = crossing((50,), n_actions=2)
+    config = DQNConfig(**{**SHORT, "updates": 400, "learning_rate": 0.01}, gamma=0.99)
+    with pytest.warns(UserWarning, match="values diverge") as caught:
+        train(data, replace(config, target_interval=1), tmp_path / "run", progress=silent)
+    (warning,) = caught
+    # Every step pays 1, so no return is above 1 / (1 - .99).
+    assert "beyond 100;" in str(warning.message)
+
+
+@pytest.mark.parametrize(
+    ("before", "value", "tells"),
+    [(10.0, 21.0, True), (10.0, 19.0, False), (30.0, 25.0, False), (-10.0, -21.0, True)],
+)
+def test_values_diverge_if_they_grow_beyond_twice_what_is_possible(
+    before: float, value: float, tells: bool
+) -> None:
+    assert (divergence_warning(before, value, 10.0) is not None) == tells

@@ -1,0 +1,186 @@
+"""Several observations in a row as one: while training, in files of policies, and back."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import DQN
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import PolicyError
+from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.policy import load_policy as load_offline
+from mcaprl.offline.training.train import train as train_offline
+from mcaprl.online.agent import Agent
+from mcaprl.online.evaluation import Scale
+from mcaprl.online.frames import FrameMemory, StackedVecEnv, joined, stacked_space
+from mcaprl.online.policy import load_policy
+from mcaprl.online.task import Task
+from mcaprl.online.train import train
+from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.progress import TrainingProgress
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
+
+SHORT: dict[str, Any] = {
+    "steps": 120,
+    "envs": 4,
+    "hidden": (8,),
+    "frame_stack": 3,
+    "learning_starts": 20,
+    "target_update_interval": 40,
+    "eval_interval": 60,
+    "eval_episodes": 2,
+    "final_episodes": 2,
+    "checkpoint_interval": 60,
+}
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+def test_the_newest_frame_is_last_and_the_first_one_stands_for_what_was() -> None:
+    memory = FrameMemory(spaces.Box(0, 9, (2,)), 3)
+    assert memory.begin(np.array([[1, 2], [5, 6]])).tolist() == [
+        [1, 2, 1, 2, 1, 2],
+        [5, 6, 5, 6, 5, 6],
+    ]
+    assert memory.see(np.array([[3, 4], [7, 8]])).tolist() == [
+        [1, 2, 1, 2, 3, 4],
+        [5, 6, 5, 6, 7, 8],
+    ]
+    assert memory.ending(1, np.array([9, 9])).tolist() == [5, 6, 5, 6, 9, 9]
+    memory.begin_one(1)
+    assert memory.stacked().tolist() == [[1, 2, 1, 2, 3, 4], [7, 8, 7, 8, 7, 8]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "stacked"), [((84, 84, 1), (84, 84, 3)), ((1, 84, 84), (3, 84, 84))]
+)
+def test_pictures_are_joined_along_their_channels(
+    shape: tuple[int, ...], stacked: tuple[int, ...]
+) -> None:
+    space = spaces.Box(0, 255, shape, np.uint8)
+    assert stacked_space(space, 3).shape == stacked
+    frames = np.arange(3, dtype=np.uint8).reshape(1, 3, 1, 1, 1) * np.ones((1, 3, *shape), np.uint8)
+    found = joined(frames, space)
+    assert found.shape == (1, *stacked)
+    axis = stacked.index(3)
+    for k in range(3):
+        assert (np.take(found[0], k, axis) == k).all()
+
+
+def test_environments_stack_as_their_episodes_go() -> None:
+    """What is seen at each step is the newest frame; what is before it was seen before."""
+    batch = Task.for_sim("lane").batch(3)
+    with closing(StackedVecEnv(BatchedVecEnv(batch), 2)) as env:
+        env.seed(0)
+        before: Any = env.reset()
+        assert before.shape == (3, 24)
+        random, ends = np.random.default_rng(0), 0
+        for _ in range(60):
+            now, _, dones, infos = env.step(random.integers(6, size=3))
+            now = np.asarray(now)
+            for row in range(3):
+                if dones[row]:
+                    ends += 1
+                    last = infos[row]["terminal_observation"]
+                    np.testing.assert_array_equal(last[:12], before[row, 12:])
+                    np.testing.assert_array_equal(now[row, :12], now[row, 12:])
+                else:
+                    np.testing.assert_array_equal(now[row, :12], before[row, 12:])
+            before = now
+    assert ends > 3
+
+
+def test_a_stacking_policy_acts_outside_as_it_does_in_training(tmp_path: Path) -> None:
+    """`evaluate` runs single environments and remembers; training stacks in a batch."""
+    task = Task.for_sim("lane", **SHORT)
+    (summary,) = train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
+    path = summary.folder / "best_model.zip"
+    policy = load_policy(path)
+    assert policy.frame_stack == 3
+    log = mcaprl.open(summary.folder / "evaluations" / f"step-{summary.best_step:09d}.mcap")
+    for episode in log.episodes:
+        policy.begin()
+        acted = [int(policy.act(seen[None])[0]) for seen in episode.observations]
+        assert acted == episode.actions.tolist()
+    model = DQN.load(path)
+    assert model.observation_space.shape == (36,)
+    assert mcaprl.open(tmp_path / "log.mcap").observation_space.shape == (12,)
+
+
+def test_the_commands_take_a_stacking_policy(tmp_path: Path) -> None:
+    (summary,) = train(Task.for_sim("lane", **SHORT), tmp_path / "run", progress=silent)
+    path, log = str(summary.folder / "best_model.zip"), str(tmp_path / "log.mcap")
+    assert run(["record", "lane", "--policy", path, "--episodes", "2", "--out", log]) == 0
+    out = tmp_path / "annotated.mcap"
+    assert run(["annotate", log, "--policy", path, "--out", str(out)]) == 0
+    dataset, policy = mcaprl.open(log), load_policy(Path(path))
+    episode = dataset.episodes[0]
+    rows = np.maximum(np.arange(episode.length)[:, None] - [2, 1, 0], 0)
+    values = policy.q_values(episode.observations[rows])
+    assert values.argmax(1).tolist() == episode.actions.tolist()
+
+
+def test_an_offline_policy_that_stacks_is_taken_over(tmp_path: Path) -> None:
+    env = mcaprl.RecordMcap(mcaprl.sims.make_sim("lane"), tmp_path / "log.mcap", scene=False)
+    rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=300)
+    env.close()
+    config = CQLConfig(updates=20, hidden=(8,), frame_stack=3, gamma=0.5, target_interval=2)
+    train_offline(mcaprl.open(tmp_path / "log.mcap"), config, tmp_path / "cql", progress=silent)
+    policy = load_offline(tmp_path / "cql")
+    stacks = np.random.default_rng(0).normal(size=(5, 3, 12)).astype(np.float32)
+    with closing(agent(tmp_path)) as begun:
+        begun.start_from(mcaprl.open(tmp_path / "log.mcap"), policy)
+        model: Any = begun.model
+        with torch.inference_mode():
+            values = model.q_net(torch.from_numpy(stacks.reshape(5, 36))).numpy()
+        np.testing.assert_allclose(values, policy.q_values(stacks), rtol=1e-5, atol=1e-5)
+        assert model.replay_buffer.frames[""].shape[2:] == (12,)
+    with (
+        closing(agent(tmp_path, frame_stack=1)) as other,
+        pytest.raises(PolicyError, match=r"looks at 3 observations in a row.*--frame-stack"),
+    ):
+        other.start_from(None, policy)
+
+
+@pytest.mark.parametrize("options", [{}, {"observation": "depth"}])
+def test_a_run_with_frames_is_resumed(tmp_path: Path, options: dict[str, Any]) -> None:
+    """Weights, the optimiser's moments and the frames come back, pictures' among them."""
+    first = agent(tmp_path, options)
+    with closing(first):
+        first.learn(silent)
+    second = agent(tmp_path, options, resume=True)
+    with closing(second):
+        second.learn(silent)
+    assert second.resumed_at == 120
+    mine: Any = first.model
+    other: Any = second.model
+    for name, value in mine.policy.state_dict().items():
+        assert torch.equal(value, other.policy.state_dict()[name]), name
+    states = [m.policy.optimizer.state_dict()["state"] for m in (mine, other)]
+    weights = list(other.policy.optimizer.param_groups[0]["params"])
+    for number, moments in states[0].items():
+        for name, value in moments.items():
+            found = states[1][number][name]
+            assert torch.equal(value, found)
+            if found.ndim:
+                assert found.stride() == weights[number].stride()
+    kept = mine.replay_buffer.columns()
+    for name, column in other.replay_buffer.columns().items():
+        np.testing.assert_array_equal(column, kept[name], err_msg=name)
+
+
+def agent(folder: Path, options: Any = None, resume: bool = False, **settings: Any) -> Agent:
+    (folder / "seed-0").mkdir(exist_ok=True)
+    task = Task.for_sim("lane", sim_options=options, **{**SHORT, **settings})
+    scale = Scale(0.0, 1.0)
+    return Agent(task, "mcaprl/LaneKeeping-v0", folder / "seed-0", 0, scale, resume=resume)

@@ -1,0 +1,226 @@
+"""Training that is watched: what viewers get, and that it changes nothing."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import UsageError
+from mcaprl.online.live import TRAINING_NAMES, LiveTraining
+from mcaprl.online.task import Task
+from mcaprl.online.train import train
+from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.learner_topic import read_learner
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.viewer.live_stream import Pace
+from tests.conftest import need
+from tests.support.paths import NODE
+
+SHORT: dict[str, Any] = {
+    "steps": 400,
+    "envs": 4,
+    "hidden": (8,),
+    "learning_starts": 60,
+    "eval_interval": 200,
+    "eval_episodes": 2,
+    "final_episodes": 2,
+}
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_frames_take_no_more_than_their_share() -> None:
+    clock = Clock()
+    pace = Pace(share=0.02, period_s=0.1, clock=clock)
+    shown = 0
+    for _ in range(100_000):
+        if pace.due():
+            shown += 1
+            pace.begin()
+            clock.now_s += 0.003
+            pace.pause()
+            # The environment's own step, which is not the frame's.
+            clock.now_s += 0.05
+            pace.begin()
+            clock.now_s += 0.001
+            pace.end()
+        clock.now_s += 0.001
+    # A frame of 4 ms and the 196 ms that belong to it; a step of 50 ms is beside them.
+    assert shown * 0.004 <= 0.02 * clock.now_s
+    assert shown == pytest.approx(clock.now_s / 0.25, rel=0.02)
+
+
+def test_cheap_frames_come_no_faster_than_can_be_seen() -> None:
+    clock = Clock()
+    pace = Pace(share=0.02, period_s=0.1, clock=clock)
+    shown = 0
+    while clock.now_s < 10:
+        if pace.due():
+            shown += 1
+            pace.begin()
+            pace.end()
+        clock.now_s += 0.001
+    assert shown == pytest.approx(100, abs=2)
+
+
+class Watcher:
+    """A viewer of the Foxglove protocol that takes whatever comes."""
+
+    def __init__(self, url: str) -> None:
+        need(shutil.which("node") is not None, "node is not installed")
+        installed = (NODE / "node_modules" / "@foxglove" / "ws-protocol").exists()
+        need(installed, "run `npm ci` in tests/node")
+        self._process = subprocess.Popen(
+            ["node", str(NODE / "watch.mjs"), url], stdout=subprocess.PIPE, text=True
+        )
+        assert self._process.stdout is not None
+        assert self._process.stdout.readline() == "watching\n"
+
+    def seen(self) -> Any:
+        """All that came, once the server has said goodbye."""
+        return json.loads(self._process.communicate(timeout=30)[0])
+
+
+def watched(task: Task, out: Path, **options: Any) -> Any:
+    """Train, watched as closely as can be; what the viewer got."""
+    every = Pace(share=1.0, period_s=0.0)
+    with closing(LiveTraining(task, port=0, pace=every)) as live:
+        watcher = Watcher(live.stream.url)
+        train(task, out, live=live, progress=silent, **options)
+    return watcher.seen()
+
+
+def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
+    """The messages of a topic with messages of one length, as an array."""
+    dtype = message_dtype(seen["topics"][topic]["schema"])
+    assert dtype is not None
+    found = [base64.b64decode(m["bytes"]) for m in seen["messages"] if m["topic"] == topic]
+    return np.frombuffer(b"".join(found), dtype)
+
+
+def test_a_viewer_sees_what_is_recorded(tmp_path: Path) -> None:
+    """With time for every frame, the first environment's transitions are those in the log."""
+    task = Task.for_sim("lane", **SHORT)
+    seen = watched(task, tmp_path / "run", record=tmp_path / "log.mcap")
+    counts = Counter(message["topic"] for message in seen["messages"])
+    each_step = {"/rl/step", "/rl/learner", "/rl/values", "/rl/training"}
+    shown = {"/scene", "/tf", "/telemetry", "/camera/depth"}
+    assert {counts[topic] for topic in each_step | shown} == {100}
+    assert counts["/scene/static"] >= 1
+    steps, learner = decoded(seen, "/rl/step"), decoded(seen, "/rl/learner")
+    log, told = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
+    # Episodes are logged at their ends: find the first environment's by its observations.
+    places = {row.tobytes(): i for i, row in enumerate(log.observations)}
+    rows = [places[observation.tobytes()] for observation in steps["observation"]]
+    for name, column in (("reward", log.rewards), ("behavior_prob", log.behavior_probs)):
+        np.testing.assert_array_equal(steps[name], column[rows], err_msg=name)
+    np.testing.assert_array_equal(steps["action"], log.actions[rows])
+    np.testing.assert_array_equal(steps["terminated"], log.terminated[rows])
+    np.testing.assert_array_equal(learner["epsilon"], told.epsilon[rows])
+    np.testing.assert_array_equal(learner["policy_version"], told.policy_version[rows])
+    ends = [base64.b64decode(m["bytes"]) for m in seen["messages"] if m["topic"] == "/rl/episode"]
+    assert len(ends) == len(np.flatnonzero(steps["terminated"][:-1]))
+    first = messages.decode(ends[0], messages.EPISODE_TYPE)
+    length = int(np.flatnonzero(steps["terminated"])[0]) + 1
+    assert (first.episode, first.length, first.reason) == (steps["episode"][0], length, "off_lane")
+    assert first.total_reward == pytest.approx(steps["reward"][:length].sum())
+
+
+def test_values_and_numbers_are_the_learners(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", **SHORT)
+    seen = watched(task, tmp_path / "run")
+    values, steps = decoded(seen, "/rl/values"), decoded(seen, "/rl/step")
+    assert values["q"].shape == (100, 6)
+    np.testing.assert_array_equal(values["policy_action"], values["q"].argmax(1))
+    np.testing.assert_array_equal(values["agrees"], values["policy_action"] == steps["action"])
+    np.testing.assert_allclose(values["value"], values["q"].max(1), rtol=1e-6)
+    assert (values["q"][0] != values["q"][-1]).all(), "it learns"
+    training = decoded(seen, "/rl/training")
+    assert training.dtype.names == ("encapsulation", *TRAINING_NAMES)
+    assert training["steps"].tolist() == list(range(0, 400, 4))
+    assert np.isnan(training["loss"][:10]).all()
+    assert (training["loss"][30:] > 0).all()
+    assert training["epsilon"][0] == 1.0
+    assert training["epsilon"][-1] == pytest.approx(0.05, rel=1e-3)
+    assert np.isnan(training["score"][0])
+    assert np.isfinite(training["score"][-1])
+
+
+def test_watching_changes_nothing(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", **SHORT)
+    watched(task, tmp_path / "seen", record=tmp_path / "seen.mcap")
+    train(task, tmp_path / "alone", record=tmp_path / "alone.mcap", progress=silent)
+    curves = [tmp_path / name / "seed-0" / "curve.csv" for name in ("seen", "alone")]
+    assert curves[0].read_text() == curves[1].read_text()
+    logs = [mcaprl.open(tmp_path / f"{name}.mcap") for name in ("seen", "alone")]
+    np.testing.assert_array_equal(logs[0].observations, logs[1].observations)
+    np.testing.assert_array_equal(logs[0].behavior_probs, logs[1].behavior_probs)
+    layout = json.loads((tmp_path / "seen" / "foxglove-layout.json").read_text())
+    paths = layout["configById"]["Plot!loss"]["paths"]
+    assert [path["value"] for path in paths] == ["/rl/training.loss"]
+    assert "3D!scene" in layout["configById"]
+
+
+@pytest.mark.parametrize(
+    ("sim", "algo", "options"),
+    [
+        ("CartPole-v1", "ppo", {"rollout_steps": 40, "batch_size": 20}),
+        ("powerline", "a2c", {"rollout_steps": 8}),
+        ("racer", "dqn", {"learning_starts": 20, "frame_stack": 2}),
+    ],
+)
+def test_other_algorithms_and_environments(
+    tmp_path: Path, sim: str, algo: str, options: dict[str, Any]
+) -> None:
+    shared = {name: value for name, value in SHORT.items() if name != "learning_starts"}
+    task = Task.for_sim(sim, algo, **{**shared, "steps": 80, "eval_interval": 80, **options})
+    seen = watched(task, tmp_path / "run")
+    steps, values = decoded(seen, "/rl/step"), decoded(seen, "/rl/values")
+    assert len(steps) == len(values) == 20
+    assert np.isnan(values["q"]).all() == (algo != "dqn")
+    np.testing.assert_allclose(values["preference"].sum(1), 1.0, rtol=1e-5)
+    assert ((values["entropy"] >= 0) & (values["entropy"] <= 1.0001)).all()
+    assert ("/scene" in seen["topics"]) == (sim != "CartPole-v1")
+
+
+def test_the_command_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = ["--steps", "16", "--envs", "4", "--eval-episodes", "1", "--final-episodes", "1"]
+    out = tmp_path / "run"
+    arguments = ["train-online", "lane", *short, "--out", str(out), "--live", "--port", "0"]
+    assert run(arguments) == 0
+    told = capsys.readouterr().out
+    assert "ws://127.0.0.1:" in told
+    assert f"layout to import: {out / 'foxglove-layout.json'}" in told
+    assert (out / "foxglove-layout.json").exists()
+
+
+def test_a_port_that_is_taken() -> None:
+    task = Task.for_sim("lane", **SHORT)
+    with closing(LiveTraining(task, port=0)) as live:
+        port = int(live.stream.url.rpartition(":")[2])
+        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*--port"):
+            LiveTraining(task, port=port)

@@ -1,0 +1,256 @@
+"""What online training records: all transitions, as SB3 stored them, and how they came about."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from numpy.typing import NDArray
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.buffers import ReplayBuffer
+
+import mcaprl
+from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.training.train import train as train_offline
+from mcaprl.online.agent import Agent
+from mcaprl.online.curve import read_curve
+from mcaprl.online.evaluation import Scale
+from mcaprl.online.first_episodes import FirstEpisodes
+from mcaprl.online.policy import load_policy
+from mcaprl.online.recording import behavior_probabilities, log_paths
+from mcaprl.online.task import Task
+from mcaprl.online.train import train
+from mcaprl.online.vec_env import BatchedVecEnv
+from mcaprl.progress import TrainingProgress
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.learner_topic import read_learner
+from mcaprl.sims import make_sim
+
+SHORT: dict[str, Any] = {
+    "steps": 800,
+    "hidden": (8,),
+    "eval_interval": 400,
+    "eval_episodes": 3,
+    "final_episodes": 2,
+    "learning_starts": 160,
+    "target_update_interval": 80,
+    "envs": 4,
+}
+LANE_ACTIONS = 6
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+def trained(folder: Path, **settings: Any) -> tuple[Agent, Dataset]:
+    """An agent that has learned a little, and its log."""
+    folder.mkdir()
+    task = Task.for_sim("lane", "dqn", **{**SHORT, **settings})
+    path = folder / "log.mcap"
+    agent = Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), record=path)
+    with closing(agent):
+        agent.learn(silent)
+    return agent, mcaprl.open(path)
+
+
+def buffered_episodes(buffer: ReplayBuffer) -> list[dict[str, NDArray[Any]]]:
+    """SB3's rows, cut into episodes, in the order in which these ended."""
+    episodes = []
+    for env in range(buffer.n_envs):
+        columns = {
+            name: getattr(buffer, name)[: buffer.size(), env]
+            for name in (
+                "observations",
+                "actions",
+                "rewards",
+                "next_observations",
+                "dones",
+                "timeouts",
+            )
+        }
+        ends = np.flatnonzero(columns["dones"]).tolist()
+        starts = [0, *(end + 1 for end in ends)]
+        for start, end in zip(starts, [*ends, buffer.size() - 1], strict=True):
+            if start <= end:
+                part = {name: values[start : end + 1] for name, values in columns.items()}
+                # What was still open when training ended comes last.
+                episodes.append((end if end in ends else buffer.size(), env, part))
+    return [part for _, _, part in sorted(episodes, key=lambda episode: episode[:2])]
+
+
+@pytest.mark.parametrize("envs", [1, 4])
+def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) -> None:
+    agent, log = trained(tmp_path / "run", envs=envs)
+    assert isinstance(agent.model, DQN)
+    assert agent.model.replay_buffer is not None
+    episodes = buffered_episodes(agent.model.replay_buffer)
+    assert len(log) == sum(len(part["rewards"]) for part in episodes) == 800
+    assert len(log.episodes) == len(episodes) > 10
+    stored = {name: np.concatenate([part[name] for part in episodes]) for name in episodes[0]}
+    np.testing.assert_array_equal(log.observations, stored["observations"])
+    np.testing.assert_array_equal(log.next_observations, stored["next_observations"])
+    np.testing.assert_array_equal(log.actions, stored["actions"][:, 0])
+    np.testing.assert_array_equal(log.rewards.astype(np.float32), stored["rewards"])
+    np.testing.assert_array_equal(log.terminated, (stored["dones"] * (1 - stored["timeouts"])) == 1)
+    timeouts = [episode.truncated[-1] for episode in log.episodes]
+    told = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
+    assert timeouts == told
+
+
+def test_it_trains_offline_as_it_is(tmp_path: Path) -> None:
+    _, log = trained(tmp_path / "run")
+    config = CQLConfig(updates=20, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
+    (summary,) = train_offline(log, config, tmp_path / "offline", progress=silent)
+    assert summary.updates == 20
+
+
+def test_probabilities_are_those_of_the_behavior(tmp_path: Path) -> None:
+    _, log = trained(tmp_path / "run")
+    learner = read_learner(tmp_path / "run" / "log.mcap")
+    epsilon, probs = learner.epsilon, log.behavior_probs
+    warm_up = learner.policy_version == 0
+    # 160 random steps, and the four of the first decision after them.
+    assert (epsilon == 1.0).sum() == 160
+    np.testing.assert_allclose(probs[epsilon == 1.0], 1 / LANE_ACTIONS)
+    low, high = epsilon / LANE_ACTIONS, 1 - epsilon + epsilon / LANE_ACTIONS
+    is_greedy = np.isclose(probs, high, rtol=1e-6)
+    assert (is_greedy | np.isclose(probs, low, rtol=1e-6)).all()
+    settled = ~warm_up & (epsilon <= 0.05)
+    assert is_greedy[settled].mean() > 0.9
+    assert learner.policy_version.max() > 100
+
+
+def test_probabilities_are_right_whatever_was_asked_in_between(tmp_path: Path) -> None:
+    # With a learning rate of next to nothing, the network at the end is that of all steps; an
+    # evaluation after each one asks the network for other actions.
+    _, log = trained(
+        tmp_path / "run",
+        learning_rate=1e-30,
+        exploration_initial_eps=0.5,
+        exploration_final_eps=0.5,
+        eval_interval=4,
+        learning_starts=100,
+        steps=300,
+    )
+    epsilon = read_learner(tmp_path / "run" / "log.mcap").epsilon
+    greedy = load_policy(tmp_path / "run" / "best_model.zip").act(log.observations)
+    expected = epsilon / LANE_ACTIONS + (1 - epsilon) * (log.actions == greedy)
+    np.testing.assert_allclose(log.behavior_probs, expected, rtol=1e-6)
+    assert 0.3 < (log.actions == greedy)[epsilon < 1].mean() < 0.9
+
+
+def test_greedy_steps_are_the_networks_choice() -> None:
+    env = BatchedVecEnv(Task.for_sim("lane").batch(5))
+    model = DQN("MlpPolicy", env, buffer_size=10, learning_starts=0, device="cpu", seed=0)
+    observations: Any = env.reset()
+    model._last_obs = observations
+    model.exploration_rate = 0.4
+    greedy = model.predict(observations, deterministic=True)[0]
+    other = (greedy + 1) % LANE_ACTIONS
+    high, low = 0.6 + 0.4 / LANE_ACTIONS, 0.4 / LANE_ACTIONS
+    np.testing.assert_allclose(behavior_probabilities(model, greedy), high)
+    np.testing.assert_allclose(behavior_probabilities(model, other), low)
+    every = [behavior_probabilities(model, np.full(5, action)) for action in range(LANE_ACTIONS)]
+    np.testing.assert_allclose(np.sum(every, axis=0), 1)
+    model.learning_starts = 100
+    np.testing.assert_allclose(behavior_probabilities(model, greedy), 1 / LANE_ACTIONS)
+    env.close()
+
+
+def test_an_actors_probabilities_sum_to_one() -> None:
+    env = BatchedVecEnv(Task.for_sim("lane").batch(5))
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=40, device="cpu", seed=0)
+    observations: Any = env.reset()
+    model._last_obs = observations
+    every = [behavior_probabilities(model, np.full(5, action)) for action in range(LANE_ACTIONS)]
+    np.testing.assert_allclose(np.sum(every, axis=0), 1, rtol=1e-6)
+    env.close()
+
+
+def test_recording_changes_nothing(tmp_path: Path) -> None:
+    agent, _ = trained(tmp_path / "recorded")
+    train(Task.for_sim("lane", "dqn", **SHORT), tmp_path / "plain", progress=silent)
+    plain = read_curve(tmp_path / "plain" / "seed-0" / "curve.csv")
+    assert [replace(point, score=0.0) for point in plain] == [
+        replace(point, score=0.0) for point in agent.points
+    ]
+
+
+def test_each_evaluation_has_a_log_of_its_own(tmp_path: Path) -> None:
+    agent, _ = trained(tmp_path / "run")
+    paths = sorted((tmp_path / "run" / "evaluations").iterdir())
+    assert [path.name for path in paths] == ["step-000000400.mcap", "step-000000800.mcap"]
+    for path, point in zip(paths, agent.points, strict=True):
+        log = mcaprl.open(path)
+        returns = [episode.total_reward for episode in log.episodes]
+        assert len(returns) == 3
+        assert np.mean(returns) == pytest.approx(point.mean_return, rel=1e-5)
+        assert min(returns) == pytest.approx(point.lowest_return, rel=1e-5)
+        np.testing.assert_array_equal(log.behavior_probs, 1)
+        assert log.env_id == "mcaprl/LaneKeeping-v0"
+    assert len(mcaprl.open(tmp_path / "run" / "evaluations").episodes) == 6
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"observation": "depth"}])
+def test_first_episodes_are_those_of_single_environments(kwargs: dict[str, Any]) -> None:
+    name, count = ("powerline", 2) if kwargs else ("lane", 4)
+    envs = SyncVectorEnv(
+        [lambda: make_sim(name, **kwargs)] * count, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    kept = FirstEpisodes(envs, "")
+    kept.reset(seed=3)
+    random = np.random.default_rng(1)
+    actions = random.integers(6, size=(60, count))
+    for row in actions:
+        kept.step(row)
+    episodes = kept.dataset().episodes
+    assert len(episodes) == count
+    for number, episode in enumerate(episodes):
+        env = make_sim(name, **kwargs)
+        observation: Any = env.reset(seed=3 + number)[0]
+        for step in range(len(episode.rewards)):
+            _check_equal(_at(episode.observations, step), observation)
+            observation, reward, terminated, truncated, _ = env.step(int(actions[step, number]))
+            assert (episode.actions[step], episode.rewards[step]) == (actions[step, number], reward)
+        _check_equal(_at(episode.next_observations, -1), observation)
+        assert step == 59 or terminated or truncated
+
+
+def _at(values: Any, step: int) -> Any:
+    if isinstance(values, dict):
+        return {key: part[step] for key, part in values.items()}
+    return values[step]
+
+
+def _check_equal(one: Any, other: Any) -> None:
+    if isinstance(one, dict):
+        for key in one:
+            _check_equal(one[key], other[key])
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+def test_several_seeds_write_a_file_each(tmp_path: Path) -> None:
+    assert log_paths(tmp_path / "a.mcap", range(3, 4), False) == {3: tmp_path / "a.mcap"}
+    assert log_paths(tmp_path / "a", range(2), False) == {
+        0: tmp_path / "a" / "seed-0.mcap",
+        1: tmp_path / "a" / "seed-1.mcap",
+    }
+    with pytest.raises(UsageError, match="2 seeds write a file of each into a folder"):
+        log_paths(tmp_path / "a.mcap", range(2), False)
+
+
+def test_a_log_that_is_there_is_not_touched(tmp_path: Path) -> None:
+    path = tmp_path / "mine.mcap"
+    path.write_bytes(b"mine")
+    with pytest.raises(OutputExistsError, match=r"mine\.mcap exists"):
+        train(Task.for_sim("lane", **SHORT), tmp_path / "run", record=path, progress=silent)
+    assert path.read_bytes() == b"mine"
+    assert not (tmp_path / "run").exists()

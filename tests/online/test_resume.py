@@ -1,0 +1,242 @@
+"""Stopped, killed and resumed: what comes back, and that the run goes on."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DQN
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import TrainingError
+from mcaprl.offline.training.follow import GrowingLogs
+from mcaprl.online.agent import Agent
+from mcaprl.online.curve import read_curve
+from mcaprl.online.evaluation import Scale
+from mcaprl.online.task import Task
+from mcaprl.online.train import train
+from mcaprl.progress import TrainingProgress
+
+SHORT: dict[str, Any] = {
+    "steps": 2_000,
+    "hidden": (8,),
+    "eval_interval": 400,
+    "eval_episodes": 2,
+    "final_episodes": 2,
+    "learning_starts": 300,
+    "target_update_interval": 200,
+    "checkpoint_interval": 400,
+}
+
+
+class Stopped(Exception):
+    """Raised to stop a training."""
+
+
+def silent(_: TrainingProgress) -> None:
+    """A progress callback that does nothing."""
+
+
+def stop_at(step: int) -> Callable[[TrainingProgress], None]:
+    """A progress callback that stops the training."""
+
+    def report(now: TrainingProgress) -> None:
+        if now.done >= step:
+            raise Stopped
+
+    return report
+
+
+def agent_in(folder: Path, resume: bool, **settings: Any) -> Agent:
+    folder.mkdir(exist_ok=True)
+    task = Task.for_sim("lane", "dqn", **{**SHORT, **settings})
+    return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0), resume=resume)
+
+
+def state_of(agent: Agent) -> dict[str, Any]:
+    """All that training depends on, but for the environments."""
+    model: Any = agent.model
+    buffer = model.replay_buffer
+    return {
+        "steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "calls": model._n_calls,
+        "episodes": model._episode_num,
+        "epsilon": model.exploration_rate,
+        "weights": [value.tolist() for value in model.policy.state_dict().values()],
+        "moments": [
+            {name: value.tolist() for name, value in moments.items()}
+            for moments in model.policy.optimizer.state_dict()["state"].values()
+        ],
+        "buffer": [buffer.pos, buffer.full, buffer.observations.tolist(), buffer.dones.tolist()],
+        "torch": torch.rand(3).tolist(),
+        "numpy": np.random.rand(3).tolist(),  # noqa: NPY002
+        "action": int(model.action_space.sample()),
+    }
+
+
+@pytest.mark.parametrize("settings", [{}, {"n_steps": 3}, {"buffer_size": 1_000}])
+def test_everything_comes_back(tmp_path: Path, settings: dict[str, Any]) -> None:
+    first = agent_in(tmp_path / "run", False, **settings)
+    with closing(first):
+        first.learn(silent)
+    before = state_of(first)
+    second = agent_in(tmp_path / "run", True, **settings)
+    torch.manual_seed(7)
+    with closing(second):
+        second.learn(silent)
+    assert second.resumed_at == 2_000
+    assert second.points == first.points
+    assert state_of(second) == before
+
+
+def test_a_stopped_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    assert (summary.resumed_at, summary.steps) == (800, 2_000)
+    points = read_curve(summary.folder / "curve.csv")
+    assert [point.step for point in points] == [400, 800, 1_200, 1_600, 2_000]
+    names = sorted(path.name for path in summary.folder.glob("progress*"))
+    assert names == ["progress-from-800.csv", "progress.csv"]
+
+
+def test_epsilon_and_learning_rate_go_on_falling(tmp_path: Path) -> None:
+    settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
+    task = Task.for_sim("lane", "dqn", **settings)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    text = (summary.folder / "progress-from-800.csv").read_text().splitlines()
+    header, *rows = [line.split(",") for line in text]
+    rates = [
+        (float(row[header.index("time/total_timesteps")]), float(value))
+        for row in rows
+        if (value := row[header.index("rollout/exploration_rate")])
+    ]
+    for step, epsilon in rates:
+        assert epsilon == pytest.approx(1 - 0.95 * step / 2_000, abs=0.01)
+
+
+def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    (first,) = train(task, tmp_path / "run", progress=silent)
+    curve = (first.folder / "curve.csv").read_bytes()
+    again, more = train(task, tmp_path / "run", seeds=2, resume=True, progress=silent)
+    assert (again.resumed_at, again.steps, again.score) == (2_000, 2_000, first.score)
+    assert (first.folder / "curve.csv").read_bytes() == curve
+    assert (more.resumed_at, more.steps) == (0, 2_000)
+
+
+def test_a_killed_run_goes_on(tmp_path: Path) -> None:
+    code = f"""
+        import sys, time
+        from mcaprl.online.task import Task
+        from mcaprl.online.train import train
+
+        def report(now):
+            print(now.done, flush=True)
+            if now.done >= 1_000:
+                time.sleep(60)
+
+        task = Task.for_sim("lane", "dqn", **{SHORT!r})
+        train(task, sys.argv[1], record=sys.argv[2], progress=report)
+    """
+    log = tmp_path / "log.mcap"
+    command = [sys.executable, "-c", textwrap.dedent(code), str(tmp_path / "run"), str(log)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) >= 1_000:
+                process.send_signal(signal.SIGKILL)
+                break
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    logged = len(GrowingLogs([log]).dataset)
+    (summary,) = train(task, tmp_path / "run", record=log, resume=True, progress=silent)
+    assert (summary.resumed_at, summary.steps) == (800, 2_000)
+    # What was logged before the kill is there, and behind it what was done since.
+    assert 800 < logged <= 1_000
+    assert len(mcaprl.open(log)) == logged + 1_200
+    assert (tmp_path / "log.mcap.damaged").exists()
+
+
+def test_a_log_is_appended_to(tmp_path: Path) -> None:
+    task, log = Task.for_sim("lane", "dqn", **SHORT), tmp_path / "log.mcap"
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", record=log, progress=stop_at(1_000))
+    before = mcaprl.open(log)
+    train(task, tmp_path / "run", record=log, resume=True, progress=silent)
+    after = mcaprl.open(log)
+    assert len(after) == len(before) + 1_200
+    np.testing.assert_array_equal(after.rewards[: len(before)], before.rewards)
+
+
+def test_ppo_goes_on_too(tmp_path: Path) -> None:
+    settings = {**SHORT, "rollout_steps": 512}
+    for name in ("learning_starts", "target_update_interval"):
+        settings.pop(name)
+    task = Task.for_sim("lane", "ppo", **settings)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    assert summary.resumed_at > 500
+    assert summary.steps >= 2_000
+
+
+def test_another_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = {**SHORT, "steps": 200, "eval_interval": 200}
+    train(Task.for_sim("lane", "dqn", **short), tmp_path / "run", progress=silent)
+    other = Task.for_sim("lane", "dqn", **{**short, "gamma": 0.5})
+    with pytest.raises(TrainingError, match=r"has gamma 0\.97, not 0\.5"):
+        train(other, tmp_path / "run", resume=True, progress=silent)
+    out = ["--out", str(tmp_path / "run"), "--resume"]
+    assert run(["train-online", "racer", *out]) == 1
+    assert "has sim 'lane', not 'racer'" in capsys.readouterr().err
+
+
+def test_the_command_resumes_with_the_runs_own_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = {**SHORT, "steps": 200, "eval_interval": 200}
+    train(Task.for_sim("lane", "dqn", **short), tmp_path / "run", progress=silent)
+    assert run(["train-online", "--out", str(tmp_path / "run"), "--resume"]) == 0
+    assert "dqn in lane" in capsys.readouterr().out
+
+
+def test_a_broken_checkpoint_is_told(tmp_path: Path) -> None:
+    short = {**SHORT, "steps": 200, "eval_interval": 200}
+    task = Task.for_sim("lane", "dqn", **short)
+    train(task, tmp_path / "run", progress=silent)
+    path = tmp_path / "run" / "seed-0" / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(TrainingError, match=r"is broken .* delete it to start this seed anew"):
+        train(task, tmp_path / "run", resume=True, progress=silent)
+
+
+def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"algo": "cql", "config": {}}))
+    with pytest.raises(TrainingError, match="is of no online run"):
+        Task.of_run(tmp_path)
+    (tmp_path / "config.json").write_text("[]")
+    with pytest.raises(TrainingError, match="is no JSON object"):
+        Task.of_run(tmp_path)
+
+
+def test_a_resumed_models_file_is_whole(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    assert DQN.load(summary.folder / "best_model.zip").num_timesteps == summary.best_step

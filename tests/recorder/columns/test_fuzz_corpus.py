@@ -1,0 +1,25 @@
+"""Bytes that once broke something, and the seeds of the search for more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.fuzz_target import try_bytes, write_seeds
+from tests.support.paths import FUZZ_CORPUS
+
+CORPUS = sorted((FUZZ_CORPUS).iterdir())
+
+
+@pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
+def test_past_finding(path: Path) -> None:
+    try_bytes(path.read_bytes())
+
+
+def test_seeds(tmp_path: Path) -> None:
+    write_seeds(tmp_path)
+    seeds = sorted(tmp_path.iterdir())
+    assert len(seeds) == 18
+    for seed in seeds:
+        try_bytes(seed.read_bytes())

@@ -1,0 +1,70 @@
+"""Whether logged probabilities can be true: by hand, and for policies that are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from mcaprl.recorder.dataset.calibration import ProbabilityRange, calibration
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.lint import lint
+
+
+def test_by_hand() -> None:
+    found = calibration(np.array([0.5, 0.5, 0.25, 1.0]), spaces.Discrete(3))
+    assert found is not None
+    # (2 + 2 + 4 + 1) / 4, deviations -.25, -.25, 1.75, -1.25: variance 4.75 / 3, over 4.
+    assert (found.available, found.actions) == (3, 2.25)
+    assert found.error == pytest.approx(math.sqrt(4.75 / 3 / 4))
+    assert found.ranges == (
+        ProbabilityRange(1.25 / 3, 3, 2.0),
+        ProbabilityRange(1.0, 1, 0.25),
+    )
+    assert str(found) == "2.25 +- 0.63 of 3 actions"
+
+
+@pytest.mark.parametrize("epsilon", [0.05, 0.3])
+def test_an_epsilon_greedy_policy_has_one_likely_action(epsilon: float) -> None:
+    random = np.random.default_rng(0)
+    rare, steps = epsilon / 9, 50_000
+    likely = random.random(steps) < 1 - epsilon + rare
+    found = calibration(np.where(likely, 1 - epsilon + rare, rare), spaces.Discrete(9))
+    assert found is not None
+    assert found.possible
+    assert found.actions == pytest.approx(9, abs=4 * found.error)
+    few, one = found.ranges
+    assert one.actions == pytest.approx(1, abs=0.02)
+    assert few.actions == pytest.approx(8, abs=4 * found.error)
+
+
+def test_a_policy_that_never_explores_speaks_of_one_action() -> None:
+    found = calibration(np.ones(10), spaces.Discrete(4))
+    assert found is not None
+    assert found.possible
+    assert (found.actions, found.error) == (1.0, 0.0)
+
+
+def test_probabilities_that_are_too_small_are_a_problem() -> None:
+    steps = 400
+    data = Dataset.from_arrays(
+        observations=np.random.default_rng(0).normal(size=(steps, 1)).astype(np.float32),
+        actions=np.arange(steps) % 2,
+        rewards=np.arange(steps) / steps,
+        terminated=np.arange(steps) % 50 == 49,
+        truncated=np.zeros(steps, dtype=np.bool_),
+        next_observations=np.zeros((steps, 1), dtype=np.float32),
+        behavior_probs=np.full(steps, 0.25),
+        action_space=spaces.Discrete(2),
+    )
+    problems = [finding for finding in lint(data) if "behavior_prob" in finding.what]
+    assert [finding.severity for finding in problems] == ["problem"]
+    assert "it speaks of 4.00 +- 0.00 of 2 actions: too many" in problems[0].what
+
+
+def test_what_cannot_be_examined_is_not() -> None:
+    assert calibration(np.array([0.5, math.nan]), spaces.Discrete(2)) is None
+    assert calibration(np.array([0.5, 0.0]), spaces.Discrete(2)) is None
+    assert calibration(np.array([0.5, 0.5]), spaces.Box(-1, 1, (1,))) is None

@@ -1,0 +1,144 @@
+"""Each fault of a dataset is found, told with its place, and not found where it is not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.record.wrapper import RecordMcap
+
+
+def dataset(**changes: Any) -> Dataset:
+    """Two episodes of three steps with nothing to complain of, but for the changes."""
+    rising = np.arange(14, dtype=np.float32).reshape(7, 2) / 14
+    columns: dict[str, Any] = {
+        "observations": rising[[0, 1, 2, 3, 4, 5]],
+        "next_observations": rising[[1, 2, 3, 4, 5, 6]],
+        "actions": np.array([0, 1, 2, 2, 1, 0]),
+        "rewards": np.array([1.0, 3.0, 3.0, 1.0, 2.0, 3.0]),
+        "terminated": np.array([False, False, True, False, False, False]),
+        "truncated": np.array([False, False, False, False, False, True]),
+        "behavior_probs": np.full(6, 0.5),
+        "observation_space": spaces.Box(0, 1, (2,), np.float32),
+        "action_space": spaces.Discrete(3),
+    }
+    return Dataset.from_arrays(**(columns | changes))
+
+
+def changed(column: str, at: Any, value: float) -> dict[str, Any]:
+    """A column of `dataset` with one other value."""
+    array = np.array(getattr(dataset(), column))
+    array[at] = value
+    return {column: array}
+
+
+def test_a_sound_dataset_has_no_findings() -> None:
+    assert lint(dataset()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "severity", "text"),
+    [
+        (
+            changed("observations", (1, 0), math.nan)
+            | changed("next_observations", (0, 0), math.nan),
+            "problem",
+            "1 values of observation are NaN or infinite (episode 0 step 1)",
+        ),
+        (
+            changed("next_observations", (5, 1), math.inf),
+            "problem",
+            "1 values of observation are NaN or infinite (episode 1 step 3)",
+        ),
+        (
+            changed("rewards", 4, -math.inf),
+            "problem",
+            "1 rewards are NaN or infinite (episode 1 step 1)",
+        ),
+        (
+            changed("next_observations", (5, 1), 1.5),
+            "problem",
+            "1 number of observation leave their space (observation[1] is 0.07143 to 1.5, its"
+            " space 0 to 1)",
+        ),
+        ({"rewards": np.zeros(6)}, "problem", "no reward differs from 0 (all steps)"),
+        (
+            {"rewards": np.array([0, 0, 1.0, 0, 0, 0])},
+            "note",
+            "rewards are paid on the last steps of episodes only (1 of 2 episodes)",
+        ),
+        (
+            changed("rewards", 5, -10.0),
+            "problem",
+            "1 truncated episode end with a reward that no other step has (-10, elsewhere 1 to 3)",
+        ),
+        (
+            {"actions": np.array([0, 1, 0, 0, 1, 0])},
+            "note",
+            "1 action of 3 were never taken (2)",
+        ),
+        (
+            changed("behavior_probs", 3, math.nan),
+            "note",
+            "behavior_prob is unknown in 1 of 6 steps (episode 1 step 0)",
+        ),
+        (
+            {name: np.array(getattr(dataset(), name)) * [0, 1] for name in ("observations",)}
+            | {"next_observations": np.array(dataset().next_observations) * [0, 1]},
+            "note",
+            "1 number of observation never change (observation[0])",
+        ),
+    ],
+)
+def test_findings(changes: dict[str, Any], severity: str, text: str) -> None:
+    found = [finding for finding in lint(dataset(**changes)) if text in str(finding)]
+    assert [finding.severity for finding in found] == [severity], lint(dataset(**changes))
+    assert found[0].effect
+
+
+def test_repeated_episodes_are_named() -> None:
+    twice = Dataset.concatenate([dataset(), dataset()])
+    [finding] = lint(twice)
+    assert str(finding).startswith(
+        "2 episodes repeat others, step by step (episodes 0, 2; episodes 1, 3)"
+    )
+
+
+def test_problems_come_before_notes() -> None:
+    findings = lint(dataset(**changed("rewards", 5, -10.0), actions=np.zeros(6, dtype=np.int64)))
+    severities = [finding.severity for finding in findings]
+    assert severities == sorted(severities, reverse=True)
+    assert set(severities) == {"problem", "note"}
+
+
+def test_gaps_in_time_are_measured_in_usual_steps() -> None:
+    gappy = dataset()
+    # Half a second where steps are a tenth apart; from_arrays counts them so.
+    gappy.episodes[1].log_time_ns[2:] += 400_000_000
+    [finding] = lint(gappy)
+    assert str(finding).startswith(
+        "1 gap in time, where steps are 0.1 s apart (the longest is 0.5 s, episode 1 step 1)"
+    )
+
+
+def test_several_policies_are_told(tmp_path: Path) -> None:
+    recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / "mixed.mcap")
+    for policy in ("one", "other"):
+        recorder.policy = policy
+        recorder.reset(seed=0)
+        ended = False
+        while not ended:
+            recorder.behavior_prob = 1.0
+            ended = recorder.step(int(policy == "one"))[2]
+    recorder.close()
+    found = [str(finding) for finding in lint(mcaprl.open(tmp_path / "mixed.mcap"))]
+    assert any("2 policies acted (1 by one, 1 by other)" in text for text in found)

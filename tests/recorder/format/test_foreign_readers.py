@@ -1,0 +1,213 @@
+"""Others' code reads our logs, and every value is the one that we read ourselves."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+import mcaprl
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.schema import stored_dtype
+from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.sims import make_sim
+from tests.conftest import need
+from tests.support.paths import NODE
+from tests.support.recordings import MIXED_SPACE, leaves_of, record
+
+Messages = dict[str, list[tuple[int, Any]]]
+
+
+@pytest.fixture(scope="module", params=["zstd", "lz4", "none"])
+def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two topics of images, vectors of all dtypes, NaN and infinities, several chunks each."""
+    path = tmp_path_factory.mktemp("foreign") / "log.mcap"
+    record(path, MIXED_SPACE, spaces.Discrete(5), [120, 1, 33], compression=request.param)
+    return path
+
+
+def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
+    """What we read: for each topic, its fields as one array over the messages."""
+    dataset = mcaprl.open(path)
+    leaves = observation_leaves(dataset.observation_space)
+    topics: dict[str, dict[str, np.ndarray[Any, Any]]] = {}
+    step: dict[str, list[Any]] = defaultdict(list)
+    images: dict[str, list[Any]] = defaultdict(list)
+    for episode in dataset.episodes:
+        last = episode.length
+        for row in range(last + 1):
+            final = row == last
+            source = episode.next_observations if final else episode.observations
+            index = row - 1 if final else row
+            for leaf, array in zip(leaves, leaves_of(source), strict=True):
+                (images if leaf.encoding else step)[leaf.name].append(array[index])
+            step["reward"].append(0.0 if final else episode.rewards[row])
+            step["action"].append(0 if final else episode.actions[row])
+            step["behavior_prob"].append(np.nan if final else episode.behavior_probs[row])
+            step["terminated"].append(not final and episode.terminated[row])
+            step["truncated"].append(not final and episode.truncated[row])
+            step["final"].append(final)
+            step["episode"].append(episode.index)
+            step["step"].append(row)
+    topics["/rl/step"] = {name: np.array(values) for name, values in step.items()}
+    for leaf in leaves:
+        if leaf.encoding:
+            topics[leaf.topic] = {"data": np.array(images[leaf.name])}
+    summaries = [episode.summary._asdict() for episode in dataset.episodes]
+    topics["/rl/episode"] = {
+        name: np.array([summary[name] for summary in summaries]) for name in EpisodeSummary._fields
+    }
+    return topics
+
+
+def by_mcap_indexed(path: Path) -> Messages:
+    with path.open("rb") as file:
+        return _by_mcap(
+            SeekingReader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        )
+
+
+def by_mcap_streaming(path: Path) -> Messages:
+    with path.open("rb") as file:
+        reader = NonSeekingReader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return _by_mcap(reader)
+
+
+def _by_mcap(reader: SeekingReader | NonSeekingReader) -> Messages:
+    messages: Messages = defaultdict(list)
+    for _, channel, message, decoded in reader.iter_decoded_messages():
+        messages[channel.topic].append((message.log_time, decoded))
+    return messages
+
+
+def by_rosbags(path: Path) -> Messages:
+    messages: Messages = defaultdict(list)
+    with AnyReader([path]) as bag:
+        for connection, time_ns, data in bag.messages():
+            decoded = bag.deserialize(data, connection.msgtype)
+            messages[connection.topic].append((time_ns, decoded))
+    return messages
+
+
+def by_node(path: Path) -> Messages:
+    need(shutil.which("node") is not None, "Node is not installed")
+    need((NODE / "node_modules").is_dir(), "packages of tests/node are not installed: npm ci")
+    command = ["node", str(NODE / "dump.mjs"), str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    messages: Messages = defaultdict(list)
+    for line in done.stdout.splitlines():
+        found = json.loads(line)
+        messages[found["topic"]].append((int(found["logTime"]), found["value"]))
+    return messages
+
+
+READERS = [by_mcap_indexed, by_mcap_streaming, by_rosbags, by_node]
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_every_value_is_ours(log: Path, read: Callable[[Path], Messages]) -> None:
+    found, expected = read(log), ours(log)
+    for topic, fields in expected.items():
+        for name, column in fields.items():
+            values = [_field(message, name) for _, message in found[topic]]
+            _assert_equal(values, column, f"{topic}.{name}")
+    times = {topic: [time for time, _ in messages] for topic, messages in found.items()}
+    for topic in expected:
+        assert (np.diff(times[topic]) > 0).all(), f"log_time of {topic} does not rise"
+        if topic != "/rl/episode":
+            assert times[topic] == times["/rl/step"]
+
+
+@pytest.fixture(scope="module")
+def scene_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of the lane sim with its scene."""
+    path = tmp_path_factory.mktemp("foreign") / "lane.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path)) as env:
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(1)
+    return path
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_markers_and_frames_pass_through(scene_log: Path, read: Callable[[Path], Messages]) -> None:
+    found = read(scene_log)
+    (episode,) = mcaprl.open(scene_log).episodes
+    moments = list(moments_of_episode(McapReader(scene_log), episode))
+    assert [time for time, _ in found["/scene"]] == episode.log_time_ns.tolist()
+    for topic, parts in (("/scene", "moving"), ("/scene/static", "static")):
+        for (_, array), moment in zip(found[topic], moments, strict=False):
+            shapes = {shape.name: shape for shape in getattr(moment, parts)}
+            markers = {_field(m, "ns"): m for m in _field(array, "markers") if _field(m, "ns")}
+            assert markers.keys() == shapes.keys()
+            for name, marker in markers.items():
+                points = [[_field(p, axis) for axis in "xyz"] for p in _field(marker, "points")]
+                assert points == shapes[name].points.tolist(), name
+                assert _field(_field(marker, "header"), "frame_id") == shapes[name].frame
+    for (_, tree), moment in zip(found["/tf"], moments, strict=True):
+        (transform,) = _field(tree, "transforms")
+        translation = _field(_field(transform, "transform"), "translation")
+        assert tuple(_field(translation, axis) for axis in "xyz") == moment.frames[0].position
+
+
+def test_streaming_gives_all_topics(log: Path) -> None:
+    counts = {topic: len(messages) for topic, messages in by_mcap_streaming(log).items()}
+    indexed = {topic: len(messages) for topic, messages in by_mcap_indexed(log).items()}
+    assert counts == indexed
+    assert counts["/rosout"] == 6
+
+
+def test_doctor_finds_nothing(log: Path) -> None:
+    doctor = Path(sys.executable).with_name("pymcap-cli")
+    need(doctor.exists(), "pymcap-cli is not installed")
+    done = subprocess.run(
+        [str(doctor), "doctor", str(log)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "passed" in done.stdout
+
+
+def _field(message: Any, name: str) -> Any:
+    return message[name] if isinstance(message, dict) else getattr(message, name)
+
+
+def _assert_equal(values: list[Any], column: np.ndarray[Any, Any], where: str) -> None:
+    """Compare as the dtype of our column, bit for bit; texts and None by their own equality."""
+    assert len(values) == len(column), f"{where}: {len(values)} messages, not {len(column)}"
+    if column.dtype.kind in "OU":
+        assert [_known(value) for value in values] == column.tolist(), where
+        return
+    dtype = stored_dtype(column.dtype)
+    # One element at a time: a list of big integers as text must not pass through float.
+    lists = [list(value) if isinstance(value, bytes) else value for value in values]
+    flat = [_number(part, dtype) for value in lists for part in np.ravel(value).tolist()]
+    actual = np.array(flat, dtype)
+    expected = column.astype(dtype).ravel()
+    assert actual.tobytes() == expected.tobytes(), where
+
+
+def _number(value: Any, dtype: np.dtype[Any]) -> Any:
+    return int(value) if dtype.kind in "iub" else float(value)
+
+
+def _known(value: Any) -> Any:
+    """`/rl/episode` has -1 where no seed was given."""
+    if isinstance(value, str) and value.lstrip("-").isdigit():
+        value = int(value)
+    return None if value == -1 else value

@@ -1,0 +1,49 @@
+"""Logs of format version 1 that were written once: they open, with what is stated, for ever."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+import mcaprl
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.dataset.learner_topic import read_learner
+from mcaprl.recorder.repair.check import check_log
+from tests.golden.make import CONTENTS, FILES, FOLDER, contents_of
+from tests.support.faults import assert_is_told
+
+STATED = json.loads(CONTENTS.read_text())
+
+
+def test_every_golden_file_is_there() -> None:
+    assert set(STATED) == set(FILES)
+    assert sum(path.stat().st_size for path in FOLDER.glob("*.mcap")) < 1_000_000
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_golden_file_reads_as_stated(name: str) -> None:
+    path, stated = FOLDER / f"{name}.mcap", dict(STATED[name])
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == stated.pop("sha256"), "it is changed"
+    assert json.loads(json.dumps(contents_of(path))) == stated
+    assert check_log(path) == []
+
+
+def test_values_that_are_known() -> None:
+    """Beside the hashes, one file whose contents follow from its numbers alone."""
+    (episode,) = mcaprl.open(FOLDER / "told.mcap").episodes
+    assert_is_told(episode)
+
+
+def test_learner_of_a_vector() -> None:
+    learner = read_learner(FOLDER / "vector-of-environments.mcap")
+    assert set(learner.epsilon.tolist()) == {0.5}
+    assert learner.policy_version.max() == 7
+
+
+def test_compressions_are_those_of_their_names() -> None:
+    for name, compression in (("zstd", "zstd"), ("lz4", "lz4"), ("none", "")):
+        path: Path = FOLDER / f"every-space-{name}.mcap"
+        assert {chunk.compression for chunk in McapReader(path).chunks} == {compression}

@@ -1,0 +1,211 @@
+"""The generated messages: their text, their bytes, their names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from mcaprl.errors import SpaceError
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.schema import (
+    image_dtype,
+    is_intact,
+    message_dtype,
+    step_schema,
+    telemetry_schema,
+)
+from mcaprl.recorder.format.spaces import observation_leaves
+from tests.support.recordings import MIXED_SPACE
+
+
+def test_step_text_by_hand() -> None:
+    box = spaces.Box(-1, 1, (3,), np.float32)
+    name, text = step_schema(box, spaces.Discrete(4))
+    assert text.splitlines() == [
+        "float64 reward",
+        "int64 action",
+        "float32[3] observation",
+        "float32 behavior_prob",
+        "uint32 episode",
+        "uint32 step",
+        "bool terminated",
+        "bool truncated",
+        "bool final",
+    ]
+    dtype = message_dtype(text)
+    assert dtype is not None
+    assert dtype.itemsize == 4 + 8 + 8 + 12 + 4 + 4 + 4 + 3
+    assert is_intact(name, text.encode())
+    assert not is_intact(name, text.replace("[3]", "[2]").encode())
+    assert is_intact("other_msgs/msg/Step", b"anything")
+
+
+def test_other_spaces_have_other_names() -> None:
+    box, larger = (spaces.Box(-1, 1, (n,), np.float32) for n in (3, 4))
+    assert step_schema(box, spaces.Discrete(4))[0] == step_schema(box, spaces.Discrete(5))[0]
+    assert step_schema(box, spaces.Discrete(4))[0] != step_schema(larger, spaces.Discrete(4))[0]
+
+
+def test_names_of_dict_leaves() -> None:
+    names = {leaf.path: leaf.name for leaf in observation_leaves(MIXED_SPACE)}
+    assert names[("joints", "q")] == "observation_joints_q"
+    assert names[("Ünïcode key!",)] == "observation_n_code_key"
+    assert names[("camera",)] == "camera"
+    doubled = spaces.Dict({"a b": spaces.Discrete(2), "a_b": spaces.Discrete(2)})
+    assert [leaf.name for leaf in observation_leaves(doubled)] == [
+        "observation_a_b",
+        "observation_a_b_2",
+    ]
+
+
+def test_image_needs_size_and_uint8() -> None:
+    cases = [
+        ((84, 84, 1), np.uint8, "mono8"),
+        ((84, 84), np.uint8, "mono8"),
+        ((9, 8, 3), np.uint8, "rgb8"),
+        ((9, 8, 4), np.uint8, "rgba8"),
+        ((4, 84, 84), np.uint8, None),
+        ((7, 84, 3), np.uint8, None),
+        ((84, 84, 3), np.uint16, None),
+    ]
+    for shape, dtype, encoding in cases:
+        (leaf,) = observation_leaves(spaces.Box(0, 255, shape, dtype))
+        assert leaf.encoding == encoding, f"{shape} {dtype}"
+
+
+FIELDS = {"float64": 8, "int64": 8, "float32": 4, "uint16": 2, "uint8": 1, "bool": 1}
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(list(FIELDS)), st.integers(0, 3)), min_size=1, max_size=8)
+)
+def test_any_fixed_message_has_the_bytes_that_rosbags_writes(fields: list[tuple[str, int]]) -> None:
+    """Fields in any order, so with padding; each filled with its own number."""
+    text = "".join(
+        f"{kind}{f'[{count}]' if count else ''} f{number}\n"
+        for number, (kind, count) in enumerate(fields)
+    )
+    dtype = message_dtype(text)
+    assert dtype is not None
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, "any_msgs/msg/Any"))
+    values: dict[str, Any] = {}
+    ours = np.zeros((), dtype)
+    ours["encapsulation"] = 0x0100
+    for number, (kind, count) in enumerate(fields):
+        one = number % 2
+        values[f"f{number}"] = (
+            np.full(count, one, kind) if count else (bool(one) if kind == "bool" else one)
+        )
+        ours[f"f{number}"] = one
+    theirs = store.serialize_cdr(store.types["any_msgs/msg/Any"](**values), "any_msgs/msg/Any")
+    assert ours.tobytes() == bytes(theirs)
+
+
+@pytest.mark.parametrize("text", ["string name\n", "float32[] data\n", "geometry_msgs/Point p\n"])
+def test_no_fixed_length(text: str) -> None:
+    assert message_dtype(text) is None
+
+
+def test_comments_and_constants_take_no_place() -> None:
+    dtype = message_dtype("# nothing\nuint8 A=1\nuint8 x # one byte\n\n")
+    assert dtype is not None
+    assert dtype.names == ("encapsulation", "x")
+    assert dtype.itemsize == 5
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.sampled_from(["a", "camera", "x/y_z"]))
+def test_image_layout_is_that_of_rosbags(height: int, width: int, frame: str) -> None:
+    from mcaprl.recorder.format.schema import fill_image_constants
+
+    dtype = image_dtype(height, width, 3, "rgb8", frame)
+    ours = np.zeros(1, dtype)
+    fill_image_constants(ours, height, width, "rgb8", frame)
+    pixels = np.arange(height * width * 3, dtype=np.uint8)
+    ours["sec"], ours["nanosec"], ours["data"] = 5, 7, pixels
+    image = messages.new(
+        "sensor_msgs/msg/Image",
+        header=messages.header(5 * 10**9 + 7, frame),
+        height=height,
+        width=width,
+        encoding="rgb8",
+        is_bigendian=0,
+        step=3 * width,
+        data=pixels,
+    )
+    assert ours.tobytes() == messages.encode(image)
+
+
+@pytest.mark.parametrize("name", ["Speed m/s", "2nd", "a__b", "a_", "größe"])
+def test_telemetry_needs_ros_names(name: str) -> None:
+    with pytest.raises(SpaceError, match="no ROS field name"):
+        telemetry_schema(["speed_m_s", name])
+
+
+@pytest.mark.parametrize(
+    "text", ["float32 x\nfloat32 x\n", "float32[99999999999999999999] x\n", "uint8 encapsulation\n"]
+)
+def test_impossible_definitions(text: str) -> None:
+    assert message_dtype(text) is None
+
+
+def test_what_a_log_cannot_hold() -> None:
+    discrete = spaces.Discrete(2)
+    cases = [
+        (spaces.Tuple([discrete]), "observation is a Tuple space"),
+        (spaces.Dict({"x": spaces.Graph(discrete, None)}), r"observation\['x'\] is a Graph space"),
+        (spaces.Box(-1, 1, (0,)), "no numbers at all"),
+        (spaces.Dict({}), "empty Dict"),
+    ]
+    for space, message in cases:
+        with pytest.raises(SpaceError, match=message):
+            step_schema(space, discrete)
+
+
+def test_action_names_are_one_for_each() -> None:
+    box = spaces.Box(-1, 1, (2,), np.float32)
+
+    def names(space: spaces.Space[Any], *meanings: str) -> dict[int, str]:
+        return LogMetadata(box, space, action_meanings=meanings).action_names()
+
+    assert names(spaces.Discrete(2, start=5), "left", "right") == {5: "left", 6: "right"}
+    assert names(spaces.Discrete(2), "left", "left") == {0: "0", 1: "1"}
+    assert names(spaces.Discrete(2), "left") == {0: "0", 1: "1"}
+    assert names(box, "left") == {}
+
+
+@given(
+    st.text(max_size=9),
+    st.text(max_size=9),
+    st.text(max_size=9),
+    st.integers(0, 2**62),
+    st.none() | st.integers(0, 2**62),
+)
+def test_what_is_told_of_an_episode_is_encoded_as_rosbags_does(
+    reason: str, policy: str, options: str, time_ns: int, seed: int | None
+) -> None:
+    summary = EpisodeSummary(
+        7, 9, -2.5, True, False, time_ns, time_ns + 9, reason, policy, 0.25, seed, options
+    )
+    fields = {**summary._asdict(), "seed": -1 if seed is None else seed}
+    episode = messages.new(messages.EPISODE_TYPE, **fields)
+    assert summary.to_message() == messages.encode(episode)
+    line = messages.new(
+        messages.LOG_TYPE,
+        stamp=messages.stamp(time_ns % 2**60),
+        level=20,
+        name="mcaprl",
+        msg=reason,
+        file="",
+        function="",
+        line=0,
+    )
+    assert messages.log_message(time_ns % 2**60, reason) == messages.encode(line)

@@ -1,0 +1,437 @@
+"""RecordMcap: what is logged when, and what happens to episodes that are broken off."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.errors import LogError, NoStepsError, OutputExistsError, SpaceError, UsageError
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.signals import HoldSignals
+from mcaprl.recorder.repair.check import check_log
+from tests.support.recordings import ScriptedEnv
+
+BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+
+def two(a: float, b: float) -> np.ndarray[Any, Any]:
+    return np.array([a, b], np.float32)
+
+
+def scripted(*episodes: list[tuple[Any, float, bool, bool]], **infos: Any) -> ScriptedEnv:
+    return ScriptedEnv(BOX, spaces.Discrete(3), episodes, infos)
+
+
+ONE = [
+    (two(0, 0), 0.0, False, False),
+    (two(1, 10), 0.5, False, False),
+    (two(2, 20), -1.5, True, False),
+]
+
+
+def test_columns_by_hand(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="me", epsilon=0.5)) as env:
+        env.reset(seed=7)
+        env.behavior_prob = 0.25
+        env.step(2)
+        env.step(np.int64(1))
+        env.reset()
+        env.step(0)
+        env.step(0)
+    data = mcaprl.open(log_path)
+    assert data.observations.tolist() == [[0, 0], [1, 10], [0, 0], [1, 10]]
+    assert data.next_observations.tolist() == [[1, 10], [2, 20], [1, 10], [2, 20]]
+    assert data.actions.tolist() == [2, 1, 0, 0]
+    assert data.rewards.tolist() == [0.5, -1.5, 0.5, -1.5]
+    assert data.terminated.tolist() == [False, True, False, True]
+    assert not data.truncated.any()
+    assert data.behavior_probs[0] == 0.25
+    assert np.isnan(data.behavior_probs[1:]).all(), "a probability holds for one step"
+    first, second = data.episodes
+    assert (first.seed, second.seed) == (7, None)
+    assert (first.total_reward, first.reason, first.policy, first.epsilon) == (
+        -1.0,
+        "terminated",
+        "me",
+        0.5,
+    )
+
+
+def test_reason_comes_from_info(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE, reason="off_lane"), log_path)) as env:
+        env.reset()
+        env.step(0)
+        env.step(0)
+    assert mcaprl.open(log_path).episodes[0].reason == "off_lane"
+
+
+def test_log_times(log_path: Path) -> None:
+    start = 1_700_000_000_123_456_789
+    recorder = mcaprl.RecordMcap(
+        scripted(ONE, ONE), log_path, start_time_ns=start, step_duration_s=0.25
+    )
+    with closing(recorder) as env:
+        for _ in range(2):
+            env.reset()
+            env.step(0)
+            env.step(0)
+    first, second = mcaprl.open(log_path).episodes
+    assert (first.log_time_ns - start).tolist() == [0, 250_000_000, 500_000_000]
+    assert (second.log_time_ns - start).tolist() == [750_000_000, 1_000_000_000, 1_250_000_000]
+
+
+@pytest.mark.parametrize("way", ["reset", "close"])
+def test_interrupted_episode_is_kept(log_path: Path, way: str) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path)
+    env.reset()
+    env.step(1)
+    if way == "reset":
+        env.reset()
+    env.close()
+    env.close()
+    data = mcaprl.open(log_path)
+    assert len(data.episodes) == 1, "an episode without a transition leaves no trace"
+    assert data.truncated.tolist() == [True]
+    assert data.terminated.tolist() == [False]
+    assert data.episodes[0].reason == "interrupted"
+    assert data.next_observations.tolist() == [[1, 10]]
+
+
+class ReusesBuffer(gym.Env[Any, Any]):
+    observation_space = spaces.Dict({"image": spaces.Box(0, 255, (8, 8), np.uint8), "x": BOX})
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self) -> None:
+        self.values = {"image": np.zeros((8, 8), np.uint8), "x": two(0, 0)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.values["image"][:] = 0
+        self.values["x"][:] = 0
+        return self.values, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.values["image"] += 1
+        self.values["x"] += 1
+        action[:] = 99  # spoils its argument, too
+        return self.values, 1.0, False, bool(self.values["x"][0] == 3), {}
+
+
+def test_reused_buffers_are_copied(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(ReusesBuffer(), log_path)) as env:
+        env.reset()
+        for _ in range(3):
+            env.step(np.zeros(2, np.float32))
+    data = mcaprl.open(log_path)
+    assert data.observations["x"][:, 0].tolist() == [0, 1, 2]
+    assert data.next_observations["image"][:, 0, 0].tolist() == [1, 2, 3]
+    assert data.actions.tolist() == [[0, 0], [0, 0], [0, 0]], "the action that was asked for"
+
+
+def test_wrong_shapes_are_refused(log_path: Path) -> None:
+    bad = [(np.zeros(3, np.float32), 0.0, False, False)]
+    with (
+        closing(mcaprl.RecordMcap(scripted(bad), log_path)) as env,
+        pytest.raises(SpaceError, match=r"observation has shape \(3,\); its space declares \(2,\)"),
+    ):
+        env.reset()
+
+
+def test_episode_ends_before_a_wrong_observation(log_path: Path) -> None:
+    rows = [*ONE[:2], (np.zeros(3, np.float32), 9.0, False, False)]
+    env = mcaprl.RecordMcap(scripted(rows), log_path)
+    env.reset()
+    env.step(1)
+    with pytest.raises(SpaceError):
+        env.step(2)
+    env.close()
+    data = mcaprl.open(log_path)
+    assert data.rewards.tolist() == [0.5]
+    assert data.next_observations.tolist() == [[1, 10]]
+    assert data.episodes[0].total_reward == 0.5
+
+
+class Breaks(ScriptedEnv):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if action == 2:
+            raise RuntimeError("motor on fire")
+        return super().step(action)
+
+
+def test_episode_ends_before_an_exception(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(Breaks(BOX, spaces.Discrete(3), [ONE]), log_path)
+    env.reset()
+    env.step(1)
+    with pytest.raises(RuntimeError, match="motor on fire"):
+        env.step(2)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(1)
+    env.close()
+    data = mcaprl.open(log_path)
+    assert data.actions.tolist() == [1]
+    assert data.truncated.tolist() == [True]
+    assert data.next_observations.tolist() == [[1, 10]]
+
+
+def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
+    rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
+    env = mcaprl.RecordMcap(scripted(rows), log_path)
+    with pytest.warns(UserWarning, match="observation is float64, its space declares float32"):
+        env.reset()
+    env.step(0)
+    env.close()
+    assert mcaprl.open(log_path).observations.tolist() == [two(0.1, 0.2).tolist()]
+
+
+def test_what_a_space_cannot_hold_is_refused(log_path: Path) -> None:
+    scalar = spaces.Dict({"a": spaces.Box(0, 255, (), np.uint8), "b": spaces.Discrete(5)})
+    for number, bad in enumerate([{"a": 300, "b": 1}, {"a": 3, "b": 2.7}, {"a": 3}, None]):
+        rows = [({"a": 1, "b": 2}, 0.0, False, False), (bad, 1.0, False, False)]
+        path = log_path.with_name(f"{number}.mcap")
+        env = mcaprl.RecordMcap(ScriptedEnv(scalar, spaces.Discrete(3), [rows]), path)
+        env.reset()
+        with pytest.raises(SpaceError, match=r"observation\['[ab]'\]"):
+            env.step(0)
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(0)
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("space", "action", "kept"),
+    [
+        (spaces.Discrete(5), 1.7, None),
+        (spaces.Discrete(5), np.array([1, 2]), None),
+        (spaces.Discrete(5), np.array([3]), 3),
+        (spaces.Discrete(5), True, 1),
+        (spaces.MultiDiscrete([3, 3]), [1.5, 2], None),
+        (spaces.MultiDiscrete([3, 3]), [1, 2], [1, 2]),
+        (spaces.Box(-1, 1, (), np.float32), 0.25, 0.25),
+        (spaces.Box(-1, 1, (2,), np.float32), [0.5, -0.5], [0.5, -0.5]),
+    ],
+)
+def test_actions_are_kept_or_refused(log_path: Path, space: Any, action: Any, kept: Any) -> None:
+    env = mcaprl.RecordMcap(ScriptedEnv(BOX, space, [ONE]), log_path)
+    env.reset()
+    if kept is None:
+        with pytest.raises(SpaceError, match="action"):
+            env.step(action)
+        env.close()
+        return
+    env.step(action)
+    env.close()
+    assert mcaprl.open(log_path).actions.tolist() == [kept]
+
+
+def test_large_observations_make_small_chunks(log_path: Path) -> None:
+    """Chunks are bounded in bytes, too: no reader takes one of any size."""
+    image = spaces.Box(0, 255, (720, 1280, 3), np.uint8)
+    rows = [(np.full(image.shape, k, np.uint8), 0.0, False, k == 9) for k in range(10)]
+    env = mcaprl.RecordMcap(ScriptedEnv(image, spaces.Discrete(3), [rows]), log_path)
+    env.reset()
+    for _ in range(9):
+        env.step(0)
+    env.close()
+    assert max(chunk.uncompressed_size for chunk in McapReader(log_path).chunks) < 16 * 2**20
+    assert mcaprl.open(log_path).observations[:, 5, 7, 1].tolist() == list(range(9))
+
+
+def test_policy_is_that_of_the_episodes_start(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="a")
+    env.reset()
+    env.step(0)
+    env.policy = "b"
+    env.reset()
+    env.step(0)
+    env.close()
+    assert [episode.policy for episode in mcaprl.open(log_path).episodes] == ["a", "b"]
+
+
+@pytest.mark.parametrize("options", [{"step_duration_s": 0.0}, {"start_time_ns": -5}])
+def test_times_must_rise(log_path: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="times must rise"):
+        mcaprl.RecordMcap(scripted(ONE), log_path, **options)
+    assert not log_path.exists()
+
+
+def test_what_reset_refuses(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE), log_path)
+    with pytest.raises(UsageError, match="2\\*\\*63"):
+        env.reset(seed=2**64)
+    env.close()
+    with pytest.raises(UsageError, match="closed"):
+        env.reset()
+
+
+def test_disk_full_leaves_the_finished_episodes(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path)
+    env.reset()
+    env.step(0)
+    env.step(0)
+    env.reset()
+    env.step(0)
+
+    class Full:
+        def __init__(self, file: Any) -> None:
+            self._file = file
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._file, name)
+
+        def write(self, data: Any) -> int:
+            if len(data) > 40:
+                return int(self._file.write(data[:40]))
+            raise OSError(28, "No space left on device")
+
+    writer = env._recording.log.mcap
+    monkeypatch.setattr(writer, "_file", Full(writer._file))
+    with pytest.raises(LogError, match="No space left on device; the episodes finished before"):
+        env.step(0)
+    env.close()
+    with pytest.warns(UserWarning, match="cut off"):
+        assert len(mcaprl.open(log_path).episodes) == 1
+
+
+@pytest.fixture
+def _hears_sigint() -> Iterator[None]:
+    """A test run in the background may ignore SIGINT, as shells arrange it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_hears_sigint")
+def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
+    """Ctrl-C a hundred times, each at another moment of a recording."""
+    main = threading.get_ident()
+    for trial in range(100):
+        path = log_path.with_name(f"{trial}.mcap")
+        env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+        timer = threading.Timer(0.001 + trial * 0.0003, signal.pthread_kill, (main, signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+            timer.start()
+            while True:
+                env.reset(seed=trial)
+                while not any(env.step(0)[2:4]):
+                    pass
+        env.close()
+        try:
+            data = mcaprl.open(path)
+        except NoStepsError:
+            continue
+        assert check_log(path) == []
+        assert all(episode.reason == "terminated" for episode in data.episodes[:-1])
+        assert all(episode.terminated[-1] for episode in data.episodes[:-1])
+
+
+def test_step_needs_reset(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(0)
+        env.reset()
+
+
+def test_existing_file_is_kept(log_path: Path) -> None:
+    log_path.write_text("precious")
+    with pytest.raises(OutputExistsError, match="exists"):
+        mcaprl.RecordMcap(scripted(ONE), log_path)
+    assert log_path.read_text() == "precious"
+    mcaprl.RecordMcap(scripted(ONE), log_path, overwrite=True).close()
+
+
+def test_unwritable_place(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match="cannot write"):
+        mcaprl.RecordMcap(scripted(ONE), tmp_path / "file" / "log.mcap")
+
+
+def test_unsupported_spaces_make_no_file(log_path: Path) -> None:
+    env = ScriptedEnv(spaces.Text(5), spaces.Discrete(2), [])
+    with pytest.raises(SpaceError, match="observation is a Text space"):
+        mcaprl.RecordMcap(env, log_path)
+    env = ScriptedEnv(BOX, spaces.Dict({"a": spaces.Discrete(2)}), [])
+    with pytest.raises(SpaceError, match="action is a Dict space"):
+        mcaprl.RecordMcap(env, log_path)
+    assert not log_path.exists()
+
+
+def test_metadata_comes_first_and_is_repeated(log_path: Path) -> None:
+    env = gym.make("CartPole-v1", sutton_barto_reward=True)
+    mcaprl.RecordMcap(env, log_path, seed=3, policy="random", epsilon=1.0).close()
+    reader = McapReader(log_path)
+    kinds = [opcode for _, opcode, _ in reader.records(8)]
+    assert kinds[:2] == [0x01, 0x0C], "header, then metadata"
+    strings = reader.metadata["mcaprl.dataset"]
+    channel = reader.channel_of("/rl/step")
+    assert channel is not None
+    assert channel.metadata == strings
+    assert strings["env_id"] == "CartPole-v1"
+    assert strings["env_kwargs"] == '{"sutton_barto_reward": true}'
+    assert (strings["seed"], strings["policy"], strings["epsilon"]) == ("3", "random", "1.0")
+    assert strings["step_duration_ns"] == "20000000", "CartPole renders 50 frames a second"
+
+
+def _record_for_ever(path: Path) -> None:
+    env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
+    while True:
+        env.reset(seed=0)
+        done = False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(0)
+            done = terminated or truncated
+        time.sleep(0.001)
+
+
+def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
+    process = multiprocessing.get_context("spawn").Process(
+        target=_record_for_ever, args=(log_path,)
+    )
+    process.start()
+    deadline = time.monotonic() + 60
+    while not (log_path.exists() and log_path.stat().st_size > 30_000):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    with pytest.warns(UserWarning, match="cut off"):
+        data = mcaprl.open(log_path)
+    assert len(data.episodes) > 3
+    assert all(episode.terminated[-1] for episode in data.episodes)
+    assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
+
+
+def test_a_signal_that_waits_keeps_nothing_alive() -> None:
+    """A buffer that is looked at when the signal comes can be emptied before it is handled."""
+    buffer = BytesIO(b"pictures")
+    # A shell that starts pytest in the background has it ignore Ctrl-C.
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def look() -> int:
+        view = buffer.getbuffer()
+        signal.raise_signal(signal.SIGINT)
+        return len(view)
+
+    try:
+        with pytest.raises(KeyboardInterrupt), HoldSignals():  # noqa: PT012
+            assert look() == 8
+            buffer.truncate(0)
+    finally:
+        signal.signal(signal.SIGINT, usual)
+    assert buffer.getvalue() == b""

@@ -1,0 +1,271 @@
+"""`check`: whatever contradicts itself in a log is told, with its place and what to do."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.columns import chunk_check, chunks, joined
+from mcaprl.recorder.columns import reader as mcap_reader
+from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import contents_of
+from mcaprl.recorder.columns.summary import Summary
+from mcaprl.recorder.columns.writer import McapWriter
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder.repair.recover import recover_log
+from tests.support.faults import write_log
+from tests.support.fuzz_target import without_crcs
+from tests.support.recordings import record
+
+SPACE = spaces.Dict(
+    {"x": spaces.Box(-1, 1, (2,), np.float32), "eye": spaces.Box(0, 255, (8, 8), np.uint8)}
+)
+Change = Callable[[np.ndarray[Any, Any]], None]
+
+
+def unchanged(message: np.ndarray[Any, Any]) -> None:
+    """Leave a record as it is."""
+
+
+def rewritten(
+    path: Path,
+    change: Change = unchanged,
+    *,
+    strings: dict[str, str] | None = None,
+    leave_out: str = "",
+) -> Path:
+    """The same log by a writer with a fault: every byte is where and what its CRCs say.
+
+    Args:
+        path: of a good log.
+        change: called with each record of `/rl/step`.
+        strings: metadata instead of its own.
+        leave_out: a topic whose second chunk is missing.
+    """
+    reader, other = McapReader(path), path.with_name("other.mcap")
+    writer = McapWriter(other, overwrite=True)
+    for name, own in reader.metadata.items():
+        writer.add_metadata(name, strings or own)
+    for schema in reader.schemas.values():
+        writer.announce(schema)
+    for channel in reader.channels.values():
+        metadata = strings if strings and channel.metadata else channel.metadata
+        writer.announce(replace(channel, metadata=metadata))
+    left_out = iter(range(100))
+    for chunk in reader.chunks:
+        records = bytearray(reader.chunk_records(chunk))
+        indexes = contents_of(memoryview(bytes(records))).indexes
+        topics = {reader.channels[channel_id].topic for channel_id in indexes}
+        if leave_out in topics and next(left_out) == 1:
+            continue
+        if topics == {"/rl/step"}:
+            (index,) = indexes.values()
+            _change_all(reader, records, index, change)
+        writer.write_records(memoryview(bytes(records)), indexes)
+    writer.close()
+    return other
+
+
+def _change_all(
+    reader: McapReader, records: bytearray, index: np.ndarray[Any, Any], change: Change
+) -> None:
+    (channel,) = reader.channels_of("/rl/step")
+    dtype = message_dtype(reader.schema_of(channel).data.decode())
+    assert dtype is not None
+    for offset in index["offset"].tolist():
+        change(np.frombuffer(records, dtype, 1, offset + MESSAGE_HEADER.itemsize))
+
+
+@pytest.fixture
+def good(log_path: Path) -> Path:
+    record(log_path, SPACE, spaces.Discrete(2), [4, 3, 5])
+    assert check_log(log_path) == []
+    return log_path
+
+
+def at(number: int, row: int, **values: Any) -> Change:
+    """Set fields of one record of `/rl/step`."""
+
+    def change(message: np.ndarray[Any, Any]) -> None:
+        if (message["episode"][0], message["step"][0]) == (number, row):
+            for name, value in values.items():
+                message[name] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (at(1, 1, step=2), "out of order"),
+        (at(1, 1, episode=7), "out of order"),
+        (at(1, 3, final=False), "out of order"),
+        (at(1, 1, terminated=True), "goes on after its end"),
+        (at(2, 5, final=False), "6 records of an episode that was not finished"),
+        (at(0, 3, terminated=False), "tells terminated of True, its records False"),
+        (at(1, 2, truncated=False), "tells truncated of True, its records False"),
+    ],
+)
+def test_episodes_that_contradict_themselves(good: Path, change: Change, told: str) -> None:
+    problems = check_log(rewritten(good, change))
+    assert any(told in problem.what for problem in problems), problems
+    assert all("mcaprl recover" in problem.next for problem in problems)
+
+
+def test_nothing_is_changed_by_rewriting(good: Path) -> None:
+    assert check_log(rewritten(good)) == []
+
+
+def test_return_that_is_not_the_rewards_sum(log_path: Path) -> None:
+    write_log(log_path, 2)
+    problems = check_log(rewritten(log_path, at(1, 1, reward=1e6)))
+    assert ["tells a return of" in problem.what for problem in problems] == [True]
+    assert problems[0].where == "episode 1"
+
+
+def resealed(data: bytearray) -> bytes:
+    """Give a changed file the CRCs of its data and summary, so that only the change is wrong."""
+    footer = len(data) - 8 - 29
+    summary_start, _ = struct.unpack_from("<QQ", data, footer + 9)
+    struct.pack_into("<I", data, summary_start - 4, zlib.crc32(data[: summary_start - 13]))
+    struct.pack_into("<I", data, len(data) - 12, zlib.crc32(data[summary_start : len(data) - 12]))
+    return bytes(data)
+
+
+def test_message_index_that_is_wrong(good: Path) -> None:
+    reader = McapReader(good)
+    channel = reader.channel_of("/rl/step")
+    assert channel is not None
+    data = bytearray(good.read_bytes())
+    chunk = next(c for c in reader.chunks if channel.id in c.message_index_offsets)
+    entry = chunk.message_index_offsets[channel.id] + 9 + 6 + INDEX_ENTRY.itemsize
+    (time_ns,) = struct.unpack_from("<Q", data, entry)
+    struct.pack_into("<Q", data, entry, time_ns + 1)
+    good.write_bytes(resealed(data))
+    (problem,) = check_log(good)
+    assert problem.what == "the message index of /rl/step is wrong"
+    assert f"chunk at byte {chunk.chunk_start_offset}, /rl/step, log_time" in problem.where
+
+
+def test_summary_that_miscounts(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = Summary.to_bytes
+
+    def miscount(summary: Summary, start: int) -> bytes:
+        # /rl/episode: of /rl/step the reader itself says so.
+        summary.counts[2] += 1
+        return counted(summary, start)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Summary, "to_bytes", miscount)
+        record(log_path, SPACE, spaces.Discrete(2), [4])
+    assert any("the summary tells of" in problem.what for problem in check_log(log_path))
+
+
+def test_metadata_of_other_spaces(good: Path) -> None:
+    other = spaces.Dict({**SPACE.spaces, "x": spaces.Box(-1, 1, (3,), np.float32)})
+    strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
+    (problem,) = check_log(rewritten(good, strings=strings))
+    assert "is not that of the metadata's spaces" in problem.what
+
+
+def test_pictures_that_are_missing(good: Path) -> None:
+    """Or are of another size than the metadata says."""
+    (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
+    assert problem.what == "11 pictures for 15 records, 4 have none"
+    other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
+    strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
+    (problem,) = check_log(rewritten(good, strings=strings))
+    assert problem.what == "pictures on /rl/observation/eye are not as the metadata's space says"
+
+
+def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) -> None:
+    """Where no CRC covers the schema: it is told of, and nothing is recovered from it."""
+    write_log(log_path, 2)
+    data = without_crcs(log_path.read_bytes())
+    assert data.count(b"string encoding") >= 2
+    log_path.write_bytes(data.replace(b"string encoding", b"string encodinx"))
+    (problem,) = check_log(log_path)
+    assert (
+        "pictures on /rl/observation/picture are not as the metadata's space says" in problem.what
+    )
+    with pytest.raises(LogError, match="cannot be made whole"):
+        recover_log(log_path, tmp_path / "out.mcap")
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_threads_find_the_same(good: Path, threads: int) -> None:
+    assert check_log(good, threads=threads) == []
+    spoilt = bytearray(good.read_bytes())
+    for chunk in McapReader(good).chunks[1:3]:
+        spoilt[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
+    good.write_bytes(spoilt)
+    problems = check_log(good)
+    assert len(problems) >= 3
+    assert check_log(good, threads=threads) == problems
+
+
+def test_attachment_that_is_damaged(good: Path) -> None:
+    data = bytearray(good.read_bytes())
+    data[data.index(b"foxglove-layout.json") + 60] ^= 1
+    good.write_bytes(resealed(data))
+    assert check_log(good)[0].what == "an attachment does not match its CRC"
+
+
+def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for those of `/rl/episode`, which are read again with all of them at hand."""
+    read: list[int] = []
+    once = chunks.chunk_records
+
+    def count(file: memoryview, offset: int, scratch: Any = None) -> memoryview:
+        read.append(offset)
+        return once(file, offset, scratch)
+
+    for module in (chunks, mcap_reader):
+        monkeypatch.setattr(module, "chunk_records", count)
+    assert check_log(good) == []
+    reader = McapReader(good)
+    episodes = reader.channel_of("/rl/episode")
+    assert episodes is not None
+    others = [c for c in reader.chunks if episodes.id not in c.message_index_offsets]
+    assert {read.count(chunk.chunk_start_offset) for chunk in others} == {1}
+    assert len(read) <= 2 * len(reader.chunks)
+
+
+@pytest.mark.parametrize("compression", ["none", "zstd"])
+def test_chunks_together_are_judged_as_each_alone(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str
+) -> None:
+    """Short episodes have small chunks, which are looked at many at a time, as arrays.
+
+    Whatever byte is wrong, and covered by no CRC: what is told is what going through each chunk
+    record by record tells.
+    """
+    record(
+        log_path, SPACE, spaces.Discrete(2), [1 + k % 3 for k in range(12)], compression=compression
+    )
+    sound = without_crcs(log_path.read_bytes())
+    numbers = np.random.default_rng(5)
+    start, found = McapReader(log_path).chunks[0].chunk_start_offset, set()
+    for _ in range(200):
+        spoilt = bytearray(sound)
+        spoilt[int(numbers.integers(start, len(sound)))] ^= 1 << int(numbers.integers(8))
+        log_path.write_bytes(spoilt)
+        together = check_log(log_path)
+        with monkeypatch.context() as patch:
+            patch.setattr(chunk_check, "_is_sound", lambda *_: False)
+            patch.setattr(joined, "_MOST_BYTES", 0)
+            assert check_log(log_path) == together
+        found |= {problem.what for problem in together}
+    assert len(found) > 10, found

@@ -1,0 +1,260 @@
+"""What is added to a copy of a log: policies' opinions, and scenes that were left out."""
+
+from __future__ import annotations
+
+import json
+import math
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import LogError, OutputExistsError, PolicyError, UsageError
+from mcaprl.offline.estimate.values import (
+    gamma_of_run,
+    normalized_entropy,
+    td_errors,
+    value_columns,
+)
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.topic import Topic
+from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.viewer.annotate import AnnotatedCopy, values_topics
+from mcaprl.recorder.viewer.surprises import moments_of
+from mcaprl.sims import make_sim
+from tests.support.layouts import check_layout
+
+VALUES = np.array([[1.0, 3.0], [2.0, 0.0], [4.0, 4.0], [0.0, 8.0]], np.float32)
+FIELDS = ("q", "value", "advantage", "td_error", "entropy", "policy_action", "agrees")
+
+
+class Table:
+    """Q-values of the four observations of an episode, or no values but probabilities."""
+
+    name = "table"
+
+    def __init__(self, has_values: bool = True) -> None:
+        self._has_values = has_values
+
+    def q_values(self, observations: Any) -> Any:
+        if not self._has_values:
+            raise PolicyError("no values")
+        return VALUES[observations[:, 0].astype(int)]
+
+    def action_probabilities(self, observations: Any) -> Any:
+        return np.array([[0.75, 0.25], [0.0, 1.0], [0.5, 0.5], [1.0, 0.0]], np.float32)
+
+
+class Elsewhere(gym.Wrapper[Any, Any, Any, Any]):
+    """Starts somewhere else than it was asked to."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=99, options=options)
+
+
+@pytest.fixture
+def episode() -> Any:
+    places = np.arange(4.0, dtype=np.float32)[:, None]
+    data = mcaprl.Dataset.from_arrays(
+        observations=places[:3],
+        actions=np.array([0, 0, 1]),
+        rewards=np.array([1.0, -1.0, 2.0]),
+        terminated=np.array([False, False, True]),
+        truncated=np.zeros(3, bool),
+        next_observations=places[1:],
+    )
+    return data.episodes[0]
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Path:
+    """Two short episodes of the lane sim without a scene."""
+    path = tmp_path / "plain.mcap"
+    command = ["record", "lane", "--episodes", "2", "--policy", "random", "--no-scene"]
+    assert run([*command, "--out", str(path)]) == 0
+    return path
+
+
+def test_values_by_hand(episode: Any) -> None:
+    """Gamma 0.5: 1 + 0.5*2 - 1; -1 + 0.5*4 - 2; 2 + 0 - 4, for the episode terminated."""
+    found = value_columns(Table(), episode, spaces.Discrete(2), 0.5)
+    assert found["q"].tolist() == VALUES[:3].tolist()
+    assert found["value"].tolist() == [3.0, 2.0, 4.0]
+    assert found["advantage"].tolist() == [-2.0, 0.0, 0.0]
+    assert found["td_error"].tolist() == [1.0, -1.0, -2.0]
+    assert found["policy_action"].tolist() == [1, 0, 0]
+    assert found["agrees"].tolist() == [False, True, False]
+    odds = 1 / (1 + math.exp(-2))
+    assert found["preference"][0].tolist() == pytest.approx([1 - odds, odds])
+    assert found["entropy"][2] == pytest.approx(1.0)
+
+
+def test_a_truncated_episode_has_a_future() -> None:
+    actions, rewards = np.zeros(1, np.int64), np.zeros(1)
+    q = np.array([[0.0], [10.0]], np.float32)
+    for terminated, error in ((True, 0.0), (False, 9.0)):
+        assert td_errors(q, actions, rewards, np.array([terminated]), 0.9).tolist() == [error]
+    assert td_errors(q, actions, rewards, np.array([False]), 0.0).tolist() == [0.0]
+
+
+def test_a_policy_without_values_has_doubts_all_the_same(episode: Any) -> None:
+    found = value_columns(Table(has_values=False), episode, spaces.Discrete(2), 0.9)
+    for name in ("q", "value", "advantage", "td_error"):
+        assert np.isnan(found[name]).all()
+    certain = -(0.75 * math.log2(0.75) + 0.25 * math.log2(0.25))
+    assert found["entropy"].tolist() == pytest.approx([certain, 0.0, 1.0])
+    assert found["policy_action"].tolist() == [0, 1, 0]
+
+
+def test_actions_that_begin_elsewhere_and_single_ones(episode: Any) -> None:
+    vars(episode)["actions"] = episode.actions - 1
+    found = value_columns(Table(), episode, spaces.Discrete(2, start=-1), 0.5)
+    assert found["policy_action"].tolist() == [0, -1, -1]
+    assert found["agrees"].tolist() == [False, True, False]
+    assert normalized_entropy(np.ones((2, 1), np.float32)).tolist() == [0.0, 0.0]
+    with pytest.raises(UsageError, match="discrete"):
+        value_columns(Table(), episode, spaces.Box(-1, 1), 0.5)
+
+
+def test_gamma_is_the_runs(tmp_path: Path) -> None:
+    (tmp_path / "seed-0").mkdir()
+    assert gamma_of_run(tmp_path / "seed-0") == 0.97
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"gamma": 0.5}}))
+    assert gamma_of_run(tmp_path / "seed-0") == gamma_of_run(tmp_path) == 0.5
+
+
+def test_a_copy_keeps_all_and_adds_values(plain: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out" / "annotated.mcap"
+    data = mcaprl.open(plain)
+    columns = [
+        (
+            episode,
+            {
+                "q": np.full((episode.length, 6), episode.index, np.float32),
+                "td_error": np.arange(episode.length, dtype=np.float32),
+                "advantage": -np.arange(episode.length, dtype=np.float32),
+                "agrees": np.arange(episode.length) % 2 == 0,
+            },
+        )
+        for episode in data.episodes
+    ]
+    with AnnotatedCopy(plain, out) as copy:
+        copy.add_values("/rl/values", columns)
+    assert mcaprl.open(out).fingerprint == data.fingerprint
+    old, new = McapReader(plain), McapReader(out)
+    assert new.metadata == old.metadata
+    assert new.complete
+    head = old.summary_start - 13
+    assert bytes(new.view[:head]) == bytes(old.view[:head]), "the log is not touched"
+    topic = Topic(new, "/rl/values")
+    times = np.concatenate([episode.log_time_ns[:-1] for episode in data.episodes])
+    assert topic.times.tolist() == times.tolist()
+    assert topic.read(("q",))["q"][-1].tolist() == [1.0] * 6
+    assert set(topic.fields) >= set(FIELDS)
+    check_layout(out)
+    worst, *_, odd = moments_of(out)[::5]
+    lengths = [episode.length for episode in data.episodes]
+    longest = int(np.argmax(lengths))
+    assert (worst.kind, worst.episode, worst.step) == ("td_error", longest, lengths[longest] - 1)
+    assert worst.time_ns == data.episodes[longest].log_time_ns[-2]
+    assert (odd.kind, odd.step % 2) == ("disagreement", 1)
+
+
+def test_an_error_leaves_no_half_copy(plain: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.mcap"
+    with pytest.raises(ZeroDivisionError), AnnotatedCopy(plain, out):
+        raise ZeroDivisionError
+    assert not out.exists()
+    for path in (plain, plain.parent / "." / plain.name):
+        with pytest.raises(OutputExistsError):
+            AnnotatedCopy(plain, path, overwrite=True)
+    plain.write_bytes(plain.read_bytes()[:-40])
+    with pytest.raises(LogError, match="recover"):
+        AnnotatedCopy(plain, out)
+    assert not out.exists()
+
+
+def test_scene_is_added_later(plain: Path, tmp_path: Path) -> None:
+    """The same messages as those of a recording with a scene."""
+    out, full = tmp_path / "out.mcap", tmp_path / "full.mcap"
+    assert run(["annotate", str(plain), "--scene", "--out", str(out)]) == 0
+    start_ns = int(mcaprl.open(plain).episodes[0].log_time_ns[0])
+    data = mcaprl.open(plain)
+    with closing(mcaprl.RecordMcap(make_sim("lane"), full, start_time_ns=start_ns)) as env:
+        for episode in data.episodes:
+            env.reset(seed=episode.seed)
+            for action in episode.actions:
+                env.step(int(action))
+    readers = McapReader(out), McapReader(full)
+    for topic in ("/scene", "/scene/static", "/tf", "/tf_static", "/telemetry"):
+        added, recorded = ([*reader.messages(reader.channels_of(topic)[0])] for reader in readers)
+        assert added == recorded, topic
+    assert len(Topic(readers[0], "/rosout")) == 2 * len(data.episodes)
+    check_layout(out)
+    layout = json.loads(readers[0].attachment(LAYOUT_NAME) or b"")
+    assert layout["configById"]["3D!scene"]["followTf"] == "car"
+
+
+def test_no_scene_of_another_sim(plain: Path, tmp_path: Path) -> None:
+    data, out = mcaprl.open(plain), tmp_path / "out.mcap"
+    other = Elsewhere(make_sim("lane"))
+    reason = "no scene was added, for the sim is another now: episode 0"
+    with pytest.raises(LogError, match=reason), AnnotatedCopy(plain, out) as copy:
+        copy.add_scene(data, other, camera=False)
+    assert not out.exists()
+
+
+def test_topics_of_several_policies() -> None:
+    assert values_topics(["cql"]) == {"cql": "/rl/values"}
+    assert values_topics(["7 up", "A/b", "a_b"]) == {
+        "7 up": "/rl/values/policy_7_up",
+        "A/b": "/rl/values/a_b",
+        "a_b": "/rl/values/a_b_b",
+    }
+
+
+def test_commands(
+    plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    near = ["--gamma", "0.5", "--target-interval", "1"]
+    for algo, settings in (("cql", near), ("bc", [])):
+        train = ["train-offline", str(plain), "--algo", algo, "--updates", "3", *settings]
+        assert run([*train, "--out", algo]) == 0
+    both = [
+        "annotate",
+        str(plain),
+        "--policy",
+        "cql",
+        "--policy",
+        "bc",
+        "--scene",
+        "--out",
+        "a.mcap",
+    ]
+    assert run(both) == 0
+    check_layout(Path("a.mcap"))
+    capsys.readouterr()
+    assert run(["check", "a.mcap"]) == 0
+    assert run(["info", "a.mcap"]) == 0
+    printed = capsys.readouterr().out
+    assert "/rl/values/cql td_error" in printed
+    assert "/rl/values/bc disagreement" in printed
+    for wrong, why in (
+        (["annotate", str(plain), "--out", "b.mcap"], "needs --policy POLICY, --scene, or both"),
+        (["annotate", str(plain), "--policy", "pilot", "--out", "b.mcap"], "no network to ask"),
+        (["annotate", "a.mcap", "--scene", "--out", "b.mcap"], "has /scene already"),
+        (["annotate", str(plain), "--policy", "dqn", "--out", "b.mcap"], "unknown policy 'dqn'"),
+        (both, "a.mcap exists"),
+    ):
+        assert run(wrong) == 2
+        assert why in capsys.readouterr().err
+    assert not Path("b.mcap").exists()

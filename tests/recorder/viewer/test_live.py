@@ -1,0 +1,286 @@
+"""The live server, as a viewer meets it; and the clock behind it."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.errors import UsageError
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.record.layout import layout_of
+from mcaprl.recorder.viewer.log_layout import layout_of_log
+from mcaprl.recorder.viewer.playback import Played, Player, Track
+from mcaprl.recorder.viewer.prefix import prefixed_message, prefixes_of, side_by_side
+from mcaprl.sims import make_sim
+from tests.conftest import need
+from tests.support.paths import NODE
+
+START_NS = 1_700_000_000 * 10**9
+STEP_NS = 250_000_000
+
+
+def record(path: Path, seeds: tuple[int, ...], steps: int = 20) -> Path:
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path, start_time_ns=START_NS)) as env:
+        for seed in seeds:
+            env.reset(seed=seed)
+            for _ in range(steps):
+                env.step(1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("live") / "lane.mcap", (0, 1, 2), 8)
+
+
+def topics_of(player: Player, played: list[Played]) -> list[str]:
+    return [player.tracks[m.track].reader.channels[m.channel_id].topic for m in played]
+
+
+def test_playing_gives_every_message_once_and_in_order(log: Path) -> None:
+    reader = McapReader(log)
+    player = Player([Track(reader)], speed=3.0, playing=True)
+    played = [message for _ in range(200) for message in player.advance(0.05)]
+    assert player.ended
+    assert not player.playing
+    times = [message.time_ns for message in played]
+    assert times == sorted(times)
+    expected = [
+        (channel.id, *message)
+        for channel in reader.channels.values()
+        for message in reader.messages(channel)
+    ]
+    assert sorted((m.channel_id, m.time_ns, m.data) for m in played) == sorted(expected)
+
+
+def test_clock_stops_seeks_and_begins_again(log: Path) -> None:
+    player = Player([Track(McapReader(log))])
+    assert player.advance(1.0) == []
+    player.seek(START_NS + 4 * STEP_NS)
+    player.playing = True
+    due = player.advance(0.25)
+    assert {message.time_ns for message in due} == {START_NS + 5 * STEP_NS}
+    assert topics_of(player, due) == ["/rl/step", "/scene", "/tf", "/telemetry"]
+    player.seek(0)
+    assert player.time_ns == player.start_ns == START_NS
+    player.seek(2**63)
+    assert player.time_ns == player.end_ns
+    player.loops = True
+    player.advance(0.1)
+    assert player.playing
+
+
+def test_picture_has_the_last_message_of_each_topic(log: Path) -> None:
+    player = Player([Track(McapReader(log))])
+    player.seek(START_NS + 3 * STEP_NS + 1)
+    seen = dict(zip(topics_of(player, player.picture()), player.picture(), strict=True))
+    assert seen["/scene"].time_ns == seen["/rl/step"].time_ns == START_NS + 3 * STEP_NS
+    assert seen["/scene/static"].time_ns == START_NS
+    assert "/rl/episode" not in seen, "no episode has ended yet"
+
+
+def test_one_episode(log: Path) -> None:
+    first, last = mcaprl.open(log).episodes[1].log_time_ns[[0, -1]].tolist()
+    player = Player([Track(McapReader(log), (first, last))], playing=True)
+    times = [message.time_ns for message in player.advance(60)]
+    assert (times[0], times[-1]) == (first, last)
+    player.seek(first)
+    assert "/scene/static" in topics_of(player, player.picture()), "what came before is part of it"
+
+
+def test_two_logs_share_their_time(log: Path, tmp_path: Path) -> None:
+    other = record(tmp_path / "other.mcap", (5,), 4)
+    first, last = mcaprl.open(log).episodes[2].log_time_ns[[0, -1]].tolist()
+    player = Player([Track(McapReader(other)), Track(McapReader(log), (first, last))])
+    player.playing = True
+    due = player.advance(2 * STEP_NS / 1e9)
+    steps = [m for m, topic in zip(due, topics_of(player, due), strict=True) if topic == "/rl/step"]
+    assert [(m.track, (m.time_ns - START_NS) // STEP_NS) for m in steps] == [
+        (0, 0),
+        (1, 0),
+        (0, 1),
+        (1, 1),
+        (0, 2),
+        (1, 2),
+    ]
+    assert player.end_ns == START_NS + last - first
+
+
+def test_frames_of_two_logs_do_not_meet(log: Path) -> None:
+    reader = McapReader(log)
+    for topic, type_name in (
+        ("/tf", "tf2_msgs/msg/TFMessage"),
+        ("/tf_static", "tf2_msgs/msg/TFMessage"),
+        ("/scene", "visualization_msgs/msg/MarkerArray"),
+    ):
+        _, data = next(reader.messages(reader.channels_of(topic)[0]))
+        moved = messages.decode(prefixed_message(data, type_name, "b", 10**9), type_name)
+        frames = {part.header.frame_id for part in getattr(moved, "transforms", [])}
+        frames |= {part.child_frame_id for part in getattr(moved, "transforms", [])}
+        frames |= {part.header.frame_id for part in getattr(moved, "markers", [])}
+        assert frames <= {"map", "b/car", "b/camera"}
+        if topic == "/tf":
+            assert moved.transforms[0].header.stamp.sec == START_NS // 10**9 + 1
+
+
+def test_layouts_stand_side_by_side(log: Path) -> None:
+    layout = layout_of_log(McapReader(log))
+    both = side_by_side([layout, layout], ["a", "b"])
+    panels = both["configById"]
+    assert len(panels) == 2 * len(layout["configById"])
+    assert panels["3D!b scene"]["followTf"] == "b/car"
+    assert panels["3D!b scene"]["topics"].keys() == {"/b/scene", "/b/scene/static"}
+    assert panels["Plot!a reward"]["paths"][0]["value"] == "/a/rl/step.reward"
+    assert panels["Tab!a numbers"]["tabs"][0]["layout"].startswith("Plot!a ")
+    assert panels["RosOut!b log"]["topicToRender"] == "/b/rosout"
+    assert side_by_side([layout], [""]) == layout
+    assert prefixes_of([log, log]) == ["lane", "lane_2"]
+    assert "3D!scene" not in layout_of(mcaprl.open(log)._description, [])["configById"]
+
+
+def test_a_log_of_an_hour_plays_from_anywhere(tmp_path: Path) -> None:
+    """The player holds indexes in the mapped file, and a few chunks: not the log."""
+    steps = 60_000
+    path = tmp_path / "long.mcap"
+    zeros = np.zeros((steps, 4), np.float32)
+    ends = np.arange(1, steps + 1) % 600 == 0
+    mcaprl.Dataset.from_arrays(
+        observations=zeros,
+        actions=np.zeros(steps, np.int64),
+        rewards=np.arange(steps, dtype=np.float64),
+        terminated=ends,
+        truncated=np.zeros(steps, bool),
+        next_observations=zeros,
+    ).save(path)
+    track = Track(McapReader(path))
+    rows = track._topics[0].spans[0].index
+    assert not rows.flags.owndata, "the index is a view of the file"
+    player = Player([track])
+    middle = (player.start_ns + player.end_ns) // 2
+    player.seek(middle)
+    assert any(middle - m.time_ns < 10**9 for m in player.picture())
+    player.playing = True
+    assert len(player.advance(1.0)) >= 10
+    assert track._records.cache_info().currsize <= 3
+
+
+def viewer_is_there() -> None:
+    need(shutil.which("node") is not None, "node is not installed")
+    installed = (NODE / "node_modules" / "@foxglove" / "ws-protocol").exists()
+    need(installed, "run `npm ci` in tests/node")
+    need(importlib.util.find_spec("foxglove") is not None, "foxglove-sdk is not installed")
+
+
+def _hear_signals() -> None:
+    """A shell that starts pytest in the background, or nohup, has children ignore some."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
+def look(
+    arguments: list[str], plan: list[list[Any]], how: signal.Signals = signal.SIGINT
+) -> tuple[Any, list[str]]:
+    """Run the server and a viewer that follows a plan; what it saw, and what was printed.
+
+    Args:
+        arguments: of `replay`.
+        plan: what the viewer does.
+        how: the server is ended.
+    """
+    command = [sys.executable, "-m", "mcaprl.cli", "replay", *arguments, "--port", "0"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=_hear_signals
+    ) as server:
+        assert server.stdout is not None
+        lines = [server.stdout.readline() for _ in range(4)]
+        try:
+            address = re.search(r"ws://127\.0\.0\.1:\d+", lines[1])
+            assert address is not None, lines
+            layout = re.search(r"/\S+\.json", lines[2])
+            assert layout is not None
+            assert json.loads(Path(layout[0]).read_text())["configById"]
+            viewer = ["node", str(NODE / "viewer.mjs"), address[0], json.dumps(plan)]
+            seen = subprocess.run(viewer, capture_output=True, text=True, timeout=60, check=True)
+        finally:
+            server.send_signal(how)
+            try:
+                rest, _ = server.communicate(timeout=30)
+            finally:
+                server.kill()
+    assert server.returncode == 0
+    assert rest == "ended\n"
+    assert not Path(layout[0]).exists()
+    return json.loads(seen.stdout), lines
+
+
+def test_a_viewer_connects_seeks_and_gets_the_files_own_bytes(log: Path) -> None:
+    viewer_is_there()
+    reader, data = McapReader(log), mcaprl.open(log)
+    where = int(data.episodes[1].log_time_ns[3])
+    seen, lines = look([str(log)], [["seek", str(where)], ["play", 4.0, 12], ["episode", 2]])
+    assert "app.foxglove.dev" in lines[0]
+    info = seen["server"]
+    assert {"time", "parameters", "playbackControl"} <= set(info["capabilities"])
+    assert info["dataStartTime"]["sec"] == START_NS // 10**9
+    channels = {channel.topic: channel for channel in reader.channels.values()}
+    assert seen["topics"].keys() == channels.keys()
+    for topic, told in seen["topics"].items():
+        schema = reader.schema_of(channels[topic])
+        assert told["schemaName"] == schema.name
+        assert told["schema"] == hashlib.sha256(schema.data).hexdigest()
+        assert (told["encoding"], told["schemaEncoding"]) == ("cdr", "ros2msg")
+    in_file = {
+        (topic, str(time_ns), hashlib.sha256(message).hexdigest())
+        for topic, channel in channels.items()
+        for time_ns, message in reader.messages(channel)
+    }
+    sought, played, jumped = seen["steps"]
+    for step in seen["steps"]:
+        for message in step["messages"]:
+            assert (message["topic"], message["time"], message["sha256"]) in in_file
+    assert sought["states"][0] | {"status": 1} == sought["states"][0]
+    assert sought["states"][0]["seeked"]
+    assert {m["topic"]: m["time"] for m in sought["messages"]}["/scene"] == str(where)
+    assert {m["topic"] for m in sought["messages"]} == set(channels)
+    assert played["states"][0]["status"] == 0
+    assert played["states"][0]["speed"] == 4.0
+    assert all(int(m["time"]) > where for m in played["messages"])
+    start = str(int(data.episodes[2].log_time_ns[0]))
+    assert jumped["states"][0]["time"] == start
+    assert {m["topic"]: m["time"] for m in jumped["messages"]}["/tf"] == start
+    assert seen["parameters"][-1][0] == {"name": "episode", "value": 2}
+
+
+def test_two_policies_side_by_side(log: Path, tmp_path: Path) -> None:
+    viewer_is_there()
+    other = record(tmp_path / "pilot.mcap", (5,), 4)
+    arguments = [str(log), str(other), "--episode", "0", "--speed", "2"]
+    # With the terminal, too, it ends as with Ctrl-C.
+    seen, _ = look(arguments, [["seek", str(START_NS + STEP_NS)]], signal.SIGHUP)
+    assert {"/lane/rl/step", "/pilot/rl/step", "/pilot/scene"} <= seen["topics"].keys()
+    times = {message["topic"]: message["time"] for message in seen["steps"][0]["messages"]}
+    assert times["/lane/tf"] == times["/pilot/tf"] == str(START_NS + STEP_NS)
+
+
+def test_a_port_that_is_taken(log: Path) -> None:
+    from mcaprl.recorder.viewer.player_server import LiveServer
+
+    player = Player([Track(McapReader(log))])
+    with closing(LiveServer(player, port=0)) as server:
+        port = int(server.url.rpartition(":")[2])
+        with pytest.raises(UsageError, match=rf"cannot listen on 127.0.0.1:{port}.*--port"):
+            LiveServer(player, port=port)

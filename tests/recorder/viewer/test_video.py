@@ -1,0 +1,182 @@
+"""Films and stills of logged episodes."""
+
+from __future__ import annotations
+
+import importlib.util
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.video import contact_sheet, filmed, spread
+from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, eye_behind, poses_of
+from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
+from tests.conftest import need
+
+RED, GREEN = (1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)
+WIDTH, HEIGHT = SIZE_PX
+
+
+@pytest.fixture(autouse=True)
+def _has_writers() -> None:
+    for name in ("imageio", "av", "pygame"):
+        need(importlib.util.find_spec(name) is not None, f"{name} is not installed")
+
+
+@pytest.fixture
+def view() -> Any:
+    with closing(ChaseView()) as found:
+        yield found
+
+
+def car_at(x_m: float, y_m: float = 0.0, yaw_rad: float = 0.0) -> list[Frame]:
+    return [Frame("car", (x_m, y_m, 0.0), yaw_rotation(yaw_rad))]
+
+
+def box(color: Any, x_m: float, frame: str = "map", **others: Any) -> Shape:
+    size = (1.0, 1.0, 1.0)
+    return Shape("box", "box", color, size=size, position=(x_m, 0.0, 0.5), frame=frame, **others)
+
+
+def share(picture: Any, channel: int) -> float:
+    """Of the picture that is of one pure colour, however it is lit."""
+    others = [c for c in range(3) if c != channel]
+    pure = (picture[..., channel] > 100) & (picture[..., others].max(-1) < 60)
+    return float(pure.mean())
+
+
+def test_the_body_is_in_the_middle_wherever_it_is(view: ChaseView) -> None:
+    pictures = [
+        view.draw([box(RED, 0.0, "car")], [], car_at(*place), "car", [])
+        for place in ((0.0, 0.0, 0.0), (500.0, -80.0, 2.0))
+    ]
+    assert pictures[0].shape == (HEIGHT, WIDTH, 3)
+    for picture in pictures:
+        rows, columns = np.nonzero(picture[..., 0] > picture[..., 2].astype(int) + 60)
+        assert abs(columns.mean() - WIDTH / 2) < 5
+        assert HEIGHT / 2 < rows.mean() < HEIGHT
+    assert abs(share(pictures[0], 0) - share(pictures[1], 0)) < 2e-3
+
+
+def test_the_nearer_thing_hides_the_farther(view: ChaseView) -> None:
+    wall = Shape("wall", "box", GREEN, size=(0.5, 9.0, 9.0), position=(-4.0, 0.0, 2.0))
+    for scene in ([box(RED, 0.0), wall], [wall, box(RED, 0.0)]):
+        picture = view.draw(scene, [], car_at(0.0), "car", [])
+        assert share(picture, 0) == 0.0
+        assert share(picture, 1) > 0.2
+    assert share(view.draw([box(RED, -100.0)], [], car_at(0.0), "car", []), 0) == 0.0
+    assert share(view.draw([box(RED, 900.0)], [], car_at(0.0), "car", []), 0) == 0.0
+
+
+def test_every_kind_of_shape_can_be_seen(view: ChaseView) -> None:
+    points = np.array([[0.0, -1.0, 0.2], [0.0, 1.0, 0.2], [0.0, 0.0, 2.0]])
+    for kind in ("box", "sphere", "cylinder", "line", "segments", "points", "triangles", "arrow"):
+        some = points[:2] if kind == "segments" else points
+        shape = Shape("it", kind, RED, points=some, size=(0.5, 0.5, 0.5))
+        assert share(view.draw([], [shape], [], "", []), 0) > 1e-4, kind
+    empty = view.draw([], [], [], "", [])
+    assert (view.draw([], [], [], "", ["a line"]) != empty).any()
+    label = Shape("it", "text", RED, text="here")
+    assert (view.draw([], [label], [], "", []) != empty).any()
+
+
+def test_frames_hang_on_frames() -> None:
+    quarter = yaw_rotation(np.pi / 2)
+    frames = [Frame("b", (1.0, 0.0, 0.0), quarter, "a"), Frame("a", (5.0, 0.0, 0.0), quarter)]
+    poses = poses_of(frames)
+    np.testing.assert_allclose(poses["b"].at_m, [5.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(poses["b"].axes[:, 0], [-1.0, 0.0, 0.0], atol=1e-12)
+    round_about = [Frame("a", (1.0, 0.0, 0.0), quarter, "b"), Frame("b", (0, 0, 0), quarter, "a")]
+    assert set(poses_of(round_about)) == {"a", "b"}
+    eye = eye_behind(poses["a"])
+    np.testing.assert_allclose(eye.axes.T @ eye.axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(eye.axes) == pytest.approx(1.0)
+
+
+def test_a_log_gives_back_what_was_seen(tmp_path: Path) -> None:
+    path, env = tmp_path / "lane.mcap", make_sim("lane")
+    with closing(mcaprl.RecordMcap(env, path)) as recorder:
+        recorder.reset(seed=0)
+        for _ in range(3):
+            recorder.step(1)
+        sim: Any = env.unwrapped
+        scene, static, frames = sim.scene(), sim.static_scene(), sim.frames()
+    *_, last = moments_of_episode(McapReader(path), mcaprl.open(path).episodes[0])
+    assert last.follow == "car"
+    for seen, shapes in ((last.moving, scene), (last.static, static)):
+        assert len(seen) == len(shapes)
+        for one, shape in zip(seen, shapes, strict=True):
+            for name in ("name", "kind", "frame", "text"):
+                assert getattr(one, name) == getattr(shape, name)
+            np.testing.assert_allclose(one.points, shape.points, atol=1 / 64)
+            np.testing.assert_allclose(one.position, shape.position)
+            np.testing.assert_allclose(one.size, shape.size)
+            np.testing.assert_allclose(one.color, shape.color, atol=1e-6)
+            assert np.sin(one.yaw_rad) == pytest.approx(np.sin(shape.yaw_rad), abs=1e-9)
+    np.testing.assert_allclose(last.frames[0].position, frames[0].position, atol=1e-3)
+
+
+def test_sheet() -> None:
+    pictures = [np.full((40, 60, 3), value, np.uint8) for value in (10, 20, 30, 40)]
+    sheet = contact_sheet(pictures)
+    assert sheet.shape == (46, 102, 3)
+    assert [sheet[0, 0, 0], sheet[0, 36, 0], sheet[0, 72, 0], sheet[26, 0, 0]] == [10, 20, 30, 40]
+    assert sheet[26, 36, 0] == 255
+    assert spread(2, 12) == [0, 1, 2]
+
+
+def test_a_fast_film_leaves_steps_out() -> None:
+    assert filmed(3, 50.0) == (range(4), 50.0)
+    steps, pictures_per_s = filmed(7, 120.0)
+    assert list(steps) == [1, 4, 7], "the end is shown"
+    assert pictures_per_s == 40.0
+
+
+def test_films_of_a_scene_and_of_a_sim(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import imageio.v3 as imageio
+
+    monkeypatch.chdir(tmp_path)
+    for sim, name in (("lane", "lane.mcap"), ("CartPole-v1", "cart.mcap")):
+        assert run(["record", sim, "--policy", "random", "--steps", "5", "--out", name]) == 0
+    for name, size in (("lane", (HEIGHT, WIDTH)), ("cart", (400, 600))):
+        films = ["replay", f"{name}.mcap", "--contact-sheet", f"{name}.png"]
+        assert run([*films, "--video", f"{name}.mp4"]) == 0
+        assert run(["replay", f"{name}.mcap", "--video", f"{name}.gif"]) == 0
+        for kind, plugin in (("mp4", "pyav"), ("gif", "pillow")):
+            film = imageio.imread(f"{name}.{kind}", plugin=plugin)
+            # In a GIF, a picture like the one before makes that one stay longer.
+            assert len(film) == 6 if kind == "mp4" else 2 <= len(film) <= 6
+            assert film.shape[1:] == (*size, 3)
+            assert (film[0] != film[-1]).any()
+        assert imageio.imread(f"{name}.png").shape[2] == 3
+    capsys.readouterr()
+    for arguments, why in (
+        (["--video", "lane.mp4"], "lane.mp4 exists"),
+        (["--video", "lane.avi"], "unknown kind of picture '.avi'"),
+        (["--video", "new.mp4", "--episode", "7"], "has episodes 0 to 0"),
+        (["cart.mcap", "--video", "new.mp4"], "a film shows one file"),
+    ):
+        assert run(["replay", "lane.mcap", *arguments]) == 2
+        assert why in capsys.readouterr().err
+    assert not Path("new.mp4").exists()
+
+
+def test_no_film_of_what_cannot_be_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cart.mcap"
+    with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), path)) as env:
+        env.reset()
+        env.step(0)
+    film = ["replay", str(path), "--video", str(tmp_path / "film.mp4")]
+    assert run(film) == 1
+    assert "has no scene, and no seed of episode 0" in capsys.readouterr().err
+    assert not (tmp_path / "film.mp4").exists()

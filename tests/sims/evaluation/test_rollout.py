@@ -1,0 +1,111 @@
+"""Rollouts and scores: seeds, probabilities, intervals."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mcaprl.sims.drawing.scene import Shape
+from mcaprl.sims.evaluation.evaluate import evaluate, improvements, normalize
+from mcaprl.sims.evaluation.report import evaluation_page
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, episode_seed, rollout
+
+
+class AlwaysLeft:
+    name = "left"
+
+    def act(self, observations: Any) -> NDArray[Any]:
+        return np.zeros(len(observations), np.int64)
+
+
+@pytest.fixture
+def env() -> gym.Env[Any, Any]:
+    return gym.make("CartPole-v1")
+
+
+def test_probabilities_by_hand(env: gym.Env[Any, Any]) -> None:
+    behavior = EpsilonGreedy(AlwaysLeft(), 0.2, env.action_space)
+    behavior.begin(3)
+    told = [behavior.choose(np.zeros(4, np.float32)) for _ in range(4000)]
+    assert {probability for action, probability in told if action == 0} == {0.2 / 2 + 0.8}
+    assert {probability for action, probability in told if action == 1} == {0.1}
+    assert np.mean([action for action, _ in told]) == pytest.approx(0.1, abs=0.02)
+
+
+def test_random_policy_has_equal_probabilities(env: gym.Env[Any, Any]) -> None:
+    behavior = EpsilonGreedy(None, 0.0, env.action_space)
+    assert behavior.epsilon == 1.0
+    assert {behavior.choose(np.zeros(4))[1] for _ in range(50)} == {0.5}
+
+
+def test_box_actions_have_no_known_probability() -> None:
+    env = gym.make("Pendulum-v1")
+    behavior = EpsilonGreedy(None, 0.0, env.action_space)
+    action, probability = behavior.choose(np.zeros(3))
+    assert env.action_space.contains(action)
+    assert math.isnan(probability)
+
+
+def test_episodes_do_not_depend_on_who_runs_them(env: gym.Env[Any, Any]) -> None:
+    behavior = EpsilonGreedy(AlwaysLeft(), 0.5, env.action_space)
+    whole = rollout(env, behavior, seed=4, episodes=6)
+    parts = [
+        *rollout(env, behavior, seed=4, episodes=2),
+        *rollout(env, behavior, seed=4, episodes=4, first_episode=2),
+    ]
+    assert [(e.seed, e.total_reward) for e in whole] == [(e.seed, e.total_reward) for e in parts]
+    assert len({episode.seed for episode in whole}) == 6
+    assert episode_seed(4, 1) != episode_seed(5, 0)
+
+
+def test_steps_are_counted_exactly(env: gym.Env[Any, Any]) -> None:
+    results = rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=100)
+    assert sum(result.length for result in results) == 100
+    assert results[-1].reason in ("interrupted", "terminated")
+    with pytest.raises(ValueError, match="either episodes or steps"):
+        rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0)
+
+
+def test_scores_by_hand(env: gym.Env[Any, Any]) -> None:
+    left = evaluate(env, [AlwaysLeft()], name="left", episodes=5, seed=0)
+    random = evaluate(env, [None], name="random", episodes=5, seed=0)
+    twice = evaluate(env, [AlwaysLeft(), AlwaysLeft()], name="twice", episodes=5, seed=0)
+    assert [e.seed for e in left.results[0]] == [e.seed for e in random.results[0]]
+    assert twice.returns.tolist() == [left.returns[0].tolist()] * 2, "greedy runs repeat"
+    assert normalize(left, random, None).normalized_score is None
+    assert normalize(random, random, left).normalized_score == 0.0
+    assert normalize(left, random, left).normalized_score == 1.0
+    json.dumps(left.to_json())
+    [compared] = improvements([left, random])
+    assert {compared.better, compared.than} == {"left", "random"}
+    assert 0.5 <= compared.interval[1] <= 1.0
+    json.dumps(compared.to_json())
+
+
+def test_reports_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
+    random = evaluate(env, [None], name="random", episodes=3, seed=0)
+    left = evaluate(env, [AlwaysLeft()], name="left", episodes=3, seed=0)
+    compared = improvements([random, left])
+    logged = (1.0, 0.5, 2.0)
+    evaluation_page(
+        tmp_path / "a", "CartPole", [left, random], compared, [], logged, (Path("x.mcap"), 1)
+    )
+    assert (tmp_path / "a" / "comparison.png").read_bytes()[:4] == b"\x89PNG"
+    assert not (tmp_path / "a" / "trajectories.png").exists(), "CartPole has no map"
+    page = (tmp_path / "a" / "index.html").read_text()
+    assert "mcaprl replay x.mcap --episode " in page
+    worst = min(random.results[0], key=lambda episode: episode.total_reward)
+    assert f"reset(seed={worst.seed})" in page, "random was not recorded"
+    assert f"return {worst.total_reward:.4g}, {worst.length} steps, terminated" in page
+    lane = gym.make("mcaprl/LaneKeeping-v0")
+    driven = evaluate(lane, [None], name="random", episodes=2, seed=0)
+    world = [Shape("line", "line", (1, 1, 1, 1), points=np.zeros((2, 3)))]
+    evaluation_page(tmp_path / "b", "lane", [driven], [], world, None, None)
+    assert (tmp_path / "b" / "trajectories.png").stat().st_size > 5000

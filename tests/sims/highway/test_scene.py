@@ -1,0 +1,143 @@
+"""What the highway-lane sim shows, and that a recorder of any environment records it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_typestore
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.scene import Color
+from mcaprl.sims.highway.scene import ASPHALT, GRASS, OTHER_PAINT, PAINT
+from tests.support.sim_shapes import rotated
+
+TRACK = {"road": "racetrack-v0"}
+
+
+def made(**kwargs: Any) -> Any:
+    return make_sim("highway-lane", **kwargs).unwrapped
+
+
+def shapes_of(sim: Any) -> dict[str, Any]:
+    return {shape.name: shape for shape in [*sim.static_scene(), *sim.scene()]}
+
+
+def test_the_road_lies_on_the_ground_and_looks_up() -> None:
+    sim = made(**TRACK)
+    sim.reset(seed=0)
+    triangles = shapes_of(sim)["road"].points.reshape(-1, 3, 3)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    assert np.all(triangles[:, :, 2] == 0.0)
+    assert np.all(normals[:, 2] > 0.0)
+
+
+def test_lines_are_at_the_edges_of_lanes() -> None:
+    """2.5 m from the middle of the nearest lane; solid outside and dashed between."""
+    sim = made(**TRACK)
+    sim.reset(seed=0)
+    points = shapes_of(sim)["lines"].points[:, :2]
+    offsets = np.array(
+        [[course.nearest(x_m, y_m).offset_m for course in sim.courses] for x_m, y_m in points]
+    )
+    # Their lanes' ends miss each other by some decimetres.
+    assert np.quantile(np.abs(np.abs(offsets).min(axis=1) - 2.5), 0.95) < 0.1
+    # The first lane is the left one.
+    left = np.isclose(offsets[:, 0], 2.5, atol=0.1)
+    between = np.isclose(offsets[:, 0], -2.5, atol=0.1) & np.isclose(offsets[:, 1], 2.5, atol=0.1)
+    assert left.sum() > 1.3 * between.sum()
+
+
+def test_cars_are_where_they_are() -> None:
+    sim = made(**TRACK)
+    sim.reset(seed=0, options={"pose": (60.0, 0.0, 0.2)})
+    (frame,) = sim.frames()
+    assert (frame.name, frame.parent, frame.position) == ("car", "map", (60.0, 0.0, 0.0))
+    np.testing.assert_allclose(rotated(frame, (1, 0, 0)), [math.cos(0.2), math.sin(0.2), 0])
+    (other,) = sim.others
+    shape = shapes_of(sim)["other_0"]
+    assert shape.position[:2] == (other.x_m, other.y_m)
+    assert (shape.size[:2], shape.yaw_rad) == ((5.0, 2.0), other.yaw_rad)
+    assert shapes_of(sim)["trail"].points[-1, :2].tolist() == [60.0, 0.0]
+    assert abs(sim.courses[0].nearest(other.x_m, other.y_m).offset_m) < 5.1
+
+
+def near(picture: Any, color: Color) -> Any:
+    wanted = np.round(255 * np.array(color[:3]))
+    return np.all(np.abs(picture - wanted) <= 2, axis=-1)
+
+
+def test_the_picture_shows_the_car_on_its_road() -> None:
+    env = make_sim("highway-lane", render_mode="rgb_array", **TRACK)
+    env.reset(seed=0, options={"pose": (60.0, 0.0, 0.0)})
+    picture: Any = env.render()
+    env.close()
+    assert (picture.shape, picture.dtype) == ((600, 600, 3), np.uint8)
+    rows, columns = np.nonzero(near(picture, PAINT))
+    assert (abs(rows.mean() - 300) < 3, abs(columns.mean() - 300) < 5) == (True, True)
+    assert near(picture, OTHER_PAINT).sum() > 100
+    # 80 m are 600 pixels: the left edge of the left lane is 19 pixels up, two lanes are 75 wide.
+    column = picture[250:400, 330]
+    rows = np.flatnonzero(near(column, ASPHALT))
+    assert rows.min() == pytest.approx(50 - 19, abs=3)
+    assert rows.max() == pytest.approx(50 + 56, abs=3)
+    assert near(column, GRASS).sum() > 60
+
+
+def test_a_window_shows_each_step() -> None:
+    env = make_sim("highway-lane", render_mode="human")
+    env.reset(seed=0)
+    env.step(0)
+    assert env.render() is None
+    env.close()
+
+
+def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
+    log, layout = tmp_path / "highway.mcap", tmp_path / "layout.json"
+    assert run(["record", "highway-lane", "--out", str(log), "--episodes", "2"]) == 0
+    assert run(["check", str(log)]) == 0
+    assert run(["layout", "highway-lane", "--out", str(layout)]) == 0
+    data = mcaprl.open(log)
+    assert data.env_id == "mcaprl/HighwayLane-v0"
+    assert [episode.reason for episode in data.episodes] == ["finished", "finished"]
+    assert list(data.action_names.values())[:2] == ["straight", "right"]
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    shown: dict[str, list[Any]] = {}
+    with log.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages(
+            topics=["/scene", "/scene/static", "/tf"]
+        ):
+            assert schema is not None
+            shown.setdefault(channel.topic, []).append(
+                store.deserialize_cdr(message.data, schema.name)
+            )
+    assert {marker.ns for marker in shown["/scene/static"][0].markers} >= {"road", "lines"}
+    # One at least at each episode's start and end, at most one for each observation.
+    for topic in ("/scene", "/tf"):
+        assert 4 <= len(shown[topic]) <= len(data.rewards) + 2
+    place = shown["/tf"][0].transforms[0]
+    assert (place.header.frame_id, place.child_frame_id) == ("map", "car")
+    panels = json.loads(layout.read_text())["configById"]
+    assert panels["3D!scene"]["followTf"] == "car"
+    assert "lateral_offset_m" in json.dumps(panels)
+
+
+def test_what_was_logged_can_be_driven_again(tmp_path: Path) -> None:
+    log = tmp_path / "highway.mcap"
+    arguments = ["--episodes", "2", "--policy", "random", "--seed", "5"]
+    assert run(["record", "highway-lane", "--out", str(log), *arguments]) == 0
+    sim = made()
+    for episode in mcaprl.open(log).episodes:
+        seen, _ = sim.reset(seed=episode.seed)
+        for step, action in enumerate(episode.actions):
+            np.testing.assert_array_equal(episode.observations[step], seen)
+            seen, reward, terminated, _, _ = sim.step(action)
+            assert (episode.rewards[step], episode.terminated[step]) == (reward, terminated)
+        np.testing.assert_array_equal(episode.next_observations[-1], seen)

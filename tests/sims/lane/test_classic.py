@@ -1,0 +1,249 @@
+"""The published rules of the lane sim: numbers worked by hand, and its faults shown by driving."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.lane.classic import (
+    classic_decide,
+    classic_distance,
+    classic_end,
+    classic_reward,
+)
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.env import LaneKeepingEnv
+from mcaprl.sims.lane.rules import (
+    BRAKE,
+    COLLISION,
+    DRIVING,
+    LOW_REWARD,
+    OFF_LANE,
+    SLOW,
+    located,
+)
+
+STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = range(1, 6)
+
+
+def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
+    sim = make_sim("lane", rules=rules, **kwargs).unwrapped
+    assert isinstance(sim, LaneKeepingEnv)
+    sim.reset(seed=0)
+    return sim
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "speed_m_s", "action", "hit", "reward", "text", "code"),
+    [
+        # In the middle at 10 m/s: (1 - .5) + (0 - .5) = 0; at rest 10 / 290 less.
+        (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
+        (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
+        # The same without braking: too slow by the text, up to 5 m/s.
+        (60.0, 1.0, 0.0, STRAIGHT, False, -0.034483, SLOW, DRIVING),
+        (60.0, 1.0, 5.0, LEFT, False, -0.017241, SLOW, DRIVING),
+        (60.0, 1.0, 5.1, LEFT, False, -0.016897, DRIVING, DRIVING),
+        # The fastest car there is, 20 / 290 more.
+        (60.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
+        # 0.5 m beside it at 10 m/s: e^-1.5 - 1.
+        (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
+        # 1 m beside it at 20 m/s: e^-3 - 1 + 10 / 290.
+        (130.0 + 1.0, -60.0, 20.0, RIGHT, False, -0.915730, DRIVING, DRIVING),
+        # 3.4 m beside it, fast: e^-10.2 - 1 + 10 / 290 is no less than -1; at 9 m/s it is.
+        (60.0, 4.4, 20.0, STRAIGHT, False, -0.965480, DRIVING, DRIVING),
+        (60.0, 4.4, 9.0, STRAIGHT, False, -1.003411, LOW_REWARD, LOW_REWARD),
+        # The hidden lane at rest ends at ln(29) / 3 = 1.1224 m: there e^-3d is 10 / 290.
+        (60.0, 2.122, 0.0, BRAKE, False, -0.999955, DRIVING, DRIVING),
+        (60.0, 2.123, 0.0, BRAKE, False, -1.000059, LOW_REWARD, LOW_REWARD),
+        # Beyond 3.5 m: -3 and the end, however fast.
+        (60.0, 4.51, 20.0, STRAIGHT, False, -3.0, OFF_LANE, OFF_LANE),
+        (60.0, -60.0, 30.0, BRAKE, True, -3.0, OFF_LANE, OFF_LANE),
+        # A collision ends by the code, and only driving straight ahead.
+        (60.0, 1.5, 10.0, STRAIGHT, True, -0.776870, DRIVING, COLLISION),
+        (60.0, 1.5, 10.0, LEFT, True, -0.776870, DRIVING, DRIVING),
+        (60.0, 1.0, 4.0, BRAKE, True, -0.020690, DRIVING, DRIVING),
+        # 200 m past the first corner, on the first leg's extension: the line is endless.
+        (330.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
+        # 500 m south of it all, 0.1 m beside the extension of x = 0: e^-0.3 - 1.
+        (-0.1, -500.0, 10.0, STRAIGHT, False, -0.259182, DRIVING, DRIVING),
+    ],
+)
+def test_rewards_and_ends_by_hand(
+    x_m: float,
+    y_m: float,
+    speed_m_s: float,
+    action: int,
+    hit: bool,
+    reward: float,
+    text: int,
+    code: int,
+) -> None:
+    distance_m = classic_distance(x_m, y_m)
+    assert classic_reward(distance_m, speed_m_s) == pytest.approx(reward, abs=2e-6)
+    assert classic_end(distance_m, speed_m_s, action, hit, False) == text
+    assert classic_end(distance_m, speed_m_s, action, hit, True) == code
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "distance_m"),
+    [
+        (60.0, 1.0, 0.0),
+        (60.0, 3.0, 2.0),
+        (128.0, 60.0, 2.0),
+        (400.0, 1.0, 0.0),
+        (400.0, -2.0, 3.0),
+        (-300.0, 126.0, 2.0),
+        (65.0, -62.0, 63.0),
+        (65.0, 64.0, 63.0),
+        (1.0, 700.0, 1.0),
+    ],
+)
+def test_the_distance_is_to_the_nearest_endless_line(
+    x_m: float, y_m: float, distance_m: float
+) -> None:
+    """The lines are y = 1, x = 130, y = -125, x = 0 and y = 128."""
+    assert classic_distance(x_m, y_m) == pytest.approx(distance_m)
+
+
+def test_a_decision_lasts_a_second() -> None:
+    """Full throttle from 10 m/s: v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
+    car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
+    after, hit = classic_decide(car, STRAIGHT)
+    assert not hit
+    assert after.speed_m_s == pytest.approx(30.0 - 20.0 * (1.0 - 0.2 / 30.0) ** 20)
+    assert lane().step_duration_s == 1.0
+
+
+def test_it_starts_on_the_line_with_a_second_straight_ahead() -> None:
+    car = lane().car
+    assert car.speed_m_s == pytest.approx(30.0 - 30.0 * (1.0 - 0.2 / 30.0) ** 20)
+    assert 2.0 < car.x_m < 4.0
+    assert car.steering == 0.0
+    assert lane(start="anywhere").car.along_m != car.along_m
+
+
+@pytest.mark.parametrize("rules", ["classic", "classic-code"])
+def test_ends_are_named(rules: str) -> None:
+    sim = lane(rules)
+    sim.reset(options={"pose": (60.0, 1.0, math.pi / 2, 10.0)})
+    _, reward, terminated, _, info = sim.step(STRAIGHT)
+    assert (reward, terminated, info["reason"]) == (-3.0, True, "off_lane")
+    sim.reset(options={"pose": (60.0, 2.5, 0.0, 6.0)})
+    _, reward, terminated, _, info = sim.step(BRAKE)
+    assert reward < -1.0
+    assert (terminated, info["reason"]) == (True, "low_reward")
+
+
+def test_the_two_published_ends_differ() -> None:
+    """Driving off from rest is too slow by the text; driving through a rail is over by the code."""
+    slow, through_a_rail = {"pose": (60.0, 1.0, 0.0, 0.0)}, {"pose": (120.0, 1.0, 0.0, 20.0)}
+    reasons = {}
+    for rules in ("classic", "classic-code"):
+        sim = lane(rules)
+        for start in (slow, through_a_rail):
+            sim.reset(options=start)
+            info = sim.step(STRAIGHT)[4]
+            reasons[rules, start["pose"][0]] = info.get("reason")
+    assert reasons == {
+        ("classic", 60.0): "slow",
+        ("classic", 120.0): None,
+        ("classic-code", 60.0): None,
+        ("classic-code", 120.0): "collision",
+    }
+
+
+def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
+    """The reward of the pilot's lap; it even decides four times as often as the rules allow."""
+    sim = make_sim("lane", start="line").unwrapped
+    assert isinstance(sim, LaneKeepingEnv)
+    pilot = make_pilot(sim)
+    observation, info = sim.reset(seed=0)
+    score, step = 0.0, 0
+    while info["progress_m"] < COURSE.length_m:
+        observation, _, terminated, _, info = sim.step(pilot.act(observation[None])[0])
+        assert not terminated
+        step += 1
+        if step % 4 == 0:
+            car = sim.car
+            score += classic_reward(classic_distance(car.x_m, car.y_m), car.speed_m_s)
+    left = lane()
+    left.reset(options={"pose": (60.0, 1.0, math.pi / 2, 10.0)})
+    assert left.step(STRAIGHT)[1] == -3.0
+    assert score < 5 * -3.0
+
+
+def test_fault_speed_is_hardly_paid() -> None:
+    """From 10 to 30 m/s it is worth 0.069 a second: as much as 2.4 cm beside the middle costs."""
+    gain = classic_reward(0.0, 30.0) - classic_reward(0.0, 10.0)
+    assert gain == pytest.approx(20.0 / 290.0)
+    assert classic_reward(0.0, 10.0) - classic_reward(0.024, 10.0) > gain
+    sim = lane()
+    sim.reset(options={"pose": (10.0, 1.0, 0.0, 0.0)})
+    sim.step(BRAKE)
+    rewards = [sim.step(STRAIGHT)[1] for _ in range(7)]
+    assert max(rewards) < 0.07
+
+
+def test_fault_a_hidden_lane_at_low_speed() -> None:
+    """1.2 m beside the middle: over at 1 m/s, paid on at 10 m/s, though the lane is 3.5 m wide."""
+    sim = lane()
+    ends = {}
+    for speed_m_s in (2.0, 20.0):
+        sim.reset(options={"pose": (60.0, 2.2, 0.0, speed_m_s)})
+        *_, terminated, _, info = sim.step(BRAKE)
+        assert abs(info["lateral_offset_m"]) < 1.3
+        ends[speed_m_s] = terminated
+    assert ends == {2.0: True, 20.0: False}
+
+
+def test_fault_driving_off_along_the_extension_is_paid() -> None:
+    """Straight on at the first corner, through rail and houses: paid as the street is, for ever."""
+    sim = lane()
+    sim.reset(options={"pose": (100.0, 1.0, 0.0, 20.0)})
+    for _ in range(60):
+        _, reward, terminated, _, info = sim.step(STRAIGHT)
+        assert not terminated
+        assert reward > 0.03
+    assert sim.car.x_m > 1500.0
+    assert abs(info["lateral_offset_m"]) > 1000.0
+
+
+def test_fault_braking_to_a_stand_never_ends() -> None:
+    sim = lane()
+    sim.reset(options={"pose": (60.0, 1.0, 0.0, 10.0)})
+    for _ in range(400):
+        _, reward, terminated, _, _ = sim.step(BRAKE)
+        assert not terminated
+    assert reward == pytest.approx(-10.0 / 290.0)
+
+
+def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
+    """Through the same rail while braking: nothing happens."""
+    sim = lane("classic-code")
+    reasons = []
+    for action in (STRAIGHT, BRAKE):
+        sim.reset(options={"pose": (124.0, 1.0, 0.0, 15.0)})
+        reasons.append(sim.step(action)[4].get("reason"))
+        assert sim.car.x_m > 134.2
+    assert reasons == ["collision", None]
+
+
+def test_fault_in_a_second_nothing_can_be_corrected() -> None:
+    """At 15 m/s, the slightest steering leads from the middle of the lane out of it."""
+    sim = lane()
+    for action in (RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT):
+        sim.reset(options={"pose": (60.0, 1.0, 0.0, 15.0)})
+        assert sim.step(action)[4]["reason"] == "off_lane"
+
+
+def test_fault_half_of_the_picture_s_codes_are_for_1_to_2_m() -> None:
+    sim = lane(observation="depth")
+    observation, _ = sim.reset(seed=0)
+    depth_m = sim.depth_image_m()
+    assert observation[:, :, 0][depth_m > 2.0].max() <= 127
+    assert observation[:, :, 0][depth_m > 50.0].max() <= 5

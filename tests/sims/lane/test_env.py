@@ -1,0 +1,159 @@
+"""The lane sim as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.depth import encode_depth
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.env import LaneKeepingEnv
+
+
+def lane(**kwargs: Any) -> LaneKeepingEnv:
+    """The sim itself, without wrappers."""
+    sim = make_sim("lane", **kwargs).unwrapped
+    assert isinstance(sim, LaneKeepingEnv)
+    return sim
+
+
+def test_random_starts_are_where_the_card_says() -> None:
+    sim = lane()
+    for seed in range(200):
+        _, info = sim.reset(seed=seed)
+        assert abs(info["lateral_offset_m"]) <= 1.5 + 1e-9
+        assert abs(info["heading_error_rad"]) <= 0.2 + 1e-9
+        assert 0.0 <= info["speed_m_s"] <= 10.0
+        assert info["progress_m"] == 0.0
+
+
+def test_starts_on_the_line_are_near_it_and_not_all_the_same() -> None:
+    sim = lane(start="line")
+    places = []
+    for seed in range(20):
+        sim.reset(seed=seed)
+        places.append(sim.telemetry())
+    assert all(abs(place["x_m"] - 2.0) < 1e-9 for place in places)
+    assert all(abs(place["y_m"] - 1.0) <= 0.3 for place in places)
+    assert all(place["speed_m_s"] == 0.0 for place in places)
+    assert len({place["y_m"] for place in places}) == 20
+
+
+def test_a_pose_is_kept() -> None:
+    sim = lane()
+    _, info = sim.reset(options={"pose": (130.0, -50.0, -math.pi / 2, 7.0)})
+    expected = {
+        "x_m": 130.0,
+        "y_m": -50.0,
+        "yaw_rad": -math.pi / 2,
+        "speed_m_s": 7.0,
+        "lateral_offset_m": 0.0,
+        "heading_error_rad": 0.0,
+        "progress_m": 0.0,
+        "steering_rad": 0.0,
+    }
+    assert sim.telemetry().keys() == expected.keys()
+    assert sim.telemetry() == pytest.approx(expected, abs=1e-12)
+    assert info["speed_m_s"] == 7.0
+    sim.reset(options={"pose": [130.0, -50.0, 0.0]})
+    assert sim.telemetry()["speed_m_s"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: at most 3.5 m"),
+        ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s is 0 to 30, not -1.0"),
+    ],
+)
+def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        lane().reset(options=options)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"rules": "classics"}, "did you mean classic or classic-code\\?"),
+        ({"observation": "stat"}, "did you mean state\\?"),
+        ({"start": "pole"}, "known: None, anywhere, line"),
+    ],
+)
+def test_an_unknown_value_is_refused(kwargs: dict[str, str], words: str) -> None:
+    with pytest.raises(UnknownNameError, match=words):
+        lane(**kwargs)
+
+
+def last_step(env: gym.Env[Any, Any], action: int) -> tuple[float, bool, bool, dict[str, Any]]:
+    """Repeat one action until the episode ends."""
+    while True:
+        _, reward, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return float(reward), terminated, truncated, info
+
+
+def test_leaving_the_lane_and_stalling_are_named_and_cost_5() -> None:
+    env = make_sim("lane")
+    env.reset(options={"pose": (50.0, 1.0, 0.0, 8.0)})
+    assert last_step(env, 3)[:3] == (-5.0, True, False)
+    env.reset(options={"pose": (50.0, 1.0, 0.0, 8.0)})
+    assert last_step(env, 3)[3]["reason"] == "off_lane"
+    env.reset(options={"pose": (50.0, 1.0, 0.0, 8.0)})
+    assert last_step(env, 0)[3]["reason"] == "stall"
+
+
+def test_progress_counts_along_the_path() -> None:
+    sim = lane()
+    sim.reset(options={"pose": (20.0, 1.0, 0.0, 8.0)})
+    total = 0.0
+    for _ in range(20):
+        _, reward, _, _, info = sim.step(1)
+        total += float(reward)
+    assert info["progress_m"] == pytest.approx(sim.telemetry()["x_m"] - 20.0)
+    assert total == pytest.approx(info["progress_m"] / 7.5)
+
+
+def test_what_the_camera_sees_is_what_is_observed() -> None:
+    sim = lane(observation="depth")
+    seen, _ = sim.reset(seed=4)
+    assert seen.shape == (84, 84, 1)
+    assert seen.dtype == np.uint8
+    depth_m = sim.depth_image_m()
+    assert depth_m.shape == (84, 84)
+    assert depth_m.dtype == np.float32
+    np.testing.assert_array_equal(seen[:, :, 0], encode_depth(depth_m))
+    moved, *_ = sim.step(1)
+    np.testing.assert_array_equal(moved[:, :, 0], encode_depth(sim.depth_image_m()))
+
+
+@pytest.mark.parametrize(
+    ("along_m", "turn"),
+    [(10.0, -1), (129.9, -1), (130.1, -1), (511.0, -1), (513.0, 1), (1025.9, 1)],
+)
+def test_a_dashboard_tells_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
+    # The shared street comes before the fifth corner: its first passage ends in a right turn, the
+    # second, 512 m on, in a left one.
+    sim = lane(observation="dashboard")
+    sim.reset(seed=4)
+    sim.fleet._cars[0, 5] = along_m + 3 * COURSE.length_m
+    sim.fleet._cars[0, 3] = 15.0
+    seen = sim.fleet.observation(0)
+    assert seen["depth"].tobytes() == encode_depth(sim.depth_image_m()).tobytes()
+    assert seen["motion"][2] == turn
+    moved, *_ = sim.step(3)
+    assert moved["motion"][1] == 1.0, "50 % to the left"
+    assert moved["motion"][0] == pytest.approx(sim.car.speed_m_s / 30)
+
+
+def test_names_fit_what_they_name() -> None:
+    sim = lane()
+    assert len(sim.action_meanings) == 6
+    assert len(sim.observation_names) == 12
+    assert lane(observation="depth").observation_names == ()
+    assert sim.step_duration_s * sim.metadata["render_fps"] == 1.0

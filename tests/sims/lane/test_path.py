@@ -1,0 +1,53 @@
+"""The course's own searches find what those of any path find, to the bit."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from mcaprl.sims.geometry.paths import further, point_of, project, spot_at
+from mcaprl.sims.lane.course import COURSE
+from mcaprl.sims.lane.path import (
+    LONGEST_LOOK_M,
+    course_leg,
+    course_next,
+    course_point_ahead,
+    course_project,
+    course_spot_at,
+)
+from mcaprl.sims.lane.rules import AHEAD_M, BEHIND_M, LOOKAHEADS_M
+
+# A subnormal number before the start ends behind it, a distance that no car can tell.
+along = st.one_of(
+    st.floats(-20, 5000, allow_subnormal=False), st.sampled_from(COURSE.along_m.tolist())
+)
+
+
+def test_nobody_looks_further_than_the_shortest_leg() -> None:
+    assert LONGEST_LOOK_M == 126.0
+    assert max(*LOOKAHEADS_M, BEHIND_M + AHEAD_M) < LONGEST_LOOK_M
+
+
+@given(along)
+@example(-1e-17)
+@example(1026.0)
+def test_a_place_on_the_course(along_m: float) -> None:
+    leg, rest_m = course_spot_at(along_m)
+    assert (int(leg), rest_m) == spot_at(COURSE, along_m)
+
+
+@given(along, st.sampled_from(LOOKAHEADS_M))
+def test_a_point_ahead(along_m: float, ahead_m: float) -> None:
+    leg, rest_m = course_spot_at(along_m)
+    found = course_point_ahead(course_leg(leg), course_leg(course_next(leg)), rest_m, ahead_m)
+    assert found == point_of(COURSE, further(COURSE, spot_at(COURSE, along_m), ahead_m))
+
+
+@given(along, st.floats(-9, 9), st.floats(-math.pi, math.pi), st.floats(0, 9))
+def test_the_nearest_point(along_m: float, away_m: float, angle: float, lag_m: float) -> None:
+    x_m, y_m = point_of(COURSE, spot_at(COURSE, along_m))
+    x_m, y_m = x_m + away_m * math.cos(angle), y_m + away_m * math.sin(angle)
+    window = (along_m - lag_m - BEHIND_M, along_m - lag_m + AHEAD_M)
+    assert course_project(x_m, y_m, *window) == project(COURSE, x_m, y_m, *window)

@@ -1,0 +1,167 @@
+"""What the lane sim's car can touch, and how far its rays reach, by hand and by an outline."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mcaprl.sims import make_sim
+from mcaprl.sims.geometry.bicycle import moving
+from mcaprl.sims.lane.course import buildings, rails
+from mcaprl.sims.lane.env import LaneKeepingEnv
+from mcaprl.sims.lane.obstacles import BODY_LENGTH_M, BODY_WIDTH_M, ray_length, touches
+from mcaprl.sims.lane.rays import RAYS_DEG, observe_rays
+from mcaprl.sims.lane.rules import Car, located
+
+BOXES = (*rails(), *buildings())
+
+
+def car_at(x_m: float, y_m: float, yaw_rad: float) -> Car:
+    return located(moving(x_m, y_m, yaw_rad, 5.0), 0.0, 60.0, 0.0)
+
+
+def lane() -> LaneKeepingEnv:
+    sim = make_sim("lane", observation="rays").unwrapped
+    assert isinstance(sim, LaneKeepingEnv)
+    return sim
+
+
+def in_a_box(x_m: float, y_m: float) -> bool:
+    return any(
+        abs(x_m - box.x_m) <= box.length_m / 2 and abs(y_m - box.y_m) <= box.width_m / 2
+        for box in BOXES
+    )
+
+
+@pytest.mark.parametrize(
+    ("angle_rad", "length_m"),
+    [
+        # On the first street, y = 1: the rails' inner faces are 4 m to each side.
+        (math.pi / 2, 4.0),
+        (-math.pi / 2, 4.0),
+        (math.pi / 4, 4.0 * math.sqrt(2.0)),
+        (-math.pi / 4, 4.0 * math.sqrt(2.0)),
+        # Ahead, the rail behind the first corner, at x = 134; behind, the one at x = -4.
+        (0.0, 74.0),
+        (math.pi, 64.0),
+        (math.radians(30.0), 8.0),
+    ],
+)
+def test_rays_on_a_street_by_hand(angle_rad: float, length_m: float) -> None:
+    assert ray_length(60.0, 1.0, angle_rad) == pytest.approx(length_m)
+
+
+def test_a_ray_reaches_100_m() -> None:
+    assert ray_length(20.0, 1.0, 0.0) == 100.0
+    assert ray_length(34.01, 1.0, 0.0) == pytest.approx(99.99)
+
+
+def test_a_ray_from_within_something_is_0() -> None:
+    house = buildings()[0]
+    assert ray_length(house.x_m, house.y_m, 1.0) == 0.0
+
+
+@given(st.floats(-20.0, 150.0), st.floats(-150.0, 150.0), st.floats(-math.pi, math.pi))
+def test_a_ray_ends_where_the_first_box_begins(x_m: float, y_m: float, angle_rad: float) -> None:
+    """Sampled every 2 cm: nothing before the end, something behind it."""
+    length_m = ray_length(x_m, y_m, angle_rad)
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    along_m = np.arange(0.0, length_m - 1e-6, 0.02)
+    for box in BOXES:
+        inside_x = np.abs(x_m + along_m * cos - box.x_m) <= box.length_m / 2
+        inside_y = np.abs(y_m + along_m * sin - box.y_m) <= box.width_m / 2
+        assert not (inside_x & inside_y).any()
+    if 0.0 < length_m < 100.0:
+        behind_m = length_m + 1e-9
+        assert in_a_box(x_m + behind_m * cos, y_m + behind_m * sin) or in_a_box(
+            x_m + length_m * cos, y_m + length_m * sin
+        )
+
+
+def test_what_is_observed_by_hand() -> None:
+    sim = lane()
+    observation, _ = sim.reset(options={"pose": (60.0, 2.0, 0.0, 15.0)})
+    seen = dict(zip(sim.observation_names, observation.tolist(), strict=True))
+    assert seen["left_90"] == pytest.approx(math.log(1 + 3.0) / math.log(101))
+    assert seen["right_90"] == pytest.approx(math.log(1 + 5.0) / math.log(101))
+    assert seen["right_30"] == pytest.approx(math.log(1 + 10.0) / math.log(101))
+    assert seen["ahead"] == pytest.approx(math.log(1 + 74.0) / math.log(101))
+    assert seen["behind"] == pytest.approx(math.log(1 + 64.0) / math.log(101))
+    assert (seen["speed"], seen["steering"]) == (0.5, 0.0)
+    assert (seen["way_20m_forward"], seen["way_20m_left"]) == pytest.approx((1.0, -0.05))
+    turned = sim.step(2)[0]
+    assert turned[17] == -1.0
+    assert len(RAYS_DEG) == 16
+
+
+def test_the_way_tells_the_crossing_s_streets_apart() -> None:
+    """The shared leg ends with a right turn on one pass and with a left turn on the other."""
+    observation = np.zeros(20, dtype=np.float32)
+    way = []
+    for near_m in (125.0, 637.0):
+        observe_rays(located(moving(125.0, 1.0, 0.0, 5.0), 0.0, near_m, 0.0), observation)
+        way.append(observation[18:].tolist())
+    assert way == [[0.25, -0.75], [0.25, 0.75]]
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "yaw_rad", "hit"),
+    [
+        (60.0, 1.0, 0.0, False),
+        # Its side is 0.875 m from its middle, the rail's face 4 m from the street's.
+        (60.0, 1.0 + 4.0 - 0.876, 0.0, False),
+        (60.0, 1.0 + 4.0 - 0.874, 0.0, True),
+        (60.0, 1.0 - 4.0 + 0.874, 0.0, True),
+        # Its nose is 2.2 m ahead of the middle of its wheelbase, its tail 2.1 m behind.
+        (134.0 - 2.201, 1.0, 0.0, False),
+        (134.0 - 2.199, 1.0, 0.0, True),
+        (134.0 - 2.101, 1.0, math.pi, False),
+        (134.0 - 2.099, 1.0, math.pi, True),
+        # Across the street it needs 4.3 m; turned by 45 degrees 3.05 m to one side.
+        (60.0, 1.0, math.pi / 2, False),
+        (60.0, 3.0, math.pi / 2, True),
+        # Off the road between the rails and the houses.
+        (60.0, 7.0, 0.0, False),
+    ],
+)
+def test_what_a_car_touches_by_hand(x_m: float, y_m: float, yaw_rad: float, hit: bool) -> None:
+    assert touches(car_at(x_m, y_m, yaw_rad)) is hit
+
+
+@given(st.floats(-12.0, 145.0), st.floats(-20.0, 20.0), st.floats(-math.pi, math.pi))
+def test_a_car_touches_what_has_a_point_in_its_body(x_m: float, y_m: float, yaw_rad: float) -> None:
+    """The body is sampled every 5 cm, finer than a rail is thick."""
+    forward, left = np.meshgrid(
+        np.linspace(-BODY_LENGTH_M / 2, BODY_LENGTH_M / 2, 87) + 0.05,
+        np.linspace(-BODY_WIDTH_M / 2, BODY_WIDTH_M / 2, 36),
+    )
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    body_x, body_y = x_m + forward * cos - left * sin, y_m + forward * sin + left * cos
+    found, near = False, False
+    for box in BOXES:
+        outside_x = np.abs(body_x - box.x_m) - box.length_m / 2
+        outside_y = np.abs(body_y - box.y_m) - box.width_m / 2
+        distance_m = np.maximum(outside_x, outside_y).min()
+        found |= bool(distance_m <= 0.0)
+        near |= bool(distance_m <= 0.05)
+    hit = touches(car_at(x_m, y_m, yaw_rad))
+    assert hit or not found
+    assert near or not hit
+
+
+def test_the_scene_shows_the_rays_that_are_observed() -> None:
+    sim = lane()
+    sim.reset(options={"pose": (60.0, 1.0, 0.0)})
+    shapes = {shape.name: shape for shape in sim.scene()}
+    lines = shapes["rays"].points.reshape(16, 2, 3)
+    lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
+    assert lengths[0] == pytest.approx(74.0)
+    np.testing.assert_allclose(shapes["hits"].points[:, :2], lines[:, 1, :2])
+    bare = make_sim("lane").unwrapped
+    assert isinstance(bare, LaneKeepingEnv)
+    bare.reset(seed=0)
+    assert "rays" not in {shape.name for shape in bare.scene()}

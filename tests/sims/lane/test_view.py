@@ -1,0 +1,126 @@
+"""The pictures of the lane sim from above, and the flattening of shapes behind them."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import mcaprl.sims
+from mcaprl.sims.drawing.scene import Color, Kind, Shape
+from mcaprl.sims.drawing.top_view import patches, placed
+from mcaprl.sims.lane.scene import GRASS, PAINT
+
+ENV_ID = mcaprl.sims.SIMS["lane"]
+RED: Color = (1.0, 0.0, 0.0, 1.0)
+
+Picture = NDArray[np.uint8]
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def picture_at(pose: tuple[float, float, float]) -> Picture:
+    """Give the picture of a car at a pose."""
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    env.reset(options={"pose": pose})
+    picture = env.render()
+    env.close()
+    assert isinstance(picture, np.ndarray)
+    return picture
+
+
+def near(picture: Picture, color: Color) -> NDArray[np.bool_]:
+    """Say which pixels have a colour, but for rounding."""
+    wanted = np.round(255 * np.array(color[:3]))
+    return np.asarray(np.all(np.abs(picture - wanted) <= 2, axis=-1))
+
+
+def test_a_picture_has_the_car_in_its_middle() -> None:
+    picture = picture_at((50.0, 1.0, 0.0))
+    assert picture.shape == (600, 600, 3)
+    assert picture.dtype == np.uint8
+    rows, columns = np.nonzero(near(picture, PAINT))
+    assert abs(rows.mean() - 300) < 12
+    assert abs(columns.mean() - 300) < 12
+
+
+def test_the_car_points_where_it_is_heading() -> None:
+    """Along x it is longer from left to right, along y from top to bottom."""
+    for yaw_rad, wide in ((0.0, True), (math.pi / 2, False)):
+        rows, columns = np.nonzero(near(picture_at((50.0, 1.0, yaw_rad)), PAINT))
+        assert (np.ptp(columns) > 1.5 * np.ptp(rows)) == wide
+
+
+def test_north_is_up_and_east_is_right() -> None:
+    """10 m before the corner at (130, 1): grass 8 m to the north, none 8 m to the east."""
+    grass = near(picture_at((120.0, 1.0, 0.0)), GRASS)
+    ten_metres_px = round(10 * 600 / 55)
+    assert grass[300 - ten_metres_px // 2, 250]
+    assert not grass[300, 300 + ten_metres_px]
+    assert not grass[300 - ten_metres_px, 300 + ten_metres_px]
+
+
+def test_a_window_shows_each_step() -> None:
+    env = gym.make(ENV_ID, render_mode="human")
+    env.reset(seed=0)
+    env.step(1)
+    assert env.render() is None
+    env.close()
+
+
+def test_rendering_needs_a_mode() -> None:
+    """The env itself draws nothing without one; Gymnasium's own wrapper would warn."""
+    env = gym.make(ENV_ID).unwrapped
+    env.reset(seed=0)
+    assert env.render() is None
+
+
+def test_patches_lie_in_the_order_of_their_heights() -> None:
+    tower = Shape("tower", "box", RED, size=(2.0, 4.0, 10.0), position=(1.0, 2.0, 5.0))
+    road = Shape("road", "triangles", RED, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]))
+    low, high = patches([tower, road])
+    assert (low.top_m, high.top_m) == (0.0, 10.0)
+    assert high.corners_m.tolist() == [[0, 0], [2, 0], [2, 4], [0, 4]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("box", 1), ("sphere", 1), ("cylinder", 1), ("text", 0)],
+)
+def test_solids_become_one_patch_and_text_none(kind: Kind, expected: int) -> None:
+    assert len(patches([Shape("it", kind, RED)])) == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("line", 5), ("arrow", 5), ("segments", 3), ("points", 6), ("triangles", 2)],
+)
+def test_points_become_patches_by_kind(kind: Kind, expected: int) -> None:
+    assert len(patches([Shape("it", kind, RED, np.eye(6, 3))])) == expected
+
+
+def test_a_stroke_is_as_wide_as_it_says() -> None:
+    ends = np.array([[0.0, 0.0, 1.0], [10.0, 0.0, 1.0]])
+    (stroke,) = patches([Shape("it", "line", RED, ends, size=(0.5, 0.0, 0.0))])
+    np.testing.assert_allclose(stroke.corners_m.min(axis=0), [-0.25, -0.25], atol=1e-12)
+    np.testing.assert_allclose(stroke.corners_m.max(axis=0), [10.25, 0.25], atol=1e-12)
+
+
+def test_a_quarter_turn_by_hand() -> None:
+    np.testing.assert_allclose(placed(np.array([[2.0, 1.0]]), 10.0, 20.0, math.pi / 2), [[9, 22]])
+
+
+@given(st.floats(-9, 9), st.floats(-50, 50), st.floats(-50, 50))
+def test_placing_keeps_distances(yaw_rad: float, x_m: float, y_m: float) -> None:
+    corners = np.array([[0.0, 0.0], [3.0, 4.0]])
+    first, second = placed(corners, x_m, y_m, yaw_rad)
+    np.testing.assert_allclose(first, [x_m, y_m])
+    assert np.hypot(*(second - first)) == pytest.approx(5.0)

@@ -1,0 +1,180 @@
+"""The published rules of the powerline sim: numbers worked by hand, and its faults shown."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from mcaprl.sims import make_sim
+from mcaprl.sims.geometry.vectors import Vector
+from mcaprl.sims.powerline.classic import (
+    classic_decide,
+    classic_distance,
+    classic_end,
+    classic_reward,
+)
+from mcaprl.sims.powerline.env import PowerlineEnv
+from mcaprl.sims.powerline.quadrotor import POINT
+from mcaprl.sims.powerline.rules import COLLISION, FLYING, OFF_LINE, begin
+from mcaprl.sims.powerline.world import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
+
+ZERO = Vector(0.0, 0.0, 0.0)
+NORTH, SOUTH, NOTHING = 0, 3, 6
+
+
+def beside(leg: int, along_m: float, distance_m: float) -> Vector:
+    """A place at a level distance, to the right of a leg or of its extension."""
+    across = np.cross([0.0, 0.0, 1.0], TANGENTS[leg])
+    across /= np.linalg.norm(across)
+    return Vector(*(POINTS_M[leg] + along_m * TANGENTS[leg] + distance_m * across).tolist())
+
+
+@pytest.mark.parametrize(
+    ("place", "speed_m_s", "hit", "reward", "end"),
+    [
+        # On the line at rest: (1 - .5) + (0 - .5) = 0.
+        (beside(0, 30.0, 0.0), 0.0, False, 0.0, FLYING),
+        # On the line at the first speed.
+        (beside(0, 30.0, 0.0), 1.445, False, 1.445, FLYING),
+        # 1 m beside it at 2 m/s: e^-1 - .5 + 1.5 = 1.36788.
+        (beside(1, 60.0, 1.0), 2.0, False, 1.367879, FLYING),
+        # 1 m beside it at rest: e^-1 - 1.
+        (beside(1, 60.0, 1.0), 0.0, False, -0.632121, FLYING),
+        # 3 m beside it at half a metre per second: e^-3 - .5.
+        (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
+        # 6.99 m beside it: e^-6.99 - .5 + 9.5, for 10 m/s in any direction.
+        (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
+        # Beyond 7 m: -10 and the end, however fast.
+        (beside(3, 100.0, 7.01), 10.0, False, -10.0, OFF_LINE),
+        (beside(0, -30.0, 7.5), 1.0, False, -10.0, OFF_LINE),
+        # A collision outweighs all.
+        (beside(1, 60.0, 0.0), 3.0, True, -100.0, COLLISION),
+        (beside(1, 60.0, 9.0), 3.0, True, -100.0, COLLISION),
+        # 50 m before the start, on the first leg's extension: the line is endless.
+        (beside(0, -50.0, 0.0), 1.0, False, 1.0, FLYING),
+        # 100 m past the first tower on the same extension.
+        (beside(0, LEG_LENGTHS_M[0] + 100.0, 0.0), 1.0, False, 1.0, FLYING),
+        # 300 m beyond the last tower, 2 m beside: e^-2 - .5 + .5.
+        (beside(3, LEG_LENGTHS_M[3] + 300.0, 2.0), 1.0, False, 0.135335, FLYING),
+    ],
+)
+def test_rewards_and_ends_by_hand(
+    place: Vector, speed_m_s: float, hit: bool, reward: float, end: int
+) -> None:
+    assert classic_reward(place, speed_m_s, hit) == pytest.approx(reward, abs=2e-6)
+    assert classic_end(place, hit) == end
+
+
+def test_the_distance_is_the_published_formula() -> None:
+    """|(p - a) x (p - b)| / |a - b|, least over the legs."""
+    random = np.random.default_rng(0)
+    for place in random.uniform([-50, -150, -90], [600, 200, 0], size=(50, 3)):
+        published = min(
+            np.linalg.norm(np.cross(place - a, place - b)) / np.linalg.norm(a - b)
+            for a, b in itertools.pairwise(POINTS_M)
+        )
+        assert classic_distance(Vector(*place.tolist())) == pytest.approx(published)
+
+
+def classic() -> PowerlineEnv:
+    """The sim itself, started."""
+    sim = make_sim("powerline", rules="classic").unwrapped
+    assert isinstance(sim, PowerlineEnv)
+    sim.reset(seed=0)
+    return sim
+
+
+def test_an_action_changes_the_measured_velocity() -> None:
+    """Commanded 1 + .25 m/s; after 5 s, ten lags, all but e^-10 of it is reached."""
+    flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
+    flight = flight._replace(command_m_s=Vector(4.0, 4.0, 4.0))
+    after, hit = classic_decide(POINT, flight, NORTH)
+    assert not hit
+    assert after.drone.velocity_m_s == pytest.approx((1.25 - 0.25 * math.exp(-10), 0.0, 0.0))
+
+
+def test_a_decision_lasts_5_seconds() -> None:
+    flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
+    after, _ = classic_decide(POINT, flight, NOTHING)
+    assert after.drone.position_m.x == pytest.approx(flight.drone.position_m.x + 5.0)
+    assert classic().step_duration_s == 5.0
+
+
+def test_it_starts_with_5_seconds_at_the_published_velocity() -> None:
+    drone = classic().flight.drone
+    assert drone.velocity_m_s == pytest.approx((1.0, -0.67, -0.8), abs=1e-3)
+    flown = np.subtract(drone.position_m, POINTS_M[0])
+    # 5 s, less the lag of half a second.
+    np.testing.assert_allclose(flown, 4.5 * np.array([1.0, -0.67, -0.8]), atol=0.25)
+
+
+def test_fault_coasting_past_the_first_tower_is_paid_for_100_m() -> None:
+    sim = classic()
+    paid_until_m = 0.0
+    for _ in range(60):
+        _, reward, terminated, _, _ = sim.step(NOTHING)
+        if terminated:
+            break
+        assert reward > 0.4
+        along = np.subtract(sim.flight.drone.position_m, POINTS_M[0]) @ TANGENTS[0]
+        paid_until_m = float(along - LEG_LENGTHS_M[0])
+    assert paid_until_m > 90.0
+
+
+def test_fault_flying_to_and_fro_earns_more_than_following_the_line() -> None:
+    """10 m/s either way is paid 10 a decision; following at 2 m/s earns 2."""
+    place = beside(2, 100.0, 0.0)
+    assert classic_reward(place, 10.0, False) == pytest.approx(10.0)
+    assert classic_reward(place, 2.0, False) == pytest.approx(2.0)
+    backwards = begin(place, Vector(-2.0, -1.0, 0.0), ZERO)
+    after, _ = classic_decide(POINT, backwards, SOUTH)
+    assert classic_reward(after.drone.position_m, 2.25, False) > 0.0
+
+
+def test_fault_flying_on_beyond_the_end_is_paid() -> None:
+    sim = classic()
+    end = POINTS_M[-1] - TANGENTS[-1]
+    sim.reset(options={"pose": (*end, *(2.0 * TANGENTS[-1]))})
+    for _ in range(10):
+        _, reward, terminated, _, info = sim.step(NOTHING)
+        assert not terminated
+        assert reward == pytest.approx(2.0, abs=0.01)
+    assert info["line_distance_m"] > 90.0
+    assert LENGTH_M < 622.0
+
+
+def test_fault_hovering_on_the_line_costs_nothing_and_never_ends() -> None:
+    sim = classic()
+    sim.reset(options={"pose": tuple(point_on_line(150.0))})
+    for _ in range(400):
+        _, reward, terminated, _, _ = sim.step(NOTHING)
+        assert (round(reward, 9), terminated) == (0.0, False)
+
+
+def test_fault_what_wind_adds_is_kept() -> None:
+    """Each decision takes the velocity that the wind has left for the command."""
+    sim = make_sim("powerline", rules="classic", plant="quad").unwrapped
+    assert isinstance(sim, PowerlineEnv)
+    flight = begin(point_on_line(300.0), ZERO, Vector(0.0, 4.0, 0.0))
+    drift = classic_decide(0, flight, NOTHING)[0].drone.velocity_m_s
+    assert abs(drift.y) > 1e-3
+
+
+def test_fault_in_5_seconds_nothing_can_be_corrected() -> None:
+    """From the line, 2 m/s sideways: 10 m by the next decision, whatever is done now."""
+    sim = classic()
+    for action in range(7):
+        sim.reset(options={"pose": (*beside(2, 100.0, 0.0), -0.9, 1.8, 0.0)})
+        assert sim.step(action)[4]["reason"] == "off_line"
+
+
+def test_fault_half_of_the_picture_s_codes_are_for_1_to_2_m() -> None:
+    sim = make_sim("powerline", rules="classic", observation="depth").unwrapped
+    assert isinstance(sim, PowerlineEnv)
+    observation, _ = sim.reset(seed=0)
+    depth_m = sim.depth_image_m()
+    assert observation[:, :, 0][depth_m > 2.0].max() <= 127
+    assert observation[:, :, 0][depth_m > 20.0].max() <= 12

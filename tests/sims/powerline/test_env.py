@@ -1,0 +1,208 @@
+"""The powerline sim as a Gymnasium environment."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.sims import make_sim
+from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
+from mcaprl.sims.powerline.env import PowerlineEnv
+from mcaprl.sims.powerline.world import LENGTH_M, POINTS_M, point_on_line
+
+NORTH, DOWN, NOTHING = 0, 2, 6
+
+
+def powerline(**kwargs: Any) -> PowerlineEnv:
+    """The sim itself, without wrappers."""
+    sim = make_sim("powerline", **kwargs).unwrapped
+    assert isinstance(sim, PowerlineEnv)
+    return sim
+
+
+def last_step(sim: PowerlineEnv, action: int) -> tuple[float, str]:
+    """Repeat one action until the episode ends; give the last reward and the reason."""
+    while True:
+        _, reward, terminated, _, info = sim.step(action)
+        if terminated:
+            return reward, info["reason"]
+
+
+def test_starts_on_the_line_are_near_the_published_one() -> None:
+    """5 s at (1, -.5, -1), less the lag, from the first point; not all the same."""
+    sim = powerline(start="line")
+    places = set()
+    for seed in range(20):
+        sim.reset(seed=seed)
+        flight = sim.flight
+        flown = np.subtract(flight.drone.position_m, POINTS_M[0])
+        np.testing.assert_allclose(flown, [4.6, -2.3, -4.6], atol=0.25)
+        assert flight.command_m_s == (1.0, -0.5, -1.0)
+        assert flight.drone.velocity_m_s == pytest.approx((1.0, -0.5, -1.0), abs=0.01)
+        places.add(flight.drone.position_m)
+    assert len(places) == 20
+
+
+def test_random_starts_are_where_the_card_says() -> None:
+    sim = powerline()
+    along, at_first = [], 0
+    for seed in range(200):
+        _, info = sim.reset(seed=seed)
+        assert info["line_distance_m"] <= 1.3
+        assert info["progress_m"] == 0.0
+        assert info["speed_m_s"] <= 5.5
+        command = np.array(sim.flight.command_m_s)
+        np.testing.assert_array_equal(command, np.rint(2 * command) / 2)
+        at_first += sim.flight.furthest_m < 8.5 and tuple(command) == (1.0, -0.5, -1.0)
+        along.append(sim.flight.furthest_m)
+    assert 75 <= at_first <= 125
+    assert max(along) > 500.0
+    assert max(along) <= LENGTH_M - 19.0
+
+
+def test_a_pose_is_kept_and_told_in_ros_axes() -> None:
+    sim = powerline()
+    point = point_on_line(150.0)
+    pose = (point.x, point.y + 2.0, point.z - 1.0, 3.0, 0.0, 0.0)
+    _, info = sim.reset(options={"pose": pose})
+    told = sim.telemetry()
+    assert sim.flight.drone.position_m == pose[:3]
+    assert (told["x_m"], told["y_m"], told["z_m"]) == (pose[0], -pose[1], -pose[2])
+    assert told["speed_m_s"] == info["speed_m_s"] == 3.0
+    # East of a line that leads north is to its right; higher is positive.
+    assert told["lateral_offset_m"] < -1.9
+    assert told["vertical_offset_m"] == pytest.approx(1.0, abs=0.15)
+    assert told["line_distance_m"] == pytest.approx(math.sqrt(5.0), abs=0.1)
+    assert told["tilt_rad"] == 0.0
+    assert told["wire_distance_m"] > 6.0
+    assert told["height_m"] > 25.0
+    sim.reset(options={"pose": pose[:3]})
+    assert sim.telemetry()["speed_m_s"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"pose": (1.0, 2.0)}, "is not \\(x_m, y_m, z_m\\) or \\(x_m, y_m, z_m, vx_m_s"),
+        ({"pose": "home"}, "is not \\(x_m, y_m, z_m\\)"),
+        ({"pose": (1.0, math.inf, 0.0)}, "is not \\(x_m, y_m, z_m\\)"),
+        ({"pose": (0.0, -32.0, 19.0)}, "ends the episode at once: collision.*z points down"),
+        ({"pose": (0.0, -32.0, -30.0)}, "ends the episode at once: off_line, .* m from the line"),
+        ({"pose": (0.0, -32.0, -19.0, 9.0, 0.0, 0.0)}, "speed in m/s is 0 to 8, not 9.0"),
+        ({"place": (0.0, -32.0, -19.0)}, "only the option 'pose', not \\['place'\\]"),
+    ],
+)
+def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        powerline().reset(options=options)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"rules": "clasic"}, "unknown rules 'clasic': did you mean classic"),
+        ({"camera": "up"}, "known: down, front"),
+        ({"plant": "plane"}, "known: None, point, quad"),
+        ({"start": "pole"}, "known: anywhere, line"),
+    ],
+)
+def test_an_unknown_value_is_refused(kwargs: dict[str, str], words: str) -> None:
+    with pytest.raises(UnknownNameError, match=words):
+        powerline(**kwargs)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"wind_m_s": -1.0}, "wind_m_s is 0 to 8, not -1.0"),
+        ({"wind_m_s": math.nan}, "wind_m_s is 0 to 8, not nan"),
+        ({"gust_m_s": 4.0}, "gust_m_s is 0 to 3, not 4.0"),
+        ({"gust_m_s": 1.0, "rules": "classic"}, "gust_m_s is 0 to 0, not 1.0"),
+    ],
+)
+def test_a_number_out_of_range_is_refused(kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        powerline(**kwargs)
+
+
+def test_ends_are_named_and_paid() -> None:
+    sim = powerline()
+    middle, near_end = point_on_line(150.0), point_on_line(LENGTH_M - 4.0)
+    sim.reset(options={"pose": tuple(middle)})
+    assert last_step(sim, NORTH + 1) == (-5.0, "off_line")
+    sim.reset(options={"pose": tuple(point_on_line(76.0))})
+    assert last_step(sim, DOWN) == (-5.0, "collision")
+    tangent = np.subtract(point_on_line(LENGTH_M - 3.0), near_end)
+    sim.reset(options={"pose": (*near_end, *(2.0 * tangent))})
+    reward, reason = last_step(sim, NOTHING)
+    assert reason == "finished"
+    assert 5.0 < reward <= 6.0
+
+
+def test_progress_is_paid_once() -> None:
+    """Flying back and forth again earns nothing for what was flown before."""
+    sim = powerline(plant="point")
+    point = point_on_line(150.0)
+    sim.reset(options={"pose": tuple(point)})
+    rewards = [sim.step(action)[1] for action in (0, 0, 3, 3, 3, 3, 0, 0, 6)]
+    assert rewards[0] > 0.0
+    assert rewards[5:8] == [0.0] * 3
+    assert sim.telemetry()["progress_m"] < sim.flight.furthest_m - 150.0 + 1e-9
+
+
+@pytest.mark.parametrize("camera", ["down", "front"])
+def test_what_the_camera_sees_is_what_is_observed(camera: str) -> None:
+    sim = powerline(observation="depth", camera=camera)
+    seen, _ = sim.reset(seed=4)
+    assert seen["depth"].shape == (84, 84, 1)
+    np.testing.assert_array_equal(seen["depth"][:, :, 0], encode_depth(sim.depth_image_m()))
+    moved, *_ = sim.step(1)
+    np.testing.assert_array_equal(moved["depth"][:, :, 0], encode_depth(sim.depth_image_m()))
+    flight = sim.flight
+    velocity = np.array(flight.drone.velocity_m_s)
+    expected = [*(velocity / 5.0), *(np.array(flight.command_m_s) - velocity)]
+    np.testing.assert_allclose(moved["motion"], expected, atol=1e-6)
+
+
+def test_the_classic_picture_has_the_published_code() -> None:
+    """255 / max(1, d), rounded down; nothing is 0."""
+    metres = np.array([0.3, 1.0, 2.0, 6.0, 300.0, np.inf])
+    assert encode_nearness(metres).tolist() == [255, 255, 127, 42, 0, 0]
+    sim = powerline(rules="classic", observation="depth")
+    seen, _ = sim.reset(seed=0)
+    assert seen.shape == (84, 84, 1)
+    np.testing.assert_array_equal(seen[:, :, 0], encode_nearness(sim.depth_image_m()))
+
+
+def test_wind_is_drawn_for_each_episode_and_gusts_for_each_step() -> None:
+    sim = powerline(wind_m_s=5.0, gust_m_s=1.0)
+    winds = []
+    for seed in range(50):
+        sim.reset(seed=seed)
+        winds.append(sim.flight.wind_m_s)
+    speeds = np.linalg.norm(np.array(winds), axis=1)
+    assert speeds.max() <= 5.0
+    assert 1.5 < speeds.mean() < 3.5
+    assert np.all(np.array(winds)[:, 2] == 0.0)
+    gusts = []
+    for _ in range(3):
+        sim.step(NOTHING)
+        gusts.append(sim.flight.gust_m_s)
+    assert len(set(gusts)) == 3
+
+
+def test_a_hover_holds_its_place_in_wind() -> None:
+    """Steady wind of 5 m/s at most: after 10 s, it has stopped less than 1 m away."""
+    sim = powerline(wind_m_s=5.0)
+    start = point_on_line(300.0)
+    for seed in range(5):
+        sim.reset(seed=seed, options={"pose": tuple(start)})
+        for _ in range(20):
+            sim.step(NOTHING)
+        drone = sim.flight.drone
+        assert np.linalg.norm(np.subtract(drone.position_m, start)) < 1.0
+        assert np.linalg.norm(drone.velocity_m_s) < 0.01

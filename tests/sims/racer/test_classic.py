@@ -1,0 +1,159 @@
+"""The classic rules of the racer sim: rewards and ends by hand, and each of their faults."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.racer.env import RacerEnv
+from mcaprl.sims.racer.rays import RAY_NAMES, RAYS, measure
+from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, judge, observe
+from mcaprl.sims.racer.track import Track
+from tests.support.racer_tracks import car_in, corridor
+
+NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
+
+
+def classic(**kwargs: Any) -> RacerEnv:
+    sim = make_sim("racer", rules="classic", **kwargs).unwrapped
+    assert isinstance(sim, RacerEnv)
+    return sim
+
+
+def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
+    """Classic lengths of the rays of a car that heads to the right."""
+    lengths = np.zeros(RAYS)
+    measure(track.walls_px, car_in(track, x_px, y_px), True, lengths)
+    return dict(zip(RAY_NAMES, lengths.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "heading_deg", "speed_px", "action", "reward", "end"),
+    [
+        (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
+        (50.0, 150.0, 0, 0, BACK, 0, DRIVING),
+        # The gate at 300 is seen from 281, 19 pixels away; not from 279 nor from 280.
+        (275.0, 150.5, 0, 4, BACK, 1, DRIVING),
+        (275.0, 150.5, 0, 2, BACK, 0, DRIVING),
+        (275.0, 150.0, 0, 3, BACK, 0, DRIVING),
+        (281.0, 150.5, 0, 0, NONE, 1, DRIVING),
+        # Over it from 295 to 305: it is behind by then. Seen from the wrong side it counts.
+        (295.0, 150.5, 0, 10, NONE, 0, DRIVING),
+        (310.0, 150.5, 180, 0, NONE, 1, DRIVING),
+        # Past it sideways, with no look at it.
+        (290.0, 150.5, 90, 0, NONE, 0, DRIVING),
+        # The gate at 600 is not the next one.
+        (590.0, 150.5, 0, 0, NONE, 0, DRIVING),
+        (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
+        (500.0, 106.0, 0, 0, NONE, -1, CRASH),
+        (984.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
+        (984.0, 150.0, 0, 0, BACK, -1, CRASH),
+        (985.0, 115.0, -45, 0, NONE, -2, CRASH),
+        (281.0, 106.5, 0, 0, NONE, 0, CRASH),
+    ],
+)
+def test_rewards_and_ends_by_hand(
+    x_px: float,
+    y_px: float,
+    heading_deg: float,
+    speed_px: float,
+    action: int,
+    reward: float,
+    end: int,
+) -> None:
+    track = corridor()
+    before = car_in(track, x_px, y_px, heading_deg, speed_px)
+    after = drive(track, before, action, True, False)
+    assert judge(track, before, after, True) == (reward, end)
+
+
+@pytest.mark.parametrize(
+    ("idle", "steps", "end"),
+    [(98, 500, DRIVING), (99, 500, NO_GATE), (0, 999, DRIVING), (0, 9_999, TIME_LIMIT)],
+)
+def test_time_runs_out(idle: float, steps: float, end: int) -> None:
+    track = corridor()
+    before = car_in(track, 50.0, 150.0)._replace(idle_steps=idle, steps=steps)
+    assert judge(track, before, drive(track, before, NONE, True, False), True) == (0, end)
+
+
+def test_fault_forward_drives_backward() -> None:
+    sim = classic()
+    sim.reset(seed=0)
+    observation, *_ = sim.step(FORWARD)
+    assert sim.telemetry()["speed_m_s"] == -2.0
+    assert observation[18] == pytest.approx(0.2)
+    assert sim.telemetry()["y_m"] > 30.0
+    sim.reset(seed=0)
+    observation, *_ = sim.step(BACK)
+    assert sim.telemetry()["y_m"] < 30.0
+    assert observation[18] == pytest.approx(-0.2)
+
+
+def test_fault_corner_rays_cross_the_nose_and_start_at_the_centre() -> None:
+    """From (500.5, 130.5): the corners are at 515.5, and what they see is floored to 515."""
+    seen = lengths_of(corridor(), 500.5, 130.5)
+    assert seen["left_corner_sideways"] == pytest.approx(math.hypot(14.5, 69.5))
+    assert seen["right_corner_sideways"] == pytest.approx(math.hypot(14.5, 30.5))
+    assert seen["left_corner_ahead"] == pytest.approx(math.hypot(499.5, 7.5))
+    assert seen["right_corner_ahead"] == pytest.approx(math.hypot(499.5, 6.5))
+
+
+def test_fault_hits_are_floored_to_pixels() -> None:
+    """In the middle between walls at 100.5 and 199.5, one seems nearer than the other."""
+    seen = lengths_of(corridor(100.5, 199.5), 500.5, 150.0)
+    assert seen["left_90"] == pytest.approx(math.hypot(50.0, 0.5))
+    assert seen["right_90"] == pytest.approx(math.hypot(49.0, 0.5))
+
+
+def test_fault_rays_are_squeezed_into_a_fifth_of_their_range() -> None:
+    track = corridor()
+    observation = np.zeros(19, dtype=np.float32)
+    observe(track, car_in(track, 800.5, 150.5), True, observation)
+    assert observation[6] == pytest.approx((1000 - math.hypot(50.5, 0.5)) / 1000)
+    sim = classic()
+    pilot = make_pilot(sim)
+    observation, _ = sim.reset()
+    seen = []
+    for _ in range(200):
+        observation, *_ = sim.step(pilot.act(observation[np.newaxis])[0])
+        seen.append(observation[:18])
+    assert np.mean(np.array(seen) > 0.8) > 0.8
+
+
+def test_fault_a_joint_of_walls_costs_twice() -> None:
+    track = corridor()
+    before = car_in(track, 985.0, 115.0, -45)
+    after = drive(track, before, NONE, True, False)
+    assert judge(track, before, after, True)[0] == -2
+    assert judge(track, before, after, False)[0] == -1
+
+
+def test_fault_a_gate_driven_over_without_a_look_is_lost() -> None:
+    """From 295 to 305 in one step: the gate at 300 is behind before it was looked at."""
+    track = corridor()
+    car = car_in(track, 295.0, 150.5, 0, 10)
+    over = drive(track, car, NONE, True, False)
+    assert over.x_px == 305.0
+    assert (over.gates, over.next_gate) == (0.0, 0.0)
+    assert drive(track, car, NONE, False, False).gates == 1.0
+
+
+def test_fault_every_episode_starts_alike() -> None:
+    sim = classic()
+    starts = {sim.reset(seed=seed)[0].tobytes() for seed in range(5)}
+    assert len(starts) == 1
+    car = sim.car
+    assert (car.x_px, car.y_px, car.speed_px) == (50.0, 300.0, 0.0)
+    assert car.heading_rad == pytest.approx(math.pi / 2)
+
+
+def test_the_wrapped_sim_lasts_10_000_steps() -> None:
+    env = make_sim("racer", rules="classic")
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == 10_000

@@ -1,0 +1,232 @@
+"""The default equations of the racer sim, with numbers worked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mcaprl.sims.racer.car import is_beyond, placed, racer_at
+from mcaprl.sims.racer.rays import FAR_PX, RAY_NAMES, RAYS, cast, measure, ray_ends
+from mcaprl.sims.racer.rules import (
+    ACTION_MEANINGS,
+    CRASH,
+    DRIVING,
+    NO_GATE,
+    OBSERVATION_NAMES,
+    TIME_LIMIT,
+    drive,
+    judge,
+    observe,
+    step_racers,
+    walls_hit,
+)
+from mcaprl.sims.racer.track import make_track
+from tests.support.racer_tracks import car_in, corridor
+
+NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
+FORWARD_LEFT, FORWARD_RIGHT = 7, 8
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "heading_deg", "speed_px", "action", "reward", "end"),
+    [
+        (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
+        (50.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
+        # Over the gate at 300: from 295 to 301, and from 290 onto it.
+        (295.0, 150.0, 0, 4, FORWARD, 1, DRIVING),
+        (290.0, 150.0, 0, 8, FORWARD, 1, DRIVING),
+        # Before it: from 289 to 299; a look from near does not count.
+        (289.0, 150.0, 0, 8, FORWARD, 0, DRIVING),
+        (285.0, 150.0, 0, 0, NONE, 0, DRIVING),
+        # Over the gate at 600, which is not the next one.
+        (595.0, 150.0, 0, 10, NONE, 0, DRIVING),
+        # The left side is 7 pixels from the middle: 101 and 99 for a wall at 100.
+        (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
+        (500.0, 106.0, 0, 0, NONE, -1, CRASH),
+        # The nose is 15 pixels ahead: 999 and 1001 for a wall at 1000.
+        (984.0, 150.0, 0, 0, NONE, 0, DRIVING),
+        (984.0, 150.0, 0, 0, FORWARD, -1, CRASH),
+        (984.0, 150.0, 0, 0, BACK, 0, DRIVING),
+        # Into the corner: two walls, one crash.
+        (985.0, 115.0, -45, 0, NONE, -1, CRASH),
+        # A gate and a crash in one step.
+        (295.0, 106.0, 0, 10, NONE, 0, CRASH),
+    ],
+)
+def test_rewards_and_ends_by_hand(
+    x_px: float,
+    y_px: float,
+    heading_deg: float,
+    speed_px: float,
+    action: int,
+    reward: float,
+    end: int,
+) -> None:
+    track = corridor()
+    before = car_in(track, x_px, y_px, heading_deg, speed_px)
+    after = drive(track, before, action, False, False)
+    assert judge(track, before, after, False) == (reward, end)
+
+
+@pytest.mark.parametrize(
+    ("idle", "steps", "x_px", "reward", "end"),
+    [
+        (98, 500, 50.0, 0, DRIVING),
+        (99, 500, 50.0, 0, NO_GATE),
+        (99, 500, 299.0, 1, DRIVING),
+        (0, 998, 50.0, 0, DRIVING),
+        (0, 999, 50.0, 0, TIME_LIMIT),
+        (99, 999, 50.0, 0, NO_GATE),
+    ],
+)
+def test_time_runs_out(idle: float, steps: float, x_px: float, reward: float, end: int) -> None:
+    track = corridor()
+    before = car_in(track, x_px, 150.0, 0, 2)._replace(idle_steps=idle, steps=steps)
+    after = drive(track, before, NONE, False, False)
+    assert judge(track, before, after, False) == (reward, end)
+
+
+def test_a_crash_comes_before_running_out_of_time() -> None:
+    track = corridor()
+    before = car_in(track, 500.0, 106.0)._replace(idle_steps=99)
+    assert judge(track, before, drive(track, before, NONE, False, False), False) == (-1, CRASH)
+
+
+def test_actions_by_hand() -> None:
+    track = corridor()
+    car = car_in(track, 500.0, 150.0, 0, 4)
+    moves = {action: drive(track, car, action, False, False) for action in range(9)}
+    assert [moves[action].speed_px for action in range(9)] == [4, 6, 4, 4, 2, 2, 2, 6, 6]
+    turns = [round(math.degrees(moves[action].heading_rad)) for action in range(9)]
+    assert turns == [0, 0, -15, 15, 0, 15, -15, -15, 15]
+    assert moves[FORWARD].x_px == 506.0
+    assert moves[FORWARD_RIGHT].x_px == pytest.approx(500 + 6 * math.cos(math.radians(15)))
+    assert moves[FORWARD_RIGHT].y_px == pytest.approx(150 + 6 * math.sin(math.radians(15)))
+    assert moves[FORWARD_LEFT].offset_m > 0.0 > moves[FORWARD_RIGHT].offset_m
+    assert len(ACTION_MEANINGS) == 9
+
+
+def test_speed_is_limited_both_ways() -> None:
+    track = corridor()
+    car = car_in(track, 500.0, 150.0, 0, 9)
+    assert drive(track, car, FORWARD, False, False).speed_px == 10.0
+    assert drive(track, car._replace(speed_px=-9.0), BACK, False, False).speed_px == -10.0
+
+
+def test_a_drifting_course_follows_by_100_over_speed_plus_1_degrees() -> None:
+    """At 9 pixels a step by 10 degrees: after two turns of 15 it is 10 degrees behind."""
+    track = corridor()
+    car = car_in(track, 500.0, 150.0, 0, 9)
+    once = drive(track, car, RIGHT, False, True)
+    twice = drive(track, once, RIGHT, False, True)
+    assert math.degrees(once.heading_rad) == pytest.approx(15.0)
+    assert math.degrees(once.course_rad) == pytest.approx(10.0)
+    assert once.y_px == pytest.approx(150 + 9 * math.sin(math.radians(10)))
+    assert math.degrees(twice.course_rad) == pytest.approx(20.0)
+    assert math.degrees(drive(track, twice, NONE, False, True).course_rad) == pytest.approx(30.0)
+    slow = drive(track, car._replace(speed_px=2.0), RIGHT, False, True)
+    assert slow.course_rad == slow.heading_rad
+
+
+def test_rays_by_hand() -> None:
+    track = corridor()
+    lengths = np.zeros(RAYS)
+    measure(track.walls_px, car_in(track, 500.0, 150.0), False, lengths)
+    ten, twenty = 50 / math.sin(math.radians(10)), 50 / math.sin(math.radians(20))
+    expected = [500, 100, 100, 50 * 2**0.5, 50 * 2**0.5, 50, 50, 500, ten, ten]
+    expected += [50 * 2**0.5, 50 * 2**0.5, twenty, twenty, 43, 43, 485, 485]
+    np.testing.assert_allclose(lengths, expected)
+
+
+def test_left_and_right_rays_are_told_apart() -> None:
+    track = corridor()
+    lengths = np.zeros(RAYS)
+    measure(track.walls_px, car_in(track, 500.0, 130.0), False, lengths)
+    seen = dict(zip(RAY_NAMES, lengths.tolist(), strict=True))
+    assert (seen["left_90"], seen["right_90"]) == pytest.approx((30.0, 70.0))
+    assert seen["left_corner_sideways"] == pytest.approx(23.0)
+    assert seen["right_corner_sideways"] == pytest.approx(63.0)
+    assert seen["left_30"] == pytest.approx(60.0)
+    assert seen["right_30"] == pytest.approx(140.0)
+
+
+def test_observation_by_hand() -> None:
+    track = corridor()
+    observation = np.zeros(19, dtype=np.float32)
+    observe(track, car_in(track, 500.0, 150.0, 0, -5), False, observation)
+    assert observation[0] == pytest.approx(math.log(51) / math.log(101))
+    assert observation[5] == pytest.approx(math.log(6) / math.log(101))
+    assert observation[18] == -0.5
+    assert OBSERVATION_NAMES[5] == "right_90"
+
+
+def test_no_ray_slips_out_through_a_joint_of_walls() -> None:
+    track = make_track()
+    x_px, y_px = 50.0, 300.0
+    away = track.walls_px[:, :2] - (x_px, y_px)
+    reach = FAR_PX * away.T / np.hypot(*away.T)
+    rays = np.vstack([np.full_like(reach, [[x_px], [y_px]]), reach])
+    shares = np.empty(len(away))
+    cast(track.walls_px, rays, shares)
+    assert (FAR_PX * shares < 990.0).all()
+
+
+@given(st.floats(0, 250), st.floats(-20, 20), st.floats(-3, 3))
+def test_rays_end_on_walls(along_m: float, right_px: float, heading_rad: float) -> None:
+    track = corridor()
+    car = placed(track, 100 + 3 * along_m, 150 + right_px, heading_rad, 0.0, 0.0)
+    ends = ray_ends(track.walls_px, car)[:, 1]
+    beside = np.minimum(np.abs(ends[:, 0] - 0), np.abs(ends[:, 0] - 1000))
+    above = np.minimum(np.abs(ends[:, 1] - 100), np.abs(ends[:, 1] - 200))
+    np.testing.assert_allclose(np.minimum(beside, above), 0.0, atol=1e-6)
+
+
+def test_the_next_gate_is_the_first_one_ahead() -> None:
+    track = make_track()
+    for index, gate in enumerate(track.gates_px):
+        x_px, y_px = (gate[:2] + gate[2:]) / 2
+        across = (gate[2:] - gate[:2]) / np.hypot(*(gate[2:] - gate[:2]))
+        ahead = np.array([across[1], -across[0]])
+        for step_px, following in ((-5.0, index), (5.0, (index + 1) % 37)):
+            x, y = np.array([x_px, y_px]) + step_px * ahead
+            heading_rad = math.atan2(ahead[1], ahead[0])
+            car = placed(track, x, y, heading_rad, 0.0, 0.0)
+            assert int(car.next_gate) == following
+            assert is_beyond(x, y, gate) == (step_px > 0)
+            assert abs(car.heading_error_rad) < 0.3
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(st.tuples(st.floats(100, 900), st.integers(0, 8)), min_size=1, max_size=6),
+    st.booleans(),
+    st.booleans(),
+)
+def test_many_cars_drive_as_one_does(
+    starts: list[tuple[float, int]], classic: bool, drift: bool
+) -> None:
+    track = corridor()
+    before = [car_in(track, x_px, 150.0, 20, 6) for x_px, _ in starts]
+    cars, actions = np.array(before), np.array([action for _, action in starts])
+    rewards, ends = np.zeros(len(cars)), np.zeros(len(cars), dtype=np.int64)
+    observations = np.zeros((len(cars), 19), dtype=np.float32)
+    step_racers(track, cars, actions, rewards, ends, observations, classic, drift)
+    for i, car in enumerate(before):
+        alone = drive(track, car, actions[i], classic, drift)
+        seen = np.zeros(19, dtype=np.float32)
+        observe(track, alone, classic, seen)
+        assert racer_at(cars[i]) == alone
+        assert (rewards[i], ends[i]) == judge(track, car, alone, classic)
+        assert seen.tobytes() == observations[i].tobytes()
+
+
+def test_walls_are_hit_by_any_edge() -> None:
+    track = corridor()
+    assert walls_hit(track, car_in(track, 500.0, 150.0)) == 0
+    assert walls_hit(track, car_in(track, 14.0, 150.0)) == 1
+    assert walls_hit(track, car_in(track, 500.0, 194.0)) == 1
+    assert walls_hit(track, car_in(track, 985.0, 115.0, -45)) == 2

@@ -1,0 +1,285 @@
+"""The batched sims against the single ones, bit for bit, and against Gymnasium's own batching."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from mcaprl.errors import UnknownNameError, UsageError
+from mcaprl.sims import SIMS, make_sim, make_sims
+from mcaprl.sims.evaluation.pilots import make_pilot
+from tests.sims.test_sims import BATCHED, CASES
+
+Envs = VectorEnv[Any, Any, Any]
+COUNT = 3
+CASES_BATCHED = [(name, kwargs) for name, kwargs in CASES if name in BATCHED]
+every_batch = pytest.mark.parametrize(
+    ("name", "kwargs"),
+    CASES_BATCHED,
+    ids=[f"{name}-{'-'.join(kwargs)}" for name, kwargs in CASES_BATCHED],
+)
+MODES = [mode.value for mode in AutoresetMode]
+seeds = st.integers(0, 2**31)
+choices = st.lists(
+    st.lists(st.integers(0, 2**16), min_size=COUNT, max_size=COUNT), min_size=1, max_size=15
+)
+
+
+def check_same(ours: Any, theirs: Any, where: str) -> None:
+    """Equal to the last bit, types and shapes included; dicts and arrays of objects as well."""
+    if isinstance(theirs, dict):
+        assert set(ours) == set(theirs), where
+        for key in theirs:
+            check_same(ours[key], theirs[key], f"{where}[{key}]")
+    elif isinstance(theirs, np.ndarray):
+        assert (ours.dtype, ours.shape) == (theirs.dtype, theirs.shape), where
+        if theirs.dtype == object:
+            for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+                check_same(one, other, f"{where}[{i}]")
+        else:
+            assert ours.tobytes() == theirs.tobytes(), where
+    elif isinstance(theirs, tuple):
+        for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+            check_same(one, other, f"{where}.{i}")
+    else:
+        assert ours == theirs, where
+
+
+def actions_of(envs: Envs, chosen: list[int]) -> NDArray[np.int64]:
+    assert isinstance(envs.single_action_space, spaces.Discrete)
+    return np.array([number % int(envs.single_action_space.n) for number in chosen])
+
+
+def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, Any]) -> Envs:
+    """Gymnasium's batch of our single environments."""
+
+    def make() -> gym.Env[Any, Any]:
+        return make_sim(name, max_episode_steps=steps, **kwargs)
+
+    makers: list[Callable[[], gym.Env[Any, Any]]] = [make] * count
+    return SyncVectorEnv(makers, autoreset_mode=mode)
+
+
+@every_batch
+@pytest.mark.parametrize("mode", MODES)
+@settings(max_examples=6)
+@given(seeds, choices)
+def test_a_batch_does_what_single_sims_do(
+    name: str, kwargs: dict[str, Any], mode: str, seed: int, chosen: list[list[int]]
+) -> None:
+    """Time limits of 6 steps and failures end many episodes; the next ones are compared, too."""
+    ours = make_sims(name, COUNT, autoreset_mode=mode, max_episode_steps=6, **kwargs)
+    theirs = one_by_one(name, COUNT, mode, 6, kwargs)
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    check_same(ours.reset(seed=seed), theirs.reset(seed=seed), "reset")
+    for step, numbers in enumerate(chosen):
+        actions = actions_of(ours, numbers)
+        mine, yours = ours.step(actions), theirs.step(actions)
+        check_same(mine, yours, f"step {step}")
+        ended = mine[2] | mine[3]
+        if mode == "Disabled" and ended.any():
+            mask = {"reset_mask": ended}
+            check_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)), "mask")
+
+
+@every_batch
+def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, Any]) -> None:
+    """Vehicle i is the single sim of seed + i, whatever its neighbours do."""
+    batch = make_sims(name, COUNT, **kwargs)
+    batch.action_space.seed(0)
+    seen, _ = batch.reset(seed=40)
+    singles = [make_sim(name, **kwargs) for _ in range(COUNT)]
+    going_on = dict(enumerate(singles))
+    for i, single in going_on.items():
+        check_same(part(seen, i), single.reset(seed=40 + i)[0], f"reset {i}")
+    for step in range(30):
+        actions = batch.action_space.sample()
+        seen, rewards, terminated, truncated, infos = batch.step(actions)
+        for i, single in list(going_on.items()):
+            theirs = single.step(actions[i])
+            check_same(part(seen, i), theirs[0], f"step {step} of {i}")
+            assert (rewards[i], terminated[i], truncated[i]) == theirs[1:4]
+            told = {key: infos[key][i] for key in infos if key[0] != "_" and infos[f"_{key}"][i]}
+            assert told == theirs[4]
+            if terminated[i] or truncated[i]:
+                del going_on[i]
+
+
+def part(observations: Any, i: int) -> Any:
+    """What one vehicle observes."""
+    if isinstance(observations, dict):
+        return {key: values[i] for key, values in observations.items()}
+    return observations[i]
+
+
+@pytest.mark.parametrize("name", BATCHED)
+def test_gymnasium_makes_batches(name: str) -> None:
+    env = gym.make_vec(SIMS[name], num_envs=4, vectorization_mode="vector_entry_point")
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert env.num_envs == 4
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == gym.spec(SIMS[name]).max_episode_steps
+    assert isinstance(env, type(make_sims(name, 4)))
+    assert isinstance(env, type(gym.make_vec(SIMS[name], 4)))
+    again = gym.make_vec(env.spec)
+    check_same(again.reset(seed=3), env.reset(seed=3), "made again from its spec")
+    env.close()
+
+
+def test_what_is_given_is_the_callers_own() -> None:
+    env = make_sims("lane", 2)
+    given = [*env.reset(seed=0), *env.step(np.array([1, 1]))]
+    kept = repr(given)
+    env.step(np.array([3, 2]))
+    assert repr(given) == kept
+
+
+def test_one_pose_for_all_or_one_for_each() -> None:
+    env = make_sims("lane", 2)
+    _, infos = env.reset(options={"pose": (50.0, 1.5, 0.0, 7.0)})
+    assert infos["lateral_offset_m"].tolist() == [0.5, 0.5]
+    poses = [(50.0, 1.5, 0.0), (60.0, 0.5, 0.1)]
+    _, infos = env.reset(options={"pose": poses})
+    assert infos["lateral_offset_m"].tolist() == [0.5, -0.5]
+    assert infos["heading_error_rad"].tolist() == pytest.approx([0.0, 0.1])
+
+
+def test_a_mask_resets_only_what_it_names_and_is_left_as_it_was() -> None:
+    env: Any = make_sims("racer", 3, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    env.step(np.array([1, 1, 1]))
+    options = {"reset_mask": np.array([False, True, False])}
+    _, infos = env.reset(seed=[7, 8, 9], options=options)
+    assert set(options) == {"reset_mask"}
+    assert infos["_progress_m"].tolist() == [False, True, False]
+    single = make_sim("racer")
+    single.reset(seed=8)
+    check_same(env.step(np.array([2, 2, 2]))[0][1], single.step(2)[0], "the one of seed 8")
+
+
+def test_each_drone_has_gusts_of_its_own() -> None:
+    env: Any = make_sims("powerline", 4, gust_m_s=2.0, start="line")
+    env.reset(seed=[5, 5, 6, 6])
+    for _ in range(5):
+        seen, *_ = env.step(np.full(4, 6))
+    assert seen[0].tolist() == seen[1].tolist()
+    assert seen[1].tolist() != seen[2].tolist()
+
+
+def test_the_racer_s_own_time_limit_comes_before_the_registered_one() -> None:
+    """1,000 steps and 10,000: the pilot's actions of a single sim, in the first of two cars."""
+    single = make_sim("racer", start="line")
+    pilot = make_pilot(single)
+    observation, _ = single.reset(seed=3)
+    batch = make_sims("racer", 2, start="line")
+    batch.reset(seed=3)
+    for step in range(1, 1_001):
+        action = int(pilot.act(observation[np.newaxis])[0])
+        observation, *_ = single.step(action)
+        _, _, terminated, truncated, infos = batch.step(np.array([action, 0]))
+        assert (terminated[0], truncated[0]) == (False, step == 1_000)
+    assert infos["reason"][0] == "time_limit"
+
+
+def test_any_other_environment_is_batched_by_gymnasium() -> None:
+    env = make_sims("CartPole-v1", 2, autoreset_mode="SameStep")
+    assert isinstance(env.unwrapped, SyncVectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    env.reset(seed=0)
+    for _ in range(100):
+        *_, infos = env.step(np.array([0, 0]))
+        if "final_obs" in infos:
+            return
+    pytest.fail("no pole fell")
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "words"),
+    [
+        ("lane", {"num_envs": 0}, "num_envs is a whole number of 1 or more, not 0"),
+        ("lane", {"num_envs": 2.5}, "num_envs is a whole number of 1 or more, not 2.5"),
+        ("lane", {"max_episode_steps": 0}, "max_episode_steps is a whole number of 1 or more"),
+        ("lane", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
+        ("CartPole-v1", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
+        ("lane", {"rules": "mine"}, "unknown rules 'mine': known: classic, classic-code, default"),
+        ("lane", {"colour": "red"}, "cannot make sim 'lane' with .*colour"),
+        ("racer", {"render_mode": "human"}, "batched sims draw no pictures"),
+        ("powerline", {"wind_m_s": 99.0}, "wind_m_s is 0 to 8, not 99.0"),
+        ("boat", {}, "unknown sim 'boat'"),
+    ],
+)
+def test_a_bad_request_is_refused(name: str, kwargs: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        make_sims(name, **{"num_envs": 2, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("actions", "words"),
+    [
+        ([1, 2, 3], "an array of 2 whole numbers, not int64 of shape \\(3,\\)"),
+        ([1.0, 2.0], "an array of 2 whole numbers, not float64 of shape \\(2,\\)"),
+        (1, "an array of 2 whole numbers"),
+        ([0, 6], "action 6 does not exist: 0 to 5 do"),
+        ([-1, 0], "action -1 does not exist: 0 to 5 do"),
+    ],
+)
+def test_bad_actions_are_refused_and_change_nothing(actions: Any, words: str) -> None:
+    env, other = make_sims("lane", 2), make_sims("lane", 2)
+    env.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(UsageError, match=words):
+        env.step(actions if isinstance(actions, int) else np.array(actions))
+    check_same(env.step(np.array([1, 2])), other.step(np.array([1, 2])), "after the refusal")
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ({"seed": [1, 2, 3]}, "3 seeds for 2 environments"),
+        ({"options": {"reset_mask": np.array([True])}}, "reset_mask is an array of 2 bools"),
+        ({"options": {"reset_mask": np.zeros(2, bool)}}, "one of them true"),
+        ({"options": {"reset_mask": np.ones(2)}}, "reset_mask is an array of 2 bools"),
+        ({"options": {"pose": [(50.0, 1.0, 0.0)] * 3}}, "3 poses for 2 environments"),
+        ({"options": {"pose": (50.0, 9.0, 0.0)}}, "8.0 m from the path"),
+        ({"options": {"place": 3}}, "only the option 'pose'"),
+    ],
+)
+def test_a_bad_reset_is_refused(request_: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        make_sims("lane", 2).reset(**request_)
+
+
+def test_a_step_needs_a_reset() -> None:
+    with pytest.raises(gym.error.ResetNeeded):
+        make_sims("lane", 2).step(np.array([1, 1]))
+    env = make_sims("lane", 2, autoreset_mode="Disabled", max_episode_steps=1)
+    env.reset(seed=0)
+    env.step(np.array([1, 1]))
+    with pytest.raises(UsageError, match=r"episodes \[0, 1\] have ended and autoreset is disabled"):
+        env.step(np.array([1, 1]))
+
+
+def test_an_unknown_value_names_the_known_ones() -> None:
+    with pytest.raises(UnknownNameError, match="known: dashboard, depth, rays, state"):
+        make_sims("lane", 2, observation="smell")
+
+
+def test_the_cases_cover_all_that_can_be_batched() -> None:
+    assert set(BATCHED) == {"lane", "powerline", "racer"}
+    assert {kwargs.get("observation") for name, kwargs in CASES if name == "lane"} == {
+        None,
+        "dashboard",
+        "depth",
+        "rays",
+    }

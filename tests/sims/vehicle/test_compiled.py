@@ -1,0 +1,69 @@
+"""What happens on a machine where the sims were never compiled, or cannot be kept compiled."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+CODE = "from mcaprl.sims.geometry.paths import wrap_angle; print(wrap_angle(4.0))"
+RESULT = "-2.2831853071795862\n"
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A copy of the sims that was never compiled."""
+    package = tmp_path / "fresh" / "mcaprl"
+    shutil.copytree(ROOT / "sims", package / "sims", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "mcaprl" / "errors.py", package)
+    (package / "__init__.py").touch()
+    return package
+
+
+def run(package: Path, user_cache: Path) -> list[str]:
+    """Compile in another process; give the lines on its stderr."""
+    kept = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    places = {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(user_cache)}
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", CODE],
+        env={**kept, **places, "HOME": str(user_cache)},
+        cwd=package.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == RESULT
+    return done.stderr.splitlines()
+
+
+def test_compiling_is_announced_once_and_kept(package: Path, tmp_path: Path) -> None:
+    assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
+    assert run(package, tmp_path) == []
+    assert list((package / "sims" / "__pycache__").glob("geometry.wrap_angle*.nbi"))
+
+
+def test_where_the_package_cannot_be_written_the_user_s_folder_keeps_it(
+    package: Path, tmp_path: Path
+) -> None:
+    # A file in the folder's place keeps even root from writing there.
+    (package / "sims" / "__pycache__").touch()
+    assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
+    assert run(package, tmp_path) == []
+
+
+def test_where_nothing_can_be_written_it_works_all_the_same(package: Path, tmp_path: Path) -> None:
+    (package / "sims" / "__pycache__").touch()
+    nowhere = tmp_path / "file"
+    nowhere.touch()
+    for _ in range(2):
+        (line,) = run(package, nowhere)
+        assert line == (
+            "compiling the sim for this machine, in each process,"
+            " as no cache folder can be written: set NUMBA_CACHE_DIR"
+        )

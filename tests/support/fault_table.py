@@ -1,0 +1,31 @@
+"""Puts what `make faults` has seen into docs/reliability.md, as a table.
+
+python -m tests.support.fault_table FIGURES PAGE
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+BEGIN, END = "<!-- fault figures: begin -->\n", "<!-- fault figures: end -->\n"
+
+
+def with_table(page: str, figures: str) -> str:
+    """The page with these figures, `fault: what was seen` in each line, instead of its own."""
+    before, _, rest = page.partition(BEGIN)
+    _, _, behind = rest.partition(END)
+    assert rest, "the page has no place for figures"
+    pairs = [line.split(": ", 1) for line in figures.splitlines()]
+    rows = "".join(f"| {fault} | {seen} |\n" for fault, seen in pairs)
+    return f"{before}{BEGIN}\n| fault | what was seen |\n|---|---|\n{rows}\n{END}{behind}"
+
+
+def main() -> None:
+    """Write the page."""
+    figures, page = map(Path, sys.argv[1:3])
+    page.write_text(with_table(page.read_text(), figures.read_text()))
+
+
+if __name__ == "__main__":
+    main()

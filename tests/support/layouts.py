@@ -1,0 +1,74 @@
+"""Whether a layout can show anything: its form, and that each of its paths is in the log."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.record.layout import LAYOUT_NAME
+
+_PATH = re.compile(
+    r"(?P<topic>/[\w/]+)(?P<filters>(?:\{[^}]*\})*)\.(?P<field>\w+)(?:\[(?P<index>\d+)\])?"
+)
+_FILTER = re.compile(r"\{(\w+)==[^}]*\}")
+
+
+def check_layout(path: Path) -> dict[str, Any]:
+    """Check the layout that is attached to a log against the log's schemas; returns it."""
+    reader = McapReader(path)
+    attached = reader.attachment(LAYOUT_NAME)
+    assert attached is not None
+    layout: dict[str, Any] = json.loads(attached)
+    assert set(layout) == {"configById", "layout", "globalVariables", "userNodes", "playbackConfig"}
+    panels = layout["configById"]
+    assert sorted(_panels(layout["layout"], panels)) == sorted(panels)
+    for panel in panels.values():
+        for series in panel.get("paths", []):
+            _check_path(reader, series["value"])
+        for topic in panel.get("topics", {}):
+            assert reader.channel_of(topic) is not None, topic
+        image = panel.get("imageMode", {}).get("imageTopic")
+        assert image is None or reader.channel_of(image) is not None, image
+    return layout
+
+
+def series_of(layout: dict[str, Any]) -> dict[str, str]:
+    """All named series of a layout, and their paths."""
+    panels = layout["configById"].values()
+    return {path["label"]: path["value"] for panel in panels for path in panel.get("paths", [])}
+
+
+def _check_path(reader: McapReader, path: str) -> None:
+    match = _PATH.fullmatch(path)
+    assert match is not None, path
+    channel = reader.channel_of(match["topic"])
+    assert channel is not None, path
+    fields = _fields(reader.schema_of(channel).data.decode())
+    for name in (match["field"], *_FILTER.findall(match["filters"])):
+        assert name in fields, path
+    count = fields[match["field"]]
+    assert (match["index"] is None) == (count is None), f"{path}: not one number"
+    assert count is None or int(match["index"]) < count, path
+
+
+def _fields(text: str) -> dict[str, int | None]:
+    """The fields of a message definition, and how many numbers they have; None for one."""
+    found: dict[str, int | None] = {}
+    for line in text.split("=====")[0].splitlines():
+        declaration = re.fullmatch(r"\w+(?:\[(\d+)\])?\s+(\w+)", line.split("#")[0].strip())
+        if declaration is not None:
+            found[declaration[2]] = None if declaration[1] is None else int(declaration[1])
+    return found
+
+
+def _panels(node: Any, panels: dict[str, Any]) -> list[str]:
+    """The panels of a layout, those behind tabs included."""
+    if isinstance(node, str):
+        tabs = panels[node].get("tabs", [])
+        return [node, *(name for tab in tabs for name in _panels(tab["layout"], panels))]
+    assert node["direction"] in ("row", "column")
+    assert 0 < node["splitPercentage"] < 100
+    return [*_panels(node["first"], panels), *_panels(node["second"], panels)]

@@ -1,0 +1,82 @@
+"""A small task whose optimum is known: a corridor of five cells with a worthless exit at one end.
+
+Cell 0 is an exit that pays 0.3, cell 4 one that pays 1; both terminate. Between them action 0 goes
+left and action 1 right, and nothing is paid. Observations are one-hot, so a network is a table.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.recorder.dataset.dataset import Dataset
+
+N_CELLS = 5
+GAMMA = 0.9
+PAYS = {0: 0.3, N_CELLS - 1: 1.0}
+INNER_CELLS = range(1, N_CELLS - 1)
+ACTION_SPACE = spaces.Discrete(2, start=5)
+"""Starts at 5, so that whoever forgets the start is found out."""
+
+
+def corridor(visits: dict[tuple[int, int], int] | None = None, repeat: int = 20) -> Dataset:
+    """Transitions of the corridor, each an episode of its own.
+
+    Args:
+        visits: how often each (cell, action) is in the data; all of them once by default.
+        repeat: how often the whole is repeated.
+    """
+    counts = visits or {(cell, action): 1 for cell in INNER_CELLS for action in (0, 1)}
+    pairs = [pair for pair, count in counts.items() for _ in range(count)] * repeat
+    cells = np.array([cell for cell, _ in pairs])
+    moves = np.array([action for _, action in pairs])
+    next_cells = cells + 2 * moves - 1
+    ends = np.isin(next_cells, list(PAYS))
+    return Dataset.from_arrays(
+        observations=one_hot(cells),
+        actions=moves + ACTION_SPACE.start,
+        rewards=np.array([PAYS.get(int(cell), 0.0) for cell in next_cells]),
+        terminated=ends,
+        truncated=~ends,
+        next_observations=one_hot(next_cells),
+        env_id="Corridor-v0",
+        observation_space=spaces.Box(0, 1, (N_CELLS,), np.float32),
+        action_space=ACTION_SPACE,
+    )
+
+
+def optimal_values() -> NDArray[np.float64]:
+    """(3, 2), Q of the inner cells by value iteration."""
+    q = np.zeros((N_CELLS, 2))
+    for _ in range(100):
+        for cell in INNER_CELLS:
+            for action, after in ((0, cell - 1), (1, cell + 1)):
+                q[cell, action] = PAYS.get(after, GAMMA * q[after].max())
+    return q[list(INNER_CELLS)]
+
+
+def inner_observations() -> NDArray[np.float32]:
+    """(3, 5), the cells in which there is something to choose."""
+    return one_hot(np.array(INNER_CELLS))
+
+
+def one_hot(cells: NDArray[np.int64]) -> NDArray[np.float32]:
+    """(N, 5) for N cells."""
+    return np.eye(N_CELLS, dtype=np.float32)[cells]
+
+
+def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dataset:
+    """Episodes of a walk whose observation is the step; every step pays 1."""
+    steps = np.concatenate([np.arange(length, dtype=np.float32) for length in lengths])[:, None]
+    last = np.concatenate([np.arange(1, length + 1) == length for length in lengths])
+    return Dataset.from_arrays(
+        observations=steps,
+        actions=np.zeros(len(steps), np.int64),
+        rewards=np.ones(len(steps)),
+        terminated=last,
+        truncated=np.zeros(len(steps), bool),
+        next_observations=steps + 1,
+        env_id="Crossing-v0",
+        action_space=spaces.Discrete(n_actions),
+    )

@@ -1,0 +1,11 @@
+"""Folders that tests read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+TESTS = Path(__file__).parent.parent
+ROOT = TESTS.parent
+GOLDEN = TESTS / "golden"
+NODE = TESTS / "node"
+FUZZ_CORPUS = TESTS / "fuzz_corpus"
