@@ -1,10 +1,10 @@
-"""Whether logged behavior probabilities can be true, as far as the actions taken tell.
+"""Calibration of logged behavior probabilities.
 
-Of each step only the probability of the action taken is known. But over actions drawn with
-probabilities p, the mean of 1 / p is the number of actions that can be drawn, and the same holds
-for those actions whose p is in a given range: their share of the steps, each counted 1 / p, is how
-many actions of that probability a state has. An epsilon-greedy policy of nine actions has one that
-is likely and eight that are not.
+A log contains only the probability p of the action taken. Over actions drawn with probabilities p,
+E[1 / p] is the number of actions with p > 0. The same holds for a range of probabilities: the sum
+of 1 / p over the steps in that range, divided by the number of all steps, is the mean number of
+actions per state whose probability is in the range. For example, an epsilon-greedy policy over nine
+actions has one action of high probability and eight of low probability.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
-"""Ranges of probabilities, the lower end not included."""
+"""Edges of the probability ranges (low, high]."""
 _STANDARD_ERRORS = 4.0
-"""So far from what must be, chance no longer explains it."""
+"""Largest deviation, in standard errors, that is attributed to chance."""
 
 
 @dataclass(frozen=True)
 class ProbabilityRange:
-    """The steps whose action had a probability in some range.
+    """The steps whose action has a probability in one range.
 
     Attributes:
-        probability: their mean.
-        steps: how many they are.
-        actions: how many actions of such a probability a state has in the mean.
+        probability: Mean probability of these actions.
+        steps: Number of these steps.
+        actions: Mean number of actions per state with a probability in the range.
     """
 
     probability: float
@@ -40,14 +40,15 @@ class ProbabilityRange:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What logged probabilities say of themselves.
+    """Consistency of the logged probabilities with the action space.
 
     Attributes:
-        available: actions that there are.
-        actions: how many the probabilities speak of: all, fewer if some never come, and more only
-            if the probabilities are smaller than they should be.
-        error: the standard error of `actions`.
-        ranges: the same by size of the probability.
+        available: Number of actions in the action space.
+        actions: Number of actions implied by the probabilities, the mean of 1 / p. It is smaller
+            than `available` if some actions are never taken, and larger only if the logged
+            probabilities are too small.
+        error: Standard error of `actions`.
+        ranges: The same estimate for each range of probabilities.
     """
 
     available: int
@@ -57,16 +58,18 @@ class Calibration:
 
     @property
     def possible(self) -> bool:
-        """Whether the probabilities can be true."""
+        """Whether the probabilities are consistent with the number of actions."""
         return self.actions <= self.available + _STANDARD_ERRORS * self.error + 1e-6
 
     def __str__(self) -> str:
-        """On one line."""
-        text = f"{self.actions:.2f} +- {self.error:.2f} of {self.available} actions"
-        return text if self.possible else f"{text}: too many, so they are smaller than the truth"
+        """Return a summary of one line."""
+        text = (
+            f"{self.actions:.2f} +- {self.error:.2f} actions; the action space has {self.available}"
+        )
+        return text if self.possible else f"{text}, so the logged probabilities are too small"
 
     def to_json(self) -> dict[str, Any]:
-        """As commands print it."""
+        """Return the JSON object that commands print."""
         ranges = [vars(one) for one in self.ranges]
         mine = {"available": self.available, "actions": self.actions, "error": self.error}
         return {**mine, "possible": self.possible, "ranges": ranges}
@@ -75,14 +78,14 @@ class Calibration:
 def calibration(
     behavior_probs: NDArray[np.floating], action_space: spaces.Space[Any]
 ) -> Calibration | None:
-    """Examine the logged probabilities of the actions taken.
+    """Estimate the calibration of logged probabilities.
 
     Args:
-        behavior_probs: (N,).
-        action_space: of these actions.
+        behavior_probs: (N,) probability of each action taken.
+        action_space: Space of the actions.
 
     Returns:
-        None if actions are not discrete, or probabilities are unknown or 0.
+        None if the actions are not discrete, or a probability is unknown or 0.
     """
     if not isinstance(action_space, spaces.Discrete) or len(behavior_probs) < 2:
         return None

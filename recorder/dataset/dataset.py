@@ -1,4 +1,4 @@
-"""Transitions as arrays, and what one does with them before learning."""
+"""The dataset: transitions of whole episodes as NumPy arrays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 
-# Rows that are hashed at a time: images on disk need not fit into memory.
+# Rows that are hashed at a time, so that images on disk do not have to fit into memory.
 _BLOCK_ROWS = 1024
 
 
@@ -34,7 +34,7 @@ class Dataset:
     """Transitions of whole episodes, from logs or from arrays.
 
     Attributes:
-        sources: the files that it was read from; empty if it was not.
+        sources: Files that the data was read from; empty for arrays.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Dataset:
         *,
         sources: tuple[Path, ...] = (),
     ) -> None:
-        """Use `mcaprl.open` or `Dataset.from_arrays`."""
+        """Create a dataset; use `mcaprl.open` or `Dataset.from_arrays` instead."""
         self._transitions = transitions
         self._description = description
         self._leaves = leaves_of(description.observation_space)
@@ -65,10 +65,10 @@ class Dataset:
         observation_space: spaces.Space[Any] | None = None,
         action_space: spaces.Space[Any] | None = None,
     ) -> Dataset:
-        """Make a dataset of N transitions in the order in which they happened.
+        """Create a dataset of N transitions, given in the order in which they happened.
 
-        An episode ends where `terminated` or `truncated` is set, or where the next transition does
-        not begin with this one's next observation.
+        An episode ends where `terminated` or `truncated` is set, or where the next transition's
+        observation differs from this one's next observation.
 
         Args:
             observations: (N, *shape), or nested dicts of such arrays.
@@ -78,13 +78,15 @@ class Dataset:
             truncated: (N,) bool.
             next_observations: like `observations`.
             behavior_probs: (N,) probability of each action under the policy that took it; default:
-                unknown.
+                NaN (unknown).
             env_id: Gymnasium id of the environment.
-            observation_space: default: unbounded Boxes of the arrays' shapes and dtypes.
-            action_space: default: Discrete up to the largest action, or an unbounded Box.
+            observation_space: Space of the observations; default: unbounded Boxes with the arrays'
+                shapes and dtypes.
+            action_space: Space of the actions; default: Discrete up to the largest action, or an
+                unbounded Box.
 
         Raises:
-            SpaceError: lengths or shapes do not agree with each other or with the spaces.
+            SpaceError: Lengths or shapes do not agree with each other or with the spaces.
         """
         from mcaprl.recorder.dataset.arrays import columns_of_arrays
 
@@ -104,13 +106,13 @@ class Dataset:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Dataset]) -> Dataset:
-        """Several datasets as one; their episodes follow each other.
+        """Concatenate the episodes of several datasets.
 
-        Metadata on which they do not agree is left empty.
+        Metadata fields that differ between the datasets are left empty.
 
         Raises:
-            SpaceError: their spaces differ.
-            LogError: there are none.
+            SpaceError: The datasets' spaces differ.
+            LogError: `parts` is empty.
         """
         if not parts:
             raise LogError("no data: the list of datasets or files is empty")
@@ -132,25 +134,25 @@ class Dataset:
 
     @cached_property
     def metadata(self) -> dict[str, str]:
-        """The log's own description of itself, strings by name."""
+        """The log's metadata: strings by name."""
         return self._description.to_strings()
 
     @cached_property
     def observations(self) -> Any:
         """(N, *shape) in the space's dtype, or nested dicts of such arrays.
 
-        Images that are on disk are read by indexing this, or by `batch`.
+        Images that stay on disk are read when this is indexed, or by `batch`.
         """
         return self._frames(self._frame_of_step)
 
     @cached_property
     def next_observations(self) -> Any:
-        """Like `observations`, one step on; at an episode's end its last observation."""
+        """Like `observations`, one step later; at an episode's end, its last observation."""
         return self._frames(self._frame_of_step + 1)
 
     @property
     def storage(self) -> str:
-        """Where the observations are: `memory`, or the files that images are read from."""
+        """Where the observations are stored: `memory`, or the files that images are read from."""
         mapped = [leaf for leaf in self._transitions.frames if isinstance(leaf, MappedImages)]
         names = list(dict.fromkeys(name for leaf in mapped for name in leaf.names))
         more = f" and {len(names) - 1} more" if len(names) > 1 else ""
@@ -158,15 +160,15 @@ class Dataset:
 
     @property
     def frames(self) -> Any:
-        """(N + E, *shape), each observation once: an episode's, its last one, the next episode's.
+        """(N + E, *shape) observations without duplicates, or nested dicts of such arrays.
 
-        Like `observations`, in nested dicts for a Dict space; not copied.
+        Each of the E episodes contributes its T + 1 observations, in order. Not a copy.
         """
         return nest(self._leaves, list(self._transitions.frames))
 
     @property
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) which of `frames` each transition's observation is; the next one is one more."""
+        """(N,) index into `frames` of each transition's observation; + 1 for the next one."""
         return self._transitions.frame_of_step()
 
     @property
@@ -176,27 +178,27 @@ class Dataset:
 
     @property
     def actions(self) -> NDArray[Any]:
-        """(N,) int64 of a Discrete space, else (N, *shape)."""
+        """(N,) int64 for a Discrete space, otherwise (N, *shape)."""
         return self._transitions.actions
 
     @property
     def rewards(self) -> NDArray[np.float64]:
-        """(N,) float64."""
+        """(N,) float64 rewards."""
         return self._transitions.rewards
 
     @property
     def terminated(self) -> NDArray[np.bool_]:
-        """(N,) bool: the transition led to a terminal state."""
+        """(N,) bool: whether the transition led to a terminal state."""
         return self._transitions.terminated
 
     @property
     def truncated(self) -> NDArray[np.bool_]:
-        """(N,) bool: the episode was cut off behind this transition."""
+        """(N,) bool: whether the episode was truncated after this transition."""
         return self._transitions.truncated
 
     @property
     def behavior_probs(self) -> NDArray[np.float32]:
-        """(N,) float32: probability of the action under the policy that took it, or NaN."""
+        """(N,) float32 probability of each action under the policy that took it; NaN if unknown."""
         return self._transitions.behavior_probs
 
     @property
@@ -206,32 +208,32 @@ class Dataset:
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Arguments to `gymnasium.make` that made it."""
+        """Keyword arguments of `gymnasium.make` that created the environment."""
         return dict(self._description.env_kwargs)
 
     @property
     def observation_space(self) -> spaces.Space[Any]:
-        """Of the environment."""
+        """Observation space of the environment."""
         return self._description.observation_space
 
     @property
     def action_space(self) -> spaces.Space[Any]:
-        """Of the environment."""
+        """Action space of the environment."""
         return self._description.action_space
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        """A name for each number of a vector observation, or empty."""
+        """Names of a vector observation's elements; empty if unknown."""
         return self._description.observation_names
 
     @property
     def action_meanings(self) -> tuple[str, ...]:
-        """A name for each discrete action, or empty."""
+        """Names of the discrete actions; empty if unknown."""
         return self._description.action_meanings
 
     @property
     def action_names(self) -> dict[int, str]:
-        """A name for each discrete action, by its value; empty for other actions."""
+        """Names of the discrete actions, by value; empty for other actions."""
         return self._description.action_names()
 
     @cached_property
@@ -245,7 +247,7 @@ class Dataset:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of spaces and transitions: the same for the same data, whatever the file."""
+        """SHA-256 of spaces and transitions, independent of the file that stores them."""
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
@@ -257,21 +259,21 @@ class Dataset:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Returns, lengths, ends and ranges of the columns."""
+        """Returns, lengths, end reasons and value ranges."""
         return describe_columns(self._transitions, self._leaves)
 
     def filter(self, keep: Callable[[Episode], bool]) -> Dataset:
-        """The episodes for which `keep` is true, as a dataset of copies."""
+        """Return a copy with only the episodes for which `keep` returns true."""
         return self._take([episode.index for episode in self.episodes if keep(episode)])
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> Batch:
-        """Copy some transitions, by their numbers; images that are on disk are read.
+        """Copy a batch of transitions; images that stay on disk are read.
 
         Args:
-            steps: (B,) which.
+            steps: (B,) indexes of the transitions.
 
         Raises:
-            CorruptLogError: images on disk are damaged.
+            CorruptLogError: Images on disk are damaged.
         """
         columns, frames = self._transitions, self._frame_of_step[steps]
         return Batch(
@@ -285,9 +287,13 @@ class Dataset:
         )
 
     def split(self, fraction: float, *, seed: int = 0) -> tuple[Dataset, Dataset]:
-        """Divide the episodes at random: about `fraction` of them, and the rest.
+        """Split the episodes at random into about `fraction` of them and the rest.
 
-        Each part keeps the order of the log. With two episodes or more, neither part is empty.
+        Both parts keep the log's order. With two or more episodes, neither part is empty.
+
+        Args:
+            fraction: Share of the episodes in the first part, between 0 and 1 (exclusive).
+            seed: Seed of the random split.
 
         Raises:
             ValueError: `fraction` is not between 0 and 1.
@@ -301,11 +307,16 @@ class Dataset:
         return self._take(first.tolist()), self._take(second.tolist())
 
     def save(self, path: str | Path, *, compression: str = "zstd", overwrite: bool = False) -> None:
-        """Write the dataset as one log; `mcaprl.open` gives an equal one back.
+        """Write the dataset as one log; `mcaprl.open` reads back an equal dataset.
+
+        Args:
+            path: Path of the log.
+            compression: `zstd`, `lz4` or `none`.
+            overwrite: Whether an existing file is replaced.
 
         Raises:
-            OutputExistsError: there is a file, and `overwrite` is not set.
-            LogError: it cannot be written.
+            OutputExistsError: The file exists and `overwrite` is not set.
+            LogError: The file cannot be written.
         """
         from mcaprl.recorder.dataset.save import save_log
 
@@ -314,11 +325,11 @@ class Dataset:
         )
 
     def to_arrow(self, table: Literal["transitions", "episodes"] = "transitions") -> pyarrow.Table:
-        """A PyArrow table: one row per transition, or one per episode. Extra: `tables`.
+        """Return a PyArrow table with one row per transition or per episode. Extra: `tables`.
 
         Raises:
-            MissingExtraError: pyarrow is not installed.
-            UnknownNameError: there is no such table.
+            MissingExtraError: PyArrow is not installed.
+            UnknownNameError: `table` is not one of the two names.
         """
         from mcaprl.recorder.dataset.tables import episode_table, transition_table
 
@@ -331,15 +342,15 @@ class Dataset:
     def to_pandas(
         self, table: Literal["transitions", "episodes"] = "transitions"
     ) -> pandas.DataFrame:
-        """A pandas DataFrame: see `to_arrow`. Extra: `tables`."""
+        """Return a pandas DataFrame; see `to_arrow`. Extra: `tables`."""
         return self.to_arrow(table).to_pandas()
 
     def __len__(self) -> int:
-        """Transitions."""
+        """Return the number of transitions."""
         return len(self.rewards)
 
     def __repr__(self) -> str:
-        """Shapes, not arrays."""
+        """Return a summary with shapes instead of arrays."""
         columns = ", ".join(
             f"{leaf.name}={shapes(frames)[1:-1]}"
             for leaf, frames in zip(self._leaves, self._transitions.frames, strict=True)

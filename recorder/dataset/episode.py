@@ -1,4 +1,4 @@
-"""One episode of a dataset, as views into its columns."""
+"""One episode of a dataset, as views into the dataset's columns."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Episode:
-    """One episode of T transitions. Arrays are views into its Dataset.
+    """One episode of T transitions; its arrays are views into the Dataset.
 
     Attributes:
-        index: in its Dataset, from 0.
+        index: Index in the Dataset, from 0.
         observations: (T, *shape), or nested dicts of such arrays.
         actions: (T,) int64, or (T, *shape).
         rewards: (T,) float64.
-        terminated: (T,) bool; only the last can be set.
-        truncated: (T,) bool; only the last can be set.
-        next_observations: like `observations`, one step on; the last is the episode's last.
+        terminated: (T,) bool; only the last element can be set.
+        truncated: (T,) bool; only the last element can be set.
+        next_observations: like `observations`, one step later.
         behavior_probs: (T,) float32; NaN where unknown.
-        log_time_ns: (T + 1,) when each observation was made, nanoseconds.
-        summary: what the log tells of the episode: seed, reason, policy, ...
+        log_time_ns: (T + 1,) log_time of each observation, nanoseconds.
+        summary: The log's summary of the episode: seed, end reason, policy, ...
     """
 
     index: int
@@ -41,40 +41,40 @@ class Episode:
 
     @property
     def length(self) -> int:
-        """Transitions."""
+        """Number of transitions."""
         return len(self.rewards)
 
     @property
     def total_reward(self) -> float:
-        """The undiscounted return."""
+        """Undiscounted return."""
         return self.summary.total_reward
 
     @property
     def reason(self) -> str:
-        """Why it ended, in the simulator's words."""
+        """Reason of the end, as the environment reported it."""
         return self.summary.reason
 
     @property
     def seed(self) -> int | None:
-        """Given to reset(); None if none was."""
+        """Seed passed to `reset`; None if there was none."""
         return self.summary.seed
 
     @property
     def policy(self) -> str:
-        """Who acted."""
+        """Name of the policy that acted."""
         return self.summary.policy
 
     @property
     def epsilon(self) -> float:
-        """Its exploration; NaN if unknown."""
+        """Probability of a random action; NaN if unknown."""
         return self.summary.epsilon
 
     def __len__(self) -> int:
-        """Transitions."""
+        """Return the number of transitions."""
         return self.length
 
     def __repr__(self) -> str:
-        """Shapes, not arrays."""
+        """Return a summary with shapes instead of arrays."""
         return (
             f"Episode(index={self.index}, length={self.length},"
             f" total_reward={self.total_reward:.6g}, reason={self.reason!r}, seed={self.seed},"
@@ -83,7 +83,7 @@ class Episode:
 
 
 def shapes(array: Any) -> str:
-    """Shape and dtype of an array, or of each in nested dicts, for a repr."""
+    """Format the shape and dtype of an array, or of each array in nested dicts."""
     if isinstance(array, dict):
         return "{" + ", ".join(f"{key}: {shapes(part)}" for key, part in array.items()) + "}"
     return f"<{'x'.join(map(str, array.shape))} {array.dtype}>"

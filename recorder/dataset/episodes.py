@@ -1,4 +1,4 @@
-"""Episodes of a log: where they end, in what order, and what `/rl/episode` tells of them."""
+"""Episodes of a log: their order, their lengths, and their summaries from `/rl/episode`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mcaprl.recorder.format.reading import Columns, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
-"""The fields that say which episode a record belongs to, where in it, and whether it is the end."""
-# So many rows of a column stay in a processor's cache while they are looked at.
+"""Fields that give a record's episode, its step, and whether it is the final record."""
+# This many rows of a column fit into a processor's cache.
 _BLOCK_ROWS = 2**15
 
 
 def time_order(topic: Topic) -> NDArray[np.int64] | None:
-    """The order of log_time; None if that is the order they are in."""
+    """Return the rows of a topic sorted by log_time; None if they are already sorted."""
     times = topic.times
     for start in range(0, len(times), _BLOCK_ROWS):
         block = times[start : start + _BLOCK_ROWS + 1]
@@ -32,13 +32,13 @@ def time_order(topic: Topic) -> NDArray[np.int64] | None:
 
 
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
-    """The order in which the records of `/rl/step` are whole episodes; None if they are in it.
+    """Return the order of `/rl/step` records that yields whole episodes; None for file order.
 
-    That is the order of log_time. Where two robots wrote at once, each on a channel of its own, it
-    is one channel after the other.
+    This is the order of log_time. If two robots wrote at the same time, each on its own channel,
+    it is one channel after the other.
 
     Raises:
-        CorruptLogError: they are no whole episodes in any order.
+        CorruptLogError: No order yields whole episodes.
     """
     order = time_order(steps)
     if steps.channels < 2:
@@ -52,10 +52,14 @@ def step_order(steps: Topic) -> NDArray[np.int64] | None:
 
 
 def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
-    """Transitions of each finished episode.
+    """Return the number of transitions of each finished episode.
+
+    Args:
+        columns: Columns of `/rl/step`: `COUNTERS`, and optionally terminated and truncated.
+        where: Name of the log for error messages.
 
     Raises:
-        CorruptLogError: records are missing, doubled or out of order.
+        CorruptLogError: Records are missing, duplicated or out of order.
     """
     final = columns["final"].astype(bool)
     finals = np.flatnonzero(final)
@@ -63,12 +67,12 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     read = int(finals[-1]) + 1
     steps, episodes = columns["step"][:read], columns["episode"][:read]
-    # Behind a final record an episode begins; any other is followed by the next of its episode.
+    # An episode begins after a final record; every other record is followed by the next step.
     begins = np.concatenate([[0], finals[:-1] + 1])
     breaks = np.concatenate([_breaks(steps, 1), _breaks(episodes, 0)])
     wrong = [begins[steps[begins] != 0], breaks[~final[breaks]] + 1]
     if "terminated" in columns:
-        # An end is the last transition's, which stands before the final record.
+        # The end flags are set on the last transition, which precedes the final record.
         ends = np.flatnonzero(columns["terminated"][: read - 1] | columns["truncated"][: read - 1])
         wrong.append(ends[~final[ends + 1]])
     rows = np.concatenate(wrong)
@@ -76,13 +80,14 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
         row = int(rows.min())
         raise CorruptLogError(
             f"{where}: record {row} of {STEP_TOPIC} (episode {episodes[row]}, step {steps[row]}) is"
-            " out of order: records are missing or doubled, or an episode goes on after its end"
+            " out of order: records are missing or duplicated, or an episode continues after its"
+            " end"
         )
     return np.diff(finals, prepend=-1) - 1
 
 
 def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
-    """The rows that the next one is not higher than by so much."""
+    """Return the rows whose successor does not differ by `by`."""
     found = []
     for start in range(0, len(column) - 1, _BLOCK_ROWS):
         block = column[start : start + _BLOCK_ROWS + 1]
@@ -90,22 +95,22 @@ def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
     return np.concatenate(found) if found else np.empty(0, np.int64)
 
 
-class Told:
-    """What `/rl/episode` tells of episodes: nothing, if it is of another type than ours."""
+class EpisodeTopic:
+    """The summaries on `/rl/episode`; none if the topic has another writer's message type."""
 
     def __init__(self, topic: Topic) -> None:
-        """Point at it; nothing is read."""
+        """Refer to the topic; nothing is read yet."""
         self._topic = topic
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) transitions of each; none if they are told of out of order."""
+        """(E,) transitions of each episode; empty if the messages are out of order."""
         if not self._is_ours or not (np.diff(self._columns["end_time_ns"]) > 0).all():
             return np.empty(0, np.int64)
         return self._columns["length"].astype(np.int64)
 
     def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-        """Of those with these last log_times, and maybe others."""
+        """Read the summaries of the episodes that end at these log_times, and maybe of others."""
         if not self._is_ours:
             return []
         fields, rows = EpisodeSummary._fields, None
@@ -117,8 +122,8 @@ class Told:
         values = {name: columns[name].tolist() for name in fields if name in columns}
         if "seed" in values:
             values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
-        defaults, told = EpisodeSummary._field_defaults, len(values["length"])
-        every = [values[name] if name in values else [defaults[name]] * told for name in fields]
+        defaults, count = EpisodeSummary._field_defaults, len(values["length"])
+        every = [values[name] if name in values else [defaults[name]] * count for name in fields]
         return list(map(EpisodeSummary._make, zip(*every, strict=True)))
 
     @property
@@ -132,35 +137,44 @@ class Told:
 
 
 def summaries(
-    path: object, columns: Columns, lengths: NDArray[np.int64], told: list[EpisodeSummary]
+    path: object, columns: Columns, lengths: NDArray[np.int64], recorded: list[EpisodeSummary]
 ) -> tuple[EpisodeSummary, ...]:
-    """One for each episode; one that was not told of is summed up from its records.
+    """Return a summary of each episode, computed from its records where none was recorded.
+
+    Args:
+        path: Path of the log for error messages.
+        columns: Columns of `/rl/step`.
+        lengths: (E,) transitions of each episode.
+        recorded: Summaries from `/rl/episode`.
 
     Raises:
-        CorruptLogError: what is told does not agree with the records.
+        CorruptLogError: A recorded summary does not agree with the records.
     """
-    # By the time of their last record: appended recordings count from 0 again.
-    by_end = {summary.end_time_ns: summary for summary in told}
+    # Keyed by the final record's time, because appended recordings count episodes from 0 again.
+    by_end = {summary.end_time_ns: summary for summary in recorded}
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()
-    untold = np.array([end not in by_end for end in ends], bool)
-    summed_up = of_records(columns, finals[untold], lengths[untold])
+    is_missing = np.array([end not in by_end for end in ends], bool)
+    computed = summaries_of_records(columns, finals[is_missing], lengths[is_missing])
     found = []
     for end, length in zip(ends, lengths.tolist(), strict=True):
-        summary = by_end[end] if end in by_end else next(summed_up)
+        summary = by_end[end] if end in by_end else next(computed)
         if summary.length != length:
             raise CorruptLogError(
-                f"{path}: /rl/episode gives episode {summary.episode} {summary.length} steps,"
-                f" {STEP_TOPIC} has {length}"
+                f"{path}: episode {summary.episode} has {summary.length} steps according to"
+                f" /rl/episode, but {length} on {STEP_TOPIC}"
             )
         found.append(summary)
     return tuple(found)
 
 
-def of_records(
+def summaries_of_records(
     columns: Columns, finals: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[EpisodeSummary]:
-    """Summaries of the episodes that end with these records, as far as records tell."""
+    """Compute the summaries of the episodes that end with these final records.
+
+    Fields that the records do not contain keep their defaults.
+    """
     firsts = finals - lengths
     lasts = np.maximum(finals - 1, firsts)
     rewards = columns["reward"].astype(np.float64, copy=False)

@@ -1,11 +1,11 @@
-"""Logs of others: what their `/rl/step` tells where no metadata describes the spaces.
+"""Logs of other writers: spaces inferred from `/rl/step` where there is no metadata.
 
-Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema`, of any number type
-and in any order, and whatever else its writer likes; `behavior_prob` may be missing. Vectors are
-`observation`, or `observation_<key>` for each key of a Dict space; images are on topics
-`/rl/observation/<key>`, at the log_times of the records. Their spaces are unbounded Boxes, and
-integer actions are Discrete up to the largest one seen. A field `observation` beside others is the
-key `state`.
+Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema`, of any numeric type
+and in any order; other fields are ignored, and `behavior_prob` may be missing. Vectors are in
+`observation`, or in `observation_<key>` for each key of a Dict space; images are on topics
+`/rl/observation/<key>`, with the log_times of the step records. The inferred spaces are unbounded
+Boxes; integer actions are Discrete up to the largest action. A field `observation` beside fields
+`observation_<key>` becomes the key `state`.
 """
 
 from __future__ import annotations
@@ -27,19 +27,20 @@ _OBSERVATION, _STATE, _IMAGE_TOPIC = "observation", "observation_state", "/rl/ob
 
 
 def observation_fields(fields: Iterable[str]) -> list[str]:
-    """Those fields of `/rl/step` that are observations, by their names."""
+    """Return the names of the fields that are observations."""
     return [name for name in fields if name == _OBSERVATION or name.startswith(f"{_OBSERVATION}_")]
 
 
 def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
-    """Describe a log by its contents.
+    """Infer a log's metadata from its contents.
 
     Args:
-        reader: of the log.
-        columns: of `/rl/step`. Beside others, `observation` is renamed to `observation_state`.
+        reader: Reader of the log.
+        columns: Columns of `/rl/step`. If there are several observations, the column `observation`
+            is renamed to `observation_state`.
 
     Raises:
-        LogError: it has no observations, or images of an encoding that is not known.
+        LogError: The log has no observations, or images of an unknown encoding.
     """
     images = sorted(
         channel.topic
@@ -68,13 +69,13 @@ def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
 
 
 def _check_names(reader: McapReader, metadata: LogMetadata, columns: Columns) -> None:
-    """Every part of the space must find its own field or topic again by its name."""
+    """Check that each leaf of the space maps back to its own field or topic."""
     for leaf in observation_leaves(metadata.observation_space):
         is_there = reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns
         if not is_there:
             raise LogError(
-                f"{reader.path}: the observation '{leaf.path[0]}' has not the name"
-                f" {leaf.topic if leaf.encoding else leaf.name}; use lower case letters, digits and"
+                f"{reader.path}: the observation '{leaf.path[0]}' is not named"
+                f" {leaf.topic if leaf.encoding else leaf.name}; use lower-case letters, digits and"
                 " single underscores"
             )
 
@@ -89,7 +90,7 @@ def _image_space(reader: McapReader, topic: str) -> spaces.Box:
     if channels is None:
         raise LogError(
             f"{reader.path}: images on {topic} are {encoding};"
-            f" known are {', '.join(IMAGE_ENCODINGS.values())}"
+            f" supported encodings: {', '.join(IMAGE_ENCODINGS.values())}"
         )
     shape = (int(height), int(width)) if channels == 1 else (int(height), int(width), channels)
     return spaces.Box(0, 255, shape, np.uint8)

@@ -1,4 +1,4 @@
-"""Where image observations are kept, and a copy beside a log that can be mapped."""
+"""Storage of image observations, and an uncompressed copy beside a log that can be mapped."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mcaprl.recorder.format.writing import McapWriter
 
 Storage = Literal["auto", "memory", "mapped"]
-"""`memory`, `mapped` (on disk), or `auto`: mapped if they would take much of the free memory."""
+"""`memory`, `mapped` (on disk), or `auto`: `mapped` above `MEMORY_SHARE` of the free memory."""
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CACHE_METADATA = "mcaprl.images"
@@ -29,14 +29,14 @@ MEMORY_SHARE = 0.5
 
 
 def is_mapped(storage: Storage, image_bytes: int) -> bool:
-    """Whether pictures of so many bytes are to stay on disk."""
+    """Return whether images of this total size stay on disk."""
     if storage == "auto":
         return image_bytes > MEMORY_SHARE * free_memory_bytes()
     return storage == "mapped"
 
 
 def free_memory_bytes() -> float:
-    """Memory that is free; infinite where the system does not tell."""
+    """Return the free memory in bytes; infinity where the system does not report it."""
     try:
         return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -46,33 +46,33 @@ def free_memory_bytes() -> float:
 def image_cache(
     reader: McapReader, topic: Topic, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
 ) -> McapReader:
-    """A copy of a log's pictures in uncompressed chunks, made beside it unless it is there.
+    """Open the copy of a log's images in uncompressed chunks; write it beside the log if needed.
 
     Args:
-        reader: of the log.
-        topic: the pictures'.
-        blocks: log_times and (K, height, width) or (K, height, width, channels) pictures, all of
-            the topic; asked for only if the copy has to be made.
+        reader: Reader of the log.
+        topic: Topic of the images.
+        blocks: log_times and (K, height, width) or (K, height, width, channels) images of the whole
+            topic; consumed only if the copy has to be written.
 
     Raises:
-        LogError: it cannot be written.
+        LogError: The copy cannot be written.
     """
     path = reader.path.with_name(f"{reader.path.name}.{topic.name.rpartition('/')[2]}.images")
-    told = {"fingerprint": fingerprint(reader), "topic": topic.name}
+    description = {"fingerprint": fingerprint(reader), "topic": topic.name}
     if path.exists():
         try:
             cache = McapReader(path)
-            if cache.complete and cache.metadata.get(CACHE_METADATA) == told:
+            if cache.complete and cache.metadata.get(CACHE_METADATA) == description:
                 return cache
         except LogError:
-            # Whatever it is, it is no copy of these pictures.
+            # The file is not a copy of these images: replace it.
             pass
     unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
     from mcaprl.recorder.format.writing import McapWriter
 
     writer = McapWriter(unfinished, compression="none", overwrite=True)
     try:
-        writer.add_metadata(CACHE_METADATA, told)
+        writer.add_metadata(CACHE_METADATA, description)
         _write_blocks(writer, topic.name, blocks)
         writer.close()
         os.replace(unfinished, path)
@@ -83,7 +83,7 @@ def image_cache(
 
 
 def fingerprint(reader: McapReader) -> str:
-    """SHA-256 of where a log's chunks are and of their CRCs; of its date, too, if it has none."""
+    """Return the SHA-256 of a log's chunk offsets and CRCs, and of its mtime if it has no CRCs."""
     digest = hashlib.sha256(str(len(reader.view)).encode())
     has_crcs = bool(reader.chunks)
     for chunk in reader.chunks:
@@ -101,18 +101,18 @@ def _write_blocks(
     from mcaprl.recorder.format.writing import message_rows
 
     rows: NDArray[Any] | None = None
-    for times, pictures in blocks:
-        height, width, channels = (*pictures.shape[1:], 1)[:3]
-        if rows is None or len(rows) < len(pictures):
+    for times, images in blocks:
+        height, width, channels = (*images.shape[1:], 1)[:3]
+        if rows is None or len(rows) < len(images):
             dtype = image_dtype(height, width, channels, IMAGE_ENCODINGS[channels], IMAGE_FRAME)
             definition = messages.definition(IMAGE_TYPE)
             channel = writer.add_channel(topic, IMAGE_TYPE, definition)
-            rows = message_rows(len(pictures), dtype, channel)
+            rows = message_rows(len(images), dtype, channel)
             encoding = IMAGE_ENCODINGS[channels]
             fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
-        chunk = rows[: len(pictures)]
+        chunk = rows[: len(images)]
         chunk["log_time"] = times
         sec, nanosec = np.divmod(times, 10**9)
         chunk["payload"]["sec"], chunk["payload"]["nanosec"] = sec, nanosec
-        chunk["payload"]["data"] = pictures.reshape(len(chunk), -1)
+        chunk["payload"]["data"] = images.reshape(len(chunk), -1)
         writer.write_rows(chunk)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.dataset.episodes import time_order
 from mcaprl.recorder.dataset.image_cache import IMAGE_TYPE, Storage, image_cache, is_mapped
-from mcaprl.recorder.dataset.mapped import Frames, MappedImages, PictureFile
+from mcaprl.recorder.dataset.mapped import Frames, ImageFile, MappedImages
 from mcaprl.recorder.format.reading import (
     MESSAGE_HEADER,
     Columns,
@@ -116,7 +116,7 @@ class _Images:
             checks.append(self._check_of(decoder, span, first))
             start = stop
         name = str(self._reader.path)
-        file = PictureFile(name, self._reader.view, self._leaf.size, checks)
+        file = ImageFile(name, self._reader.view, self._leaf.size, checks)
         return MappedImages([file], self._leaf.shape, places[order])
 
     def _data_offset(self) -> int:

@@ -1,4 +1,4 @@
-"""Reads `/rl/learner`: how the policy that acted learned meanwhile."""
+"""Reads `/rl/learner`: exploration and version of the policy while it was learning."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mcaprl.recorder.format.topics import LEARNER_TOPIC
 
 @dataclass(frozen=True, eq=False)
 class LearnerColumns:
-    """One row for each transition of a log, in the log's order.
+    """State of the learner at each of a log's N transitions, in order.
 
     Attributes:
-        log_time_ns: (N,) when its observation was made.
+        log_time_ns: (N,) log_time of the transition's observation, nanoseconds.
         epsilon: (N,) probability of a random action; NaN if unknown.
-        policy_version: (N,) updates that the policy had seen; -1 if unknown.
+        policy_version: (N,) number of updates of the policy; -1 if unknown.
     """
 
     log_time_ns: NDArray[np.int64]
@@ -29,10 +29,10 @@ class LearnerColumns:
 
 
 def read_learner(path: str | Path) -> LearnerColumns:
-    """Read what `RecordVecMcap(..., policy_version=...)` wrote beside the transitions.
+    """Read what `RecordVecMcap(..., policy_version=...)` recorded with the transitions.
 
     Raises:
-        LogError: the file has no such topic, or is damaged.
+        LogError: The file has no such topic, or is damaged.
     """
     topic = Topic(McapReader(path), LEARNER_TOPIC)
     if not topic.fields:

@@ -16,7 +16,7 @@ from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsErr
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
-    Told,
+    EpisodeTopic,
     episode_lengths,
     step_order,
     summaries,
@@ -25,7 +25,7 @@ from mcaprl.recorder.dataset.foreign import inferred_metadata, observation_field
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
-from mcaprl.recorder.dataset.transitions import Transitions, spans
+from mcaprl.recorder.dataset.transitions import Transitions, ranges
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
 from mcaprl.recorder.format.schema import is_intact, stored_dtype
@@ -60,7 +60,7 @@ class LogReader:
         self._reader = McapReader(path)
         self._steps = _steps_of(self._reader)
         self._metadata = described(self._reader)
-        self._told = Told(Topic(self._reader, EPISODE_TOPIC))
+        self._told = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC))
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
@@ -111,7 +111,7 @@ class LogReader:
     ) -> tuple[Columns, NDArray[np.int64]]:
         lengths = self.lengths
         firsts = np.cumsum(lengths + 1) - (lengths + 1)
-        rows = spans(firsts[episodes], lengths[episodes] + 1)
+        rows = ranges(firsts[episodes], lengths[episodes] + 1)
         # The order is found in the indexes of all chunks, or need not be.
         if not self._steps.chunks_rise and self._order is not None:
             rows = self._order[rows]

@@ -1,8 +1,7 @@
-"""Pictures that stay on disk: an array to index, whose rows are read when they are asked for.
+"""Images that stay on disk: an array-like object that reads its rows when they are indexed.
 
-Uncompressed chunks hold each picture as it is, so the rows of a batch are gathered from the mapped
-file at the speed of memory. A chunk is checked against its CRC when one of its pictures is asked
-for the first time.
+Uncompressed chunks contain each image's bytes, so a batch is gathered from the memory-mapped file
+at the speed of memory. The CRC of a chunk is checked when one of its images is read first.
 """
 
 from __future__ import annotations
@@ -14,44 +13,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class PictureFile:
-    """A mapped file with pictures of one size in it.
+class ImageFile:
+    """A memory-mapped file that contains images of one size.
 
     Attributes:
-        name: of the file, to tell where pictures are.
+        name: Name of the file, for messages.
     """
 
     def __init__(
-        self, name: str, view: memoryview, picture_bytes: int, checks: Sequence[Callable[[], None]]
+        self, name: str, view: memoryview, image_bytes: int, checks: Sequence[Callable[[], None]]
     ) -> None:
-        """Map pictures.
+        """Refer to the images of a file.
 
         Args:
-            name: of the file.
-            view: of all its bytes.
-            picture_bytes: of each picture.
-            checks: for each chunk, what raises an error if it is damaged.
+            name: Name of the file.
+            view: All bytes of the file.
+            image_bytes: Size of one image in bytes.
+            checks: For each chunk, a function that raises an error if the chunk is damaged.
         """
         self.name = name
         bytes_ = np.frombuffer(view, np.uint8)
-        # A window at each byte; a void-typed index copies them as fast as memcpy does.
+        # A window at each byte offset; indexing a void dtype copies as fast as memcpy.
         self._windows = np.lib.stride_tricks.as_strided(
-            bytes_[:picture_bytes].view(np.dtype((np.void, picture_bytes))),
-            (len(bytes_) - picture_bytes + 1,),
+            bytes_[:image_bytes].view(np.dtype((np.void, image_bytes))),
+            (len(bytes_) - image_bytes + 1,),
             (1,),
         )
         self._checks = checks
         self._is_checked = np.zeros(len(checks), bool)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The pictures at byte offsets, one behind the other.
+        """Copy the images at some byte offsets, one after the other.
 
         Args:
-            offsets: (K,) in the file.
-            chunks: (K,) the number of the chunk that each one is in.
+            offsets: (K,) byte offsets in the file.
+            chunks: (K,) index of each image's chunk.
 
         Raises:
-            CorruptLogError: a chunk is damaged.
+            CorruptLogError: A chunk is damaged.
         """
         checked = self._is_checked[chunks]
         if not checked.all():
@@ -62,77 +61,77 @@ class PictureFile:
 
 
 class MappedImages:
-    """(F, *shape) uint8 pictures on disk. Indexing reads; `rows` does not.
+    """(F, *shape) uint8 images on disk. Indexing reads images; `rows` does not.
 
     Attributes:
-        shape: like an array's.
-        dtype: likewise.
+        shape: Shape of the corresponding array.
+        dtype: Data type of the corresponding array.
     """
 
     dtype = np.dtype(np.uint8)
 
     def __init__(
         self,
-        files: Sequence[PictureFile],
+        files: Sequence[ImageFile],
         shape: tuple[int, ...],
         places: NDArray[np.int64],
     ) -> None:
-        """Point at pictures.
+        """Refer to images.
 
         Args:
-            files: that they are in.
-            shape: of one.
-            places: (F, 3) of each the number of its file, its chunk there, and its byte offset.
+            files: Files that contain the images.
+            shape: Shape of one image.
+            places: (F, 3) index of each image's file, index of its chunk there, and byte offset.
         """
         self._files, self._places = tuple(files), places
         self.shape = (len(places), *shape)
 
     @property
     def ndim(self) -> int:
-        """Like an array's."""
+        """Number of dimensions."""
         return len(self.shape)
 
     @property
     def size(self) -> int:
-        """Like an array's."""
+        """Number of elements."""
         return int(np.prod(self.shape))
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all pictures."""
+        """Size of all images in bytes."""
         return self.size
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the files."""
+        """Names of the files."""
         return tuple(file.name for file in self._files)
 
     def rows(self, rows: Any) -> MappedImages:
-        """Some of the pictures, still on disk."""
+        """Select images without reading them."""
         return MappedImages(self._files, self.shape[1:], self._places[rows])
 
     def __len__(self) -> int:
-        """Pictures."""
+        """Return the number of images."""
         return self.shape[0]
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
-        """Read one picture after the other."""
+        """Read the images one by one."""
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, key: Any) -> NDArray[Any]:
-        """Read pictures, indexed as an array's rows, or parts of them."""
+        """Read images, or parts of them, indexed like an array."""
         first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
         places = self._places[first]
         if places.ndim == 1:
-            picture: NDArray[Any] = self._read(places[None])[0]
-            return picture[rest] if rest else picture
-        pictures = self._read(places)
-        return pictures[(slice(None), *rest)] if rest else pictures
+            image: NDArray[Any] = self._read(places[None])[0]
+            return image[rest] if rest else image
+        images = self._read(places)
+        return images[(slice(None), *rest)] if rest else images
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Read all of them."""
+        """Read all images."""
         if copy is False:
-            raise ValueError("pictures on disk cannot become an array without a copy")
+            raise ValueError("images on disk cannot become an array without a copy")
         return self[:] if dtype is None else self[:].astype(dtype, copy=False)
 
     def _read(self, places: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -140,12 +139,12 @@ class MappedImages:
         shape = (len(places), *self.shape[1:])
         if len(self._files) == 1:
             return self._files[0].read(offset, chunk).reshape(shape)
-        pictures = np.empty(shape, np.uint8)
+        images = np.empty(shape, np.uint8)
         for index in np.unique(number).tolist():
             mine = number == index
             found = self._files[index].read(offset[mine], chunk[mine])
-            pictures[mine] = found.reshape(-1, *self.shape[1:])
-        return pictures
+            images[mine] = found.reshape(-1, *self.shape[1:])
+        return images
 
 
 Frames = NDArray[Any] | MappedImages
@@ -153,16 +152,16 @@ Frames = NDArray[Any] | MappedImages
 
 
 def rows_of(frames: Frames, rows: Any) -> Frames:
-    """Some of the frames: a view or copy of arrays, and no reading of what is on disk."""
+    """Select rows: a view or copy of an array; images on disk are not read."""
     return frames.rows(rows) if isinstance(frames, MappedImages) else frames[rows]
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """Frames of several logs, one behind the other; on disk if all are."""
+    """Concatenate the frames of several logs; they stay on disk if all of them are on disk."""
     mapped = [part for part in parts if isinstance(part, MappedImages)]
     if len(mapped) < len(parts):
         return np.concatenate([np.asarray(part) for part in parts])
-    files: list[PictureFile] = []
+    files: list[ImageFile] = []
     places = []
     for part in mapped:
         moved = part._places.copy()

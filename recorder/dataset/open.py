@@ -1,4 +1,4 @@
-"""Opens logs as one Dataset: files -> whole episodes of each -> transitions."""
+"""Opens one or more logs as a Dataset."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
 
 
@@ -28,30 +28,30 @@ def open_logs(
     images: Storage = "auto",
     threads: int = 1,
 ) -> Dataset:
-    """Read logs, or a part of them; what is not asked for is not read.
+    """Read logs, or selected columns and episodes of them.
 
-    All chunks read are checked against their CRCs. A log that was cut off, or is still being
-    written, gives its finished episodes and a warning; one of several that has none yet is left
-    out, with a warning.
+    All chunks that are read are checked against their CRCs. If a log was cut off or is still being
+    written, its finished episodes are read, with a warning. If there are several logs, those
+    without a finished episode are skipped, with a warning.
 
     Args:
-        data: a file, a folder of `.mcap` files, a glob, or a sequence of these. Logs of one call
-            must have the same spaces; their episodes follow each other in the order of the files.
-        columns: keys of a Dict observation space, nested ones as `joints/q`; the dataset's
-            observation space has just these then. None of them (`[]`) reads no observations.
-            Actions, rewards and ends are always read. Default: all.
-        episodes: a number, a slice or several numbers, counted over all logs; they come in the
-            order of the logs. Default: all.
-        images: where image observations are kept: in `memory`; `mapped`, which leaves them on disk
-            and reads those that are asked for (in the log itself if it is not compressed, else in a
-            copy beside it that is made once); or `auto`: mapped if they would take more than half
-            of the memory that is free.
-        threads: that read chunks of a file at a time.
+        data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
+            the same spaces; their episodes follow each other in the order of the files.
+        columns: Keys of a Dict observation space that are read, nested keys as `joints/q`; the
+            dataset's observation space contains only these. An empty sequence reads no
+            observations. Actions, rewards and ends are always read. Default: all keys.
+        episodes: Index, slice or indexes of the episodes that are read, counted over all logs; they
+            are returned in the logs' order. Default: all episodes.
+        images: Storage of image observations: `memory`; `mapped`, which leaves images on disk and
+            reads them when they are indexed (from the log if it is uncompressed, otherwise from an
+            uncompressed copy beside it that is written once); or `auto`, which is `mapped` if the
+            images would take more than half of the free memory.
+        threads: Number of threads that read the chunks of a file.
 
     Raises:
-        LogError: a file is missing, no MCAP, damaged, or has no finished episode.
-        SpaceError: the logs' spaces differ.
-        UsageError: there is no such column or episode.
+        LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
+        SpaceError: The logs' spaces differ.
+        UsageError: A column or an episode does not exist.
     """
     if threads < 1:
         raise UsageError(f"threads {threads}: give 1 or more")
@@ -59,34 +59,34 @@ def open_logs(
     selection = Selection(columns=chosen, images=images, threads=threads)
     logs = [LogReader(path, selection) for path in find_logs(data)]
     if episodes is None:
-        return Dataset.concatenate([part for _, part in _ask(logs, LogReader.read)])
+        return Dataset.concatenate([part for _, part in _call_each(logs, LogReader.read)])
     return _read_episodes(logs, episodes)
 
 
-def _ask(
-    logs: Sequence[LogReader], ask: Callable[[LogReader], Answer]
-) -> list[tuple[LogReader, Answer]]:
-    """What each log answers, but for those of several that have no finished episode yet.
+def _call_each(
+    logs: Sequence[LogReader], function: Callable[[LogReader], Result]
+) -> list[tuple[LogReader, Result]]:
+    """Call a function on each log; of several logs, skip those without a finished episode.
 
     Raises:
-        NoEpisodesError: none has one.
+        NoEpisodesError: No log has a finished episode.
     """
-    answers = []
+    results = []
     for log in logs:
         try:
-            answers.append((log, ask(log)))
+            results.append((log, function(log)))
         except NoEpisodesError as error:
             if len(logs) == 1:
                 raise
-            warnings.warn(f"{error}: left out", stacklevel=4)
-    if not answers:
+            warnings.warn(f"{error}: skipped", stacklevel=4)
+    if not results:
         raise NoEpisodesError(f"none of {len(logs)} logs has a finished episode")
-    return answers
+    return results
 
 
 def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
-    counted = _ask(logs, lambda log: len(log.lengths))
-    numbers = _numbers(episodes, sum(count for _, count in counted))
+    counted = _call_each(logs, lambda log: len(log.lengths))
+    numbers = _episode_indexes(episodes, sum(count for _, count in counted))
     parts, first = [], 0
     for log, count in counted:
         mine = numbers[(first <= numbers) & (numbers < first + count)]
@@ -96,34 +96,34 @@ def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
     return Dataset.concatenate(parts)
 
 
-def _numbers(episodes: Episodes, count: int) -> NDArray[np.int64]:
-    """The numbers that are meant, each once, in order.
+def _episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
+    """Resolve a selection of episodes to sorted, unique indexes.
 
     Raises:
-        UsageError: one is not there, or none is meant.
+        UsageError: An index is out of range, or the selection is empty.
     """
     if isinstance(episodes, slice):
-        asked = np.arange(count)[episodes]
+        selected = np.arange(count)[episodes]
     else:
-        asked = np.atleast_1d(np.asarray(episodes, np.int64))
-    outside = asked[(asked < -count) | (asked >= count)]
-    if len(outside) or not len(asked):
-        what = f"no episode {outside[0]}" if len(outside) else "no episodes are asked for"
+        selected = np.atleast_1d(np.asarray(episodes, np.int64))
+    outside = selected[(selected < -count) | (selected >= count)]
+    if len(outside) or not len(selected):
+        what = f"no episode {outside[0]}" if len(outside) else "no episodes are selected"
         raise UsageError(f"{what}: the logs have {count}, counted from 0")
-    return np.unique(asked % count)
+    return np.unique(selected % count)
 
 
 def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The files that `data` means: see `open_logs`; sorted within a folder or glob.
+    """Resolve `data` (see `open_logs`) to files, sorted within a folder or glob.
 
     Raises:
-        LogError: there are none.
+        LogError: There are no files.
     """
     if not isinstance(data, str | Path):
         every = [path for part in data for path in find_logs(part)]
         if not every:
             raise LogError("no data: the list of files is empty")
-        # A file that is meant twice counts once.
+        # A file that is given twice is read once.
         return list({path.resolve(): path for path in every}.values())
     path = Path(data)
     if path.is_dir():

@@ -1,4 +1,4 @@
-"""What a dataset looks like, in numbers."""
+"""Statistics of a dataset."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from mcaprl.recorder.format.spaces import Leaf
 
 @dataclass(frozen=True)
 class Column:
-    """Ranges of one observation leaf, element by element; of an image, over all its pixels.
+    """Statistics of one observation leaf: per element for a vector, over all pixels for images.
 
     Attributes:
-        mean: without NaN and infinities.
-        std: likewise.
-        low: smallest value, NaN left out.
-        high: largest value, NaN left out.
-        not_finite: how many values are NaN or infinite.
+        mean: Mean of the finite values.
+        std: Standard deviation of the finite values.
+        low: Smallest value, ignoring NaN.
+        high: Largest value, ignoring NaN.
+        not_finite: Number of values that are NaN or infinite.
     """
 
     mean: NDArray[np.float64]
@@ -35,17 +35,17 @@ class Column:
 
 @dataclass(frozen=True)
 class Statistics:
-    """A dataset in numbers.
+    """Statistics of a dataset.
 
     Attributes:
-        episodes: how many.
-        steps: transitions in all.
-        returns: (E,) undiscounted, in order.
-        lengths: (E,) transitions.
-        ends: episodes by the reason they ended.
-        duration_s: simulated time of all episodes.
-        observations: ranges by leaf name.
-        action_counts: how often each was taken, where actions are single integers; else empty.
+        episodes: Number of episodes.
+        steps: Number of transitions.
+        returns: (E,) undiscounted return of each episode.
+        lengths: (E,) number of transitions of each episode.
+        ends: Number of episodes by end reason.
+        duration_s: Simulated time of all episodes, seconds.
+        observations: Statistics of the observations by leaf name.
+        action_counts: Number of steps by action, for integer actions; otherwise empty.
     """
 
     episodes: int
@@ -59,7 +59,7 @@ class Statistics:
 
     @property
     def mean_return(self) -> float:
-        """Over episodes; NaN if there are none."""
+        """Mean return over episodes; NaN if there are none."""
         return float(self.returns.mean()) if len(self.returns) else float("nan")
 
 
@@ -92,7 +92,7 @@ def _describe(leaf: Leaf, frames: Frames) -> Column:
     values = np.asarray(frames).reshape(len(frames), leaf.size).astype(np.float64)
     finite = np.isfinite(values)
     kept = np.where(finite, values, 0.0)
-    # 0 / 0 is NaN: of no finite value there is no mean.
+    # An element without finite values has the mean 0 / 0 = NaN.
     with np.errstate(all="ignore"):
         counts = finite.sum(axis=0)
         mean = kept.sum(axis=0) / counts
@@ -108,7 +108,7 @@ def _describe(leaf: Leaf, frames: Frames) -> Column:
 
 
 def _describe_image(frames: Frames) -> Column:
-    """From the histogram of the pixels, since copies of images as floats would not fit."""
+    """Compute statistics from the pixels' histogram; float copies would not fit into memory."""
     counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
     codes = np.arange(256.0)
     seen = codes[counts > 0] if len(frames) else np.full(1, np.nan)

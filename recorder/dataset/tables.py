@@ -1,7 +1,7 @@
-"""Datasets as tables, for whoever thinks in columns. Needs the extra `tables`.
+"""Datasets as PyArrow tables. Requires the extra `tables`.
 
-Vectors become a column per number, `observation.<name>` or `observation.<index>`; arrays of more
-than MAX_COLUMNS numbers, images among them, one column of flat lists.
+A vector becomes one column per element, `observation.<name>` or `observation.<index>`; an array of
+more than MAX_COLUMNS elements, such as an image, becomes one column of flat lists.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MAX_COLUMNS = 64
 
 
 def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: LogMetadata) -> Any:
-    """One row per transition, with the observation there and the next one."""
+    """Return a table with one row per transition, including both observations."""
     pyarrow = import_extra("pyarrow", "tables")
     step_frames = columns.frame_of_step()
     lengths = columns.lengths
@@ -51,7 +51,7 @@ def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: 
 
 
 def episode_table(columns: Transitions) -> Any:
-    """One row per episode: what `/rl/episode` tells, numbered in this dataset's order."""
+    """Return a table with one episode summary per row, numbered in the dataset's order."""
     pyarrow = import_extra("pyarrow", "tables")
     rows = [episode._asdict() | {"episode": k} for k, episode in enumerate(columns.episodes)]
     return pyarrow.Table.from_pylist(rows)

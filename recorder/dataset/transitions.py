@@ -1,8 +1,8 @@
-"""The columns of a log in memory: each observation once, the rest once per transition.
+"""The columns of a dataset: one row per observation, and one per transition for the rest.
 
-With E episodes of N transitions in all there are F = N + E frames: the observations of an episode
-and its last one, episode after episode. The next observation of a transition is the frame behind
-its own, so nothing is stored twice.
+E episodes with N transitions in total have F = N + E frames: each episode's T + 1 observations, in
+order. The next observation of a transition is the frame after its own, so no observation is stored
+twice.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Transitions:
     """Columns of whole episodes.
 
     Attributes:
-        frames: for each leaf of the observation space, (F, *shape).
+        frames: (F, *shape) for each leaf of the observation space.
         log_time_ns: (F,) int64, nanoseconds since the Unix epoch.
         actions: (N,) or (N, *shape).
         rewards: (N,) float64.
         terminated: (N,) bool.
         truncated: (N,) bool.
         behavior_probs: (N,) float32; NaN where unknown.
-        episodes: one for each, in order; their lengths say where they are.
+        episodes: Summaries of the episodes, in order; their lengths give the episodes' rows.
     """
 
     frames: tuple[Frames, ...]
@@ -43,38 +43,38 @@ class Transitions:
     episodes: tuple[EpisodeSummary, ...]
 
     def __post_init__(self) -> None:
-        """Make sure that the columns belong together."""
+        """Check that the columns' lengths agree."""
         steps = sum(episode.length for episode in self.episodes)
         for name in ("actions", "rewards", "terminated", "truncated", "behavior_probs"):
-            assert len(getattr(self, name)) == steps, f"{name} has not {steps} rows"
+            assert len(getattr(self, name)) == steps, f"{name} does not have {steps} rows"
         for frames in (*self.frames, self.log_time_ns):
             assert len(frames) == steps + len(self.episodes), "frames and episodes do not agree"
 
     @property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) transitions of each episode."""
+        """(E,) number of transitions of each episode."""
         return np.array([episode.length for episode in self.episodes], np.int64)
 
     @property
     def first_steps(self) -> NDArray[np.int64]:
-        """(E,) the first transition of each episode."""
+        """(E,) index of each episode's first transition."""
         return np.cumsum(self.lengths) - self.lengths
 
     @property
     def first_frames(self) -> NDArray[np.int64]:
-        """(E,) the first frame of each episode."""
+        """(E,) index of each episode's first frame."""
         return self.first_steps + np.arange(len(self.episodes))
 
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) the frame of each transition's observation; the next one's is one more."""
+        """(N,) frame index of each transition's observation; + 1 for the next observation."""
         episode_of_step = np.repeat(np.arange(len(self.episodes)), self.lengths)
         return np.arange(len(self.rewards)) + episode_of_step
 
     def take(self, chosen: Sequence[int]) -> Transitions:
         """Copy some episodes, in the order given."""
         rows = np.array(chosen, np.int64)
-        steps = spans(self.first_steps[rows], self.lengths[rows])
-        frames = spans(self.first_frames[rows], self.lengths[rows] + 1)
+        steps = ranges(self.first_steps[rows], self.lengths[rows])
+        frames = ranges(self.first_frames[rows], self.lengths[rows] + 1)
         return Transitions(
             frames=tuple(rows_of(leaf, frames) for leaf in self.frames),
             log_time_ns=self.log_time_ns[frames],
@@ -88,7 +88,7 @@ class Transitions:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Transitions]) -> Transitions:
-        """Several logs' columns, one behind the other."""
+        """Concatenate the columns of several datasets."""
         if len(parts) == 1:
             return parts[0]
         names = ("log_time_ns", "actions", "rewards", "terminated", "truncated", "behavior_probs")
@@ -100,7 +100,7 @@ class Transitions:
         )
 
 
-def spans(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The indexes of spans, one behind the other."""
+def ranges(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the concatenated indexes of ranges that start at `starts` and have these lengths."""
     ends = np.cumsum(lengths)
     return np.repeat(starts - (ends - lengths), lengths) + np.arange(int(lengths.sum()))

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.episodes import COUNTERS, Told, episode_lengths, of_records, summaries
+from mcaprl.recorder.dataset.episodes import (
+    COUNTERS,
+    EpisodeTopic,
+    episode_lengths,
+    summaries,
+    summaries_of_records,
+)
 from mcaprl.recorder.dataset.log_reader import LogReader, described
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import (
@@ -169,11 +175,11 @@ class EpisodeCheck:
         """What `/rl/episode` tells, against the records."""
         columns = self._columns
         finals = np.cumsum(lengths + 1) - 1
-        told = Told(Topic(self._reader, EPISODE_TOPIC)).summaries(columns[LOG_TIME][finals])
+        told = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC)).summaries(columns[LOG_TIME][finals])
         if len(told) not in (0, len(lengths)):
             yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
         whole = summaries(self._reader.path, columns, lengths, told)
-        actual = of_records(columns, finals, lengths)
+        actual = summaries_of_records(columns, finals, lengths)
         for number, summary_and_actual in enumerate(zip(whole, actual, strict=True)):
             yield from _check_summary(number, *summary_and_actual)
 

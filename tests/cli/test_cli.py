@@ -106,7 +106,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
         assert estimate["verdict"].startswith("refused: ")
     random = {e["estimator"]: e for e in result["estimates"] if e["policy"] == "random"}
     assert random["PDIS"]["value"] == pytest.approx(result["behavior_return"]), "random acted"
-    assert result["behavior_calibration"]["text"] == "2.00 +- 0.00 of 2 actions"
+    assert result["behavior_calibration"]["text"] == "2.00 +- 0.00 actions; the action space has 2"
     assert result["coverage"]["random"] == pytest.approx(0.5)
     assert result["ranking"]["trusted"] is False
     assert run(ask) == 0

@@ -23,7 +23,7 @@ def test_by_hand() -> None:
         ProbabilityRange(1.25 / 3, 3, 2.0),
         ProbabilityRange(1.0, 1, 0.25),
     )
-    assert str(found) == "2.25 +- 0.63 of 3 actions"
+    assert str(found) == "2.25 +- 0.63 actions; the action space has 3"
 
 
 @pytest.mark.parametrize("epsilon", [0.05, 0.3])
@@ -61,7 +61,7 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
     )
     problems = [finding for finding in lint(data) if "behavior_prob" in finding.what]
     assert [finding.severity for finding in problems] == ["problem"]
-    assert "it speaks of 4.00 +- 0.00 of 2 actions: too many" in problems[0].what
+    assert "4.00 +- 0.00 actions; the action space has 2, so" in problems[0].what
 
 
 def test_what_cannot_be_examined_is_not() -> None:

@@ -105,7 +105,7 @@ def test_episodes(log: Path, asked: Any, meant: list[int]) -> None:
 def test_episodes_that_are_not_there(log: Path, asked: Any) -> None:
     with pytest.raises(UsageError, match="the logs have 5, counted from 0"):
         mcaprl.open(log, episodes=asked)
-    with pytest.raises(UsageError, match="no episodes are asked for"):
+    with pytest.raises(UsageError, match="no episodes are selected"):
         mcaprl.open(log, episodes=[])
 
 
