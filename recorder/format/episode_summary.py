@@ -1,4 +1,4 @@
-"""What `/rl/episode` reports of an episode, and how its rewards are added up."""
+"""The summary of an episode on `/rl/episode`, and the sum of its rewards."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from numpy.typing import NDArray
 from mcaprl.recorder.format import messages
 
 INTERRUPTED = "interrupted"
-"""Why an episode ended that the recorder, not the environment, broke off."""
+"""End reason of an episode that was ended by the recorder instead of the environment."""
 
 
 class EpisodeSummary(NamedTuple):
-    """What `/rl/episode` tells of one episode.
+    """Summary of one episode: the fields of `/rl/episode`.
 
     Attributes:
-        episode: counted from 0 in its log.
-        length: transitions.
-        total_reward: sum of rewards, in the order they came.
-        terminated: whether the last transition ended in a terminal state.
-        truncated: whether it was cut off.
-        start_time_ns: log_time of the first record.
-        end_time_ns: log_time of the final record.
-        reason: why it ended.
-        policy: who acted.
-        epsilon: its exploration; NaN if unknown.
-        seed: given to reset(); None if none was.
-        options: reset()'s options as JSON; empty if none were given.
+        episode: Index of the episode in its recording, from 0.
+        length: Number of transitions.
+        total_reward: Sum of the rewards, added up in order.
+        terminated: Whether the last transition led to a terminal state.
+        truncated: Whether the episode was truncated.
+        start_time_ns: log_time of the first record, nanoseconds.
+        end_time_ns: log_time of the final record, nanoseconds.
+        reason: Reason of the end.
+        policy: Name of the policy that acted.
+        epsilon: Probability of a random action; NaN if unknown.
+        seed: Seed passed to `reset`; None if there was none.
+        options: Options passed to `reset`, as JSON; empty if there were none.
     """
 
     episode: int
@@ -47,11 +47,11 @@ class EpisodeSummary(NamedTuple):
     options: str = ""
 
     def to_message(self) -> bytes:
-        """As `mcaprl_msgs/msg/Episode`, in CDR."""
+        """Encode the summary as an `mcaprl_msgs/msg/Episode` in CDR."""
         return messages.episode_message(**self._asdict())
 
     def log_lines(self) -> list[tuple[int, str]]:
-        """Its start and its end in words, each with its log_time."""
+        """Return the log lines of the episode's start and end, each with its log_time."""
         acting = f", {self.policy} acts" if self.policy else ""
         return [
             (self.start_time_ns, f"episode {self.episode} begins{acting}"),
@@ -64,7 +64,14 @@ class EpisodeSummary(NamedTuple):
 
 
 def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
-    """The sum in order, the same on every machine; `sum` and `np.sum` add in other ways."""
+    """Add up rewards in order, which gives the same bits on every machine.
+
+    `np.sum` adds pairwise and `sum` compensates rounding errors from Python 3.12 on.
+
+    Args:
+        rewards: (T,) rewards.
+        start: Sum of the rewards before these.
+    """
     if start:
         rewards = np.concatenate([[start], rewards])
     return add_up_each(rewards, [0], [len(rewards)])[0]
@@ -73,9 +80,9 @@ def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
 def add_up_each(
     rewards: NDArray[np.float64], starts: Iterable[int], stops: Iterable[int]
 ) -> list[float]:
-    """The sums, likewise, of several spans of rewards."""
+    """Add up the rewards of several ranges [start, stop), each in order."""
     with np.errstate(all="ignore"):
-        # Of nothing but -0.0, too, the sum from 0.0 on is 0.0.
+        # Adding 0.0 turns a sum of -0.0 into 0.0.
         return [
             float(np.add.accumulate(rewards[start:stop])[-1] + 0.0) if start < stop else 0.0
             for start, stop in zip(starts, stops, strict=True)

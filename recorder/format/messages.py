@@ -1,8 +1,8 @@
-"""ROS 2 messages of no fixed length: episodes, log lines, markers, frames.
+"""ROS 2 messages of variable length: episodes, log lines, markers, frames.
 
-Everything here is for topics with few messages, or that only viewers read; rosbags encodes them,
-but for the three that each episode ends with: a recorder is waited for. Transitions and images go
-another way (`schema`, `message_records`).
+These topics have few messages or are read by viewers only, so rosbags encodes them, except for the
+messages at each episode's end, which are encoded here because the environment waits for them.
+Transitions and images are encoded as fixed-size rows (`schema`).
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from mcaprl.errors import CorruptLogError
 LOG_TYPE = "rcl_interfaces/msg/Log"
 EPISODE_TYPE = "mcaprl_msgs/msg/Episode"
 EPISODE_TEXT = """\
-# One episode, told at its end.
+# One episode, written at its end.
 float64 total_reward
 # Nanoseconds: log_time of the episode's first and last record.
 int64 start_time_ns
 int64 end_time_ns
-# Given to reset(); -1 if none was.
+# Passed to reset(); -1 if none.
 int64 seed
-# NaN if the policy explores in no such way.
+# Probability of a random action; NaN if unknown.
 float64 epsilon
 uint32 episode
-# Transitions.
+# Number of transitions.
 uint32 length
 bool terminated
 bool truncated
-# Why it ended, in the simulator's words.
+# Reason of the end, as the environment reported it.
 string reason
-# Who acted.
+# Name of the policy that acted.
 string policy
-# reset()'s options as JSON.
+# Options passed to reset(), as JSON.
 string options
 """
 _INFO = 20
-# CDR: the encapsulation header, then fields, aligned counting from behind it.
+# CDR: the encapsulation header, then the fields, aligned relative to the end of the header.
 _ENCAPSULATION = b"\0\1\0\0"
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """ROS 2 message types, and ours."""
+    """Return the type store with ROS 2 message types and ours."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(EPISODE_TEXT, EPISODE_TYPE))
     return store
@@ -56,33 +56,33 @@ def typestore() -> Typestore:
 
 @lru_cache
 def definition(type_name: str) -> str:
-    """The `ros2msg` text of a type, with those that it nests."""
+    """Return the `ros2msg` definition of a type, including nested types."""
     if type_name == EPISODE_TYPE:
         return EPISODE_TEXT
     return typestore().generate_msgdef(type_name, ros_version=2)[0]
 
 
 def new(type_name: str, **fields: Any) -> Any:
-    """Make a message; `package/msg/Type` names its type."""
+    """Create a message of type `package/msg/Type`."""
     return typestore().types[type_name](**fields)
 
 
 def encode(message: Any) -> bytes:
-    """A message as CDR bytes."""
+    """Encode a message as CDR bytes."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """CDR bytes as a message.
+    """Decode CDR bytes.
 
     Raises:
-        CorruptLogError: they do not fit the type.
+        CorruptLogError: The bytes do not fit the type.
     """
     try:
         return typestore().deserialize_cdr(data, type_name)
-    # The library raises whatever its parsing meets; none of it is more than "does not fit".
+    # The library raises many types of errors; each means that the bytes do not fit.
     except Exception as error:
-        raise CorruptLogError(f"{len(data)} bytes are no {type_name}: {error}") from error
+        raise CorruptLogError(f"{len(data)} bytes are not a {type_name}: {error}") from error
 
 
 def episode_message(
@@ -100,28 +100,27 @@ def episode_message(
     policy: str,
     options: str,
 ) -> bytes:
-    """Fields of `EPISODE_TEXT` as CDR bytes; a `seed` of None is none."""
-    told_seed = -1 if seed is None else seed
-    times, counts = (start_time_ns, end_time_ns, told_seed), (episode, length)
+    """Encode the fields of `EPISODE_TEXT` as CDR bytes; a `seed` of None is stored as -1."""
+    times, counts = (start_time_ns, end_time_ns, -1 if seed is None else seed), (episode, length)
     data = bytearray(_ENCAPSULATION)
     data += _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
-    return bytes(_with_texts(data, reason, policy, options))
+    return bytes(_append_strings(data, reason, policy, options))
 
 
 def log_message(time_ns: int, text: str) -> bytes:
-    """An `rcl_interfaces/msg/Log` that informs, as CDR bytes."""
+    """Encode an `rcl_interfaces/msg/Log` of level INFO as CDR bytes."""
     data = bytearray(_ENCAPSULATION)
     sec, nanosec = divmod(time_ns, 10**9)
-    # Behind 2038, ROS's seconds start anew; the record's log_time does not.
+    # ROS's 32-bit seconds wrap around; the record's log_time does not.
     data += _LOG_START.pack(sec % 2**32, nanosec, _INFO)
-    _with_texts(data, "mcaprl", text, "", "")
-    # The line of the code that it comes from.
+    _append_strings(data, "mcaprl", text, "", "")
+    # The field `line`: 0.
     data += bytes(-len(data) % 4 + 4)
     return bytes(data)
 
 
-def _with_texts(data: bytearray, *texts: str) -> bytearray:
-    """Append strings: length, characters and NUL, each from a multiple of four bytes on."""
+def _append_strings(data: bytearray, *texts: str) -> bytearray:
+    """Append CDR strings: length, characters and NUL, each aligned to four bytes."""
     for text in texts:
         encoded = text.encode() + b"\0"
         data += bytes(-len(data) % 4)
@@ -131,11 +130,11 @@ def _with_texts(data: bytearray, *texts: str) -> bytearray:
 
 
 def stamp(time_ns: int) -> Any:
-    """A `builtin_interfaces/msg/Time`."""
+    """Create a `builtin_interfaces/msg/Time`."""
     sec, nanosec = divmod(time_ns, 10**9)
     return new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
 def header(time_ns: int, frame_id: str) -> Any:
-    """A `std_msgs/msg/Header`."""
+    """Create a `std_msgs/msg/Header`."""
     return new("std_msgs/msg/Header", stamp=stamp(time_ns), frame_id=frame_id)

@@ -1,19 +1,19 @@
-"""What a log says of itself, so that it opens without the simulator that made it.
+"""Metadata of a log, so that it opens without the simulator that it was recorded from.
 
-It is the metadata record `mcaprl.dataset`, the first after the file's header, and again the channel
-metadata of `/rl/step`. Both are maps of strings; what is not text is JSON.
+It is stored twice: as the metadata record `mcaprl.dataset`, the first record after the header, and
+as the channel metadata of `/rl/step`. Both are maps of strings; other values are JSON.
 
     format_version      "1"
-    env_id              Gymnasium id, empty if there is none
-    env_kwargs          JSON object: arguments to gymnasium.make
+    env_id              Gymnasium id; empty if unknown
+    env_kwargs          JSON object: keyword arguments of gymnasium.make
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
-    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": place};
-                        follows from the space (`spaces.observation_leaves`)
-    observation_names   JSON list, a name for each number of a vector observation; may be empty
-    action_meanings     JSON list, a name for each discrete action; may be empty
+    observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": name};
+                        derived from the space by `spaces.observation_leaves`
+    observation_names   JSON list of names of a vector observation's elements; may be empty
+    action_meanings     JSON list of names of the discrete actions; may be empty
     step_duration_ns    simulated time between two records
-    policy, epsilon, seed   that the recording began with; empty if unknown
+    policy, epsilon, seed   values at the start of the recording; empty if unknown
     versions            JSON object: package -> version
 """
 
@@ -35,7 +35,7 @@ from mcaprl.recorder.format.spaces import leaves_of, space_from_json, space_to_j
 
 FORMAT_VERSION = "1"
 METADATA_NAME = "mcaprl.dataset"
-# What recordings that share a file must agree on; the rest may change, and tells of the first one.
+# Fields that all recordings in one file share; the others describe the first recording.
 SAME_WHEN_APPENDED = (
     "format_version",
     "env_id",
@@ -47,7 +47,7 @@ SAME_WHEN_APPENDED = (
     "step_duration_ns",
 )
 DEFAULT_STEP_DURATION_NS = 100_000_000
-# What a spec says of drawing, and of how environments are brought together.
+# Arguments of a spec that concern rendering or vectorization.
 _NOT_OF_ONE_ENV = (
     "render_mode",
     "num_envs",
@@ -61,20 +61,20 @@ _VERSIONED = ("gymnasium", "numpy", "numba", "highway-env")
 
 @dataclass(frozen=True)
 class LogMetadata:
-    """The description of a log.
+    """Metadata of a log.
 
     Attributes:
-        observation_space: of the environment.
-        action_space: of the environment.
-        env_id: Gymnasium id; empty if unknown.
-        env_kwargs: arguments to `gymnasium.make`; JSON types only.
-        observation_names: one for each number of a vector observation, or empty.
-        action_meanings: one for each discrete action, or empty.
-        step_duration_ns: simulated time between two records.
-        policy: who acted at first; each episode tells its own.
-        epsilon: its exploration, as text; empty if unknown.
-        seed: of the recording, as text; empty if unknown.
-        versions: of the packages that the recording ran with.
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        env_id: Gymnasium id of the environment; empty if unknown.
+        env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
+        observation_names: Names of a vector observation's elements; empty if unknown.
+        action_meanings: Names of the discrete actions; empty if unknown.
+        step_duration_ns: Simulated time between two records, nanoseconds.
+        policy: Name of the first policy; each episode's summary names its own.
+        epsilon: Probability of a random action, as text; empty if unknown.
+        seed: Seed of the recording, as text; empty if unknown.
+        versions: Versions of the packages that the recording ran with.
     """
 
     observation_space: spaces.Space[Any]
@@ -90,9 +90,9 @@ class LogMetadata:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def action_names(self) -> dict[int, str]:
-        """A name for each discrete action: its meaning if each has another one, else its number.
+        """Return the names of the discrete actions by value; empty for other action spaces.
 
-        Empty for spaces of another kind.
+        A name is the action's meaning if all meanings are distinct, otherwise its number.
         """
         space = self.action_space
         if not isinstance(space, spaces.Discrete):
@@ -104,7 +104,7 @@ class LogMetadata:
         return dict(zip(values, meanings, strict=True))
 
     def to_strings(self) -> dict[str, str]:
-        """The map that is written to the file."""
+        """Return the map that is written to the file."""
         fields = [
             {
                 "path": leaf.path,
@@ -130,14 +130,14 @@ class LogMetadata:
 
     @classmethod
     def from_strings(cls, strings: Mapping[str, str]) -> LogMetadata:
-        """Read the map from a file.
+        """Parse the map that was read from a file.
 
         Raises:
-            LogError: a later format version, or a value that does not parse.
+            LogError: The format version is newer, or a value cannot be parsed.
         """
         found = strings.get("format_version")
         if found is None:
-            raise LogError(f"no metadata record '{METADATA_NAME}': the spaces are not known")
+            raise LogError(f"no metadata record '{METADATA_NAME}': the spaces are unknown")
         if found != FORMAT_VERSION:
             raise LogError(
                 f"format version {found}; mcaprl {__version__} reads {FORMAT_VERSION}:"
@@ -158,11 +158,13 @@ class LogMetadata:
                 versions=json.loads(strings.get("versions", "{}")),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
-            raise LogError(f"metadata record '{METADATA_NAME}' does not parse: {error}") from error
+            raise LogError(
+                f"metadata record '{METADATA_NAME}' cannot be parsed: {error}"
+            ) from error
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """What several descriptions agree on; the spaces must be the same."""
+        """Keep the fields that are equal in all parts; the spaces have to be equal."""
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
         differing = {
@@ -182,11 +184,11 @@ class LogMetadata:
         epsilon: str = "",
         seed: str = "",
     ) -> LogMetadata:
-        """Describe an environment: its spaces, id and arguments, and its own names for things.
+        """Create the metadata of an environment's recording.
 
-        A vector environment is described as one of those in it. The time of a step is, in this
-        order: the argument, the environment's `step_duration_s`, one over `metadata["render_fps"]`,
-        0.1 s.
+        A vector environment is described by one of its sub-environments. The duration of a step is
+        the first that is known of: the argument, the environment's `step_duration_s`,
+        1 / `metadata["render_fps"]`, 0.1 s.
         """
         one = _one_of(env)
         inner = one.unwrapped
@@ -214,11 +216,11 @@ class LogMetadata:
 
 
 def _one_of(env: Any) -> Any:
-    """An environment that shows what all of a vector are, if they live in this process."""
+    """Return a sub-environment of a vector environment, if there is one in this process."""
     if not isinstance(env, gym.vector.VectorEnv):
         return env
     inner = env.unwrapped
-    # Wrappers of the vector may have changed the spaces that its members know.
+    # Wrappers of the vector environment may have changed the spaces of the sub-environments.
     same = inner.single_observation_space == env.single_observation_space and (
         inner.single_action_space == env.single_action_space
     )
@@ -227,19 +229,19 @@ def _one_of(env: Any) -> Any:
 
 
 def _names(env: object, attribute: str) -> tuple[str, ...]:
-    """Names that an environment has for things; others mean methods by the same word."""
+    """Return a list of names that the environment has as an attribute, otherwise nothing."""
     found = getattr(env, attribute, ())
     return tuple(map(str, found)) if isinstance(found, list | tuple) else ()
 
 
 def installed_versions() -> dict[str, str]:
-    """Versions of what a recording depends on."""
+    """Return the versions of the packages that a recording depends on."""
     return dict(_installed_versions())
 
 
 @lru_cache(maxsize=1)
 def _installed_versions() -> tuple[tuple[str, str], ...]:
-    # Each is read from a file; together they would take most of the time to begin a log.
+    # Cached: each version is read from a file, which would dominate the time to open a log.
     found = {"mcaprl": __version__}
     for package in _VERSIONED:
         try:

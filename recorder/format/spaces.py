@@ -1,8 +1,8 @@
-"""Gymnasium spaces as the log sees them: JSON text, and a flat list of leaves.
+"""Gymnasium spaces in a log: as JSON text, and as a flat list of leaves.
 
-A leaf is one array of an observation or action. A Dict space has one per key, any other supported
-space is a single leaf. Supported are Box, Discrete, MultiDiscrete, MultiBinary and, for
-observations, Dict of these at any depth.
+A leaf is one array of an observation or action. A Dict space has one leaf per key; any other
+supported space is a single leaf. Supported spaces are Box, Discrete, MultiDiscrete, MultiBinary
+and, for observations, Dict spaces of these at any depth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UnknownNameError
 
-# The smallest edge that makes a uint8 array a picture rather than a vector; SB3 draws no line, its
+# Smallest height and width of a uint8 array that is treated as an image. SB3 has no such limit; its
 # Nature CNN needs 36.
 MIN_IMAGE_EDGE = 8
 IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
@@ -31,11 +31,11 @@ class Leaf:
     """One array of an observation or action.
 
     Attributes:
-        name: the field's name in `/rl/step`, or the last part of an image's topic.
-        path: keys that lead to it from the root of a Dict space; empty for the root itself.
-        shape: of one value; empty for a scalar.
-        dtype: of the values that the environment gives.
-        encoding: of an image (`mono8`, `rgb8`, `rgba8`); None for anything else.
+        name: Name of the field in `/rl/step`, or last part of an image's topic.
+        path: Keys from the root of a Dict space to the leaf; empty for the root itself.
+        shape: Shape of one value; empty for a scalar.
+        dtype: Data type of the environment's values.
+        encoding: Encoding of an image (`mono8`, `rgb8`, `rgba8`); None for any other leaf.
     """
 
     name: str
@@ -46,38 +46,38 @@ class Leaf:
 
     @property
     def size(self) -> int:
-        """How many numbers one value has."""
+        """Number of elements of one value."""
         return math.prod(self.shape)
 
     @property
     def topic(self) -> str:
-        """Where an image leaf's messages go."""
+        """Topic of an image leaf."""
         return f"/rl/observation/{self.name}"
 
     def of(self, observation: Any) -> Any:
-        """Follow the path into an observation."""
+        """Return the leaf's part of an observation."""
         for key in self.path:
             observation = observation[key]
         return observation
 
 
 def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the arrays of an observation space that is to be logged, in the space's own order.
+    """List the leaves of an observation space, in the space's order.
 
     Raises:
-        SpaceError: there are none, or a part of it is of a kind that a log cannot hold.
+        SpaceError: The space has no leaves, or a part of a kind that a log cannot store.
     """
     found = leaves_of(space)
     if not found:
-        raise SpaceError("the observation is an empty Dict space; a log needs something to hold")
+        raise SpaceError("the observation space is an empty Dict: there is nothing to record")
     return found
 
 
 def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the arrays of an observation space, in the space's own order; none of an empty Dict.
+    """List the leaves of an observation space, in the space's order; none for an empty Dict.
 
     Raises:
-        SpaceError: a part of it is of a kind that a log cannot hold.
+        SpaceError: A part of the space is of a kind that a log cannot store.
     """
     taken: set[str] = set()
     found: list[Leaf] = []
@@ -91,14 +91,14 @@ def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
-    """The leaves of a Dict space that keys mean: `joints/q`, or `joints` for all below it.
+    """Select leaves of a Dict space by key: `joints/q`, or `joints` for all leaves below it.
 
     Args:
-        leaves: to choose from.
-        keys: default: all.
+        leaves: Leaves to select from.
+        keys: Keys to select; default: all.
 
     Raises:
-        UnknownNameError: a key means none.
+        UnknownNameError: A key matches no leaf.
     """
     if keys is None:
         return list(leaves)
@@ -110,7 +110,7 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
 
 
 def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
-    """A Dict space of just these leaves of a Dict space; empty of none."""
+    """Return a Dict space with only these leaves of a Dict space."""
     groups: dict[str, list[Leaf]] = {}
     for leaf in leaves:
         groups.setdefault(leaf.path[0], []).append(replace(leaf, path=leaf.path[1:]))
@@ -124,17 +124,17 @@ def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
 
 
 def action_leaf(space: spaces.Space[Any]) -> Leaf:
-    """The one array of an action space.
+    """Return the single leaf of an action space.
 
     Raises:
-        SpaceError: the space is a Dict, or of a kind that a log cannot hold.
+        SpaceError: The space is a Dict, or of a kind that a log cannot store.
     """
     shape, dtype = _shape_and_dtype(space, "action", ())
     return Leaf("action", (), shape, dtype)
 
 
 def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
-    """Put the leaves' arrays back into the space's own form: one array, or nested dicts."""
+    """Arrange the leaves' arrays in the structure of the space: one array, or nested dicts."""
     if leaves and leaves[0].path == ():
         return arrays[0]
     nested: dict[str, Any] = {}
@@ -147,10 +147,10 @@ def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
 
 
 def space_to_json(space: spaces.Space[Any]) -> str:
-    """Write a space as JSON text; `space_from_json` gives an equal space.
+    """Write a space as JSON text; `space_from_json` reads back an equal space.
 
     Raises:
-        SpaceError: the space, or a part of it, is of a kind that a log cannot hold.
+        SpaceError: The space, or a part of it, is of a kind that a log cannot store.
     """
     return json.dumps(_to_plain(space))
 
@@ -159,13 +159,13 @@ def space_from_json(text: str) -> spaces.Space[Any]:
     """Read a space that `space_to_json` wrote.
 
     Raises:
-        SpaceError: the text describes no space.
+        SpaceError: The text does not describe a space.
     """
     try:
         return _from_plain(json.loads(text))
-    # NumPy and Gymnasium raise whatever they meet; none of it is more than "no space".
+    # NumPy and Gymnasium raise many types of errors; each means that the text is invalid.
     except Exception as error:
-        raise SpaceError(f"no description of a space: {text[:80]!r}") from error
+        raise SpaceError(f"not a description of a space: {text[:80]!r}") from error
 
 
 def _is_below(name: str, key: str) -> bool:
@@ -191,18 +191,18 @@ def _shape_and_dtype(
     ):
         allowed = "Box, Discrete, MultiDiscrete, MultiBinary"
         allowed += ", or a Dict of these" if role == "observation" else ""
-        raise SpaceError(f"{where} is a {type(space).__name__} space; a log can hold {allowed}")
+        raise SpaceError(f"{where} is a {type(space).__name__} space; a log can store {allowed}")
     shape = tuple(space.shape or ())
     if math.prod(shape) == 0:
-        raise SpaceError(f"{where} has shape {shape}, no numbers at all; leave it out of the space")
+        raise SpaceError(f"{where} has shape {shape}, so no elements; leave it out of the space")
     dtype = np.dtype(space.dtype)
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
-        raise SpaceError(f"{where} has dtype {dtype}; a log can hold bool, integers and floats")
+        raise SpaceError(f"{where} has dtype {dtype}; a log can store bool, integers and floats")
     return shape, dtype
 
 
 def _image_encoding(space: spaces.Space[Any]) -> str | None:
-    """The encoding of an image space: uint8, (height, width) or (height, width, 1 | 3 | 4)."""
+    """Return the encoding of a uint8 image space (height, width[, 1 | 3 | 4]), otherwise None."""
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return None
     if len(space.shape) not in (2, 3) or min(space.shape[:2]) < MIN_IMAGE_EDGE:
@@ -211,7 +211,7 @@ def _image_encoding(space: spaces.Space[Any]) -> str | None:
 
 
 def _field_name(words: tuple[str, ...], taken: set[str]) -> str:
-    """A ROS field name: lower case letters, digits and single underscores."""
+    """Build a unique ROS field name: lower-case letters, digits and single underscores."""
     plain = [re.sub(r"[^a-z0-9]+", "_", str(word).lower()).strip("_") or "x" for word in words]
     name = candidate = "_".join(plain)
     if not name[0].isalpha():
@@ -274,8 +274,8 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
 
 
 def _numbers(bounds: NDArray[Any]) -> Any:
-    """Bounds as JSON: a single number where all are equal; infinities as strings."""
-    # Of pictures there are many, and nearly always they are one.
+    """Return bounds as JSON: a single number if all are equal; infinities as strings."""
+    # The bounds of images are many numbers and nearly always equal: avoid the list.
     if bounds.size and (bounds == bounds.flat[0]).all():
         return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]

@@ -6,10 +6,11 @@ STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
 LEARNER_TOPIC = "/rl/learner"
 LOG_TOPIC = "/rosout"
-# Rows of /rl/step in a chunk, and images in one of theirs: as many, or as few as have this size.
+# A chunk has this many rows of /rl/step or this many images, or fewer if they exceed this size.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
 BYTES_PER_CHUNK = 8 * 2**20
-# A transition that stays behind, one that is new, and one more to make way.
+# Smallest number of rows in a buffer: the last transition, which stays in memory because its
+# episode may end there, a new one, and one more.
 MIN_ROWS = 3
 IMAGE_FRAME = "camera"

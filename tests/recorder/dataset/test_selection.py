@@ -66,7 +66,7 @@ def test_no_observations_at_all(log: Path, tmp_path: Path) -> None:
     assert none.observations == {}
     assert_same_bits(none.rewards, mcaprl.open(log).rewards)
     assert [episode.length for episode in none.episodes] == LENGTHS
-    with pytest.raises(SpaceError, match="a log needs something to hold"):
+    with pytest.raises(SpaceError, match="there is nothing to record"):
         none.save(tmp_path / "none.mcap")
 
 

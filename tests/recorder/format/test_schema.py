@@ -162,7 +162,7 @@ def test_what_a_log_cannot_hold() -> None:
     cases = [
         (spaces.Tuple([discrete]), "observation is a Tuple space"),
         (spaces.Dict({"x": spaces.Graph(discrete, None)}), r"observation\['x'\] is a Graph space"),
-        (spaces.Box(-1, 1, (0,)), "no numbers at all"),
+        (spaces.Box(-1, 1, (0,)), "so no elements"),
         (spaces.Dict({}), "empty Dict"),
     ]
     for space, message in cases:
