@@ -20,12 +20,12 @@ from mcaprl.recorder.record.display import SCENE
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.recorder.viewer.verify import verify
 from mcaprl.recorder.viewer.video import (
-    FILM_KINDS,
+    VIDEO_KINDS,
     check_output,
-    filmed,
-    spread,
-    write_film,
+    evenly_spaced,
+    shown_steps,
     write_sheet,
+    write_video,
 )
 
 Pictures = Iterator[NDArray[np.uint8]]
@@ -43,20 +43,20 @@ def make_film(
     overwrite: bool,
 ) -> None:
     """Draw one episode of a log, from its scene or, without one, as the sim draws itself."""
-    for out, kinds in ((video, FILM_KINDS), (sheet, (".png",))):
+    for out, kinds in ((video, VIDEO_KINDS), (sheet, (".png",))):
         if out is not None:
             check_output(out, kinds, overwrite=overwrite)
     dataset = open_logs(path)
     episode = dataset.episodes[number]
     if video is not None:
         step_ns = float(np.median(np.diff(episode.log_time_ns)))
-        shown, pictures_per_s = filmed(episode.length, speed * 1e9 / step_ns)
+        shown, pictures_per_s = shown_steps(episode.length, speed * 1e9 / step_ns)
         with progress(f"drawing {video}", len(shown)) as advance:
             pictures = _ticking(_pictures(path, dataset, episode, shown, sim), advance)
-            count = write_film(video, pictures, pictures_per_s)
+            count = write_video(video, pictures, pictures_per_s)
         click.echo(f"{video}: {count} pictures of episode {number}")
     if sheet is not None:
-        steps = spread(episode.length, STILLS)
+        steps = evenly_spaced(episode.length, STILLS)
         write_sheet(sheet, list(_pictures(path, dataset, episode, steps, sim)))
         click.echo(f"{sheet}: {len(steps)} stills of episode {number}")
 

@@ -1,4 +1,4 @@
-"""A server of the Foxglove protocol on this machine, and the channels that viewers find there."""
+"""A server of the Foxglove WebSocket protocol on 127.0.0.1, and its channels."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ DEFAULT_PORT = 8765
 
 
 class ViewerServer:
-    """Listens on 127.0.0.1 only, once it is started.
+    """Foxglove server that listens on 127.0.0.1 only.
 
     Attributes:
-        foxglove: the module.
-        websocket: its part for servers.
+        foxglove: The module `foxglove`.
+        websocket: The module `foxglove.websocket`.
     """
 
     def __init__(self) -> None:
-        """Make one without channels.
+        """Create a server without channels; `start` opens the port.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -39,7 +39,7 @@ class ViewerServer:
         encoding: str = "cdr",
         schema_encoding: str = "ros2msg",
     ) -> Any:
-        """Announce a topic; the channel has `log(data, log_time=...)` and `has_sinks()`."""
+        """Advertise a topic; returns a channel with `log(data, log_time=...)` and `has_sinks()`."""
         schema = self.foxglove.Schema(name=type_name, encoding=schema_encoding, data=definition)
         channel = self.foxglove.Channel(
             topic, message_encoding=encoding, schema=schema, context=self._context
@@ -48,19 +48,19 @@ class ViewerServer:
         return channel
 
     def start(self, name: str, port: int, listener: Any, **options: Any) -> Any:
-        """Begin to listen.
+        """Start the server.
 
         Args:
-            name: that viewers show.
-            port: 0 takes any that is free.
-            listener: told of viewers; see `foxglove.websocket.ServerListener`.
-            **options: more for `foxglove.start_server`.
+            name: Name of the server, as viewers display it.
+            port: Port to listen on; 0 selects a free port.
+            listener: Callbacks for viewers' requests; see `foxglove.websocket.ServerListener`.
+            **options: Further arguments of `foxglove.start_server`.
 
         Returns:
-            Its handle, for `broadcast_time` and so on.
+            Handle of the server, for `broadcast_time` etc.
 
         Raises:
-            UsageError: the port is taken.
+            UsageError: The port is in use.
         """
         try:
             self._server = self.foxglove.start_server(
@@ -78,16 +78,16 @@ class ViewerServer:
 
     @property
     def url(self) -> str:
-        """Where viewers connect."""
+        """WebSocket URL of the server."""
         return f"ws://{HOST}:{self._server.port}"
 
     @property
     def app_url(self) -> str:
-        """A link that opens Foxglove with it."""
+        """Link that opens Foxglove connected to the server."""
         return str(self._server.app_url())
 
     def close(self) -> None:
-        """Say goodbye to all viewers."""
+        """Stop the server and close its channels."""
         if self._server is not None:
             self._server.stop()
         for channel in self._channels:

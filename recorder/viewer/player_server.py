@@ -1,7 +1,7 @@
-"""A live server that plays logs to Foxglove, and obeys its play button, its speed and its seek bar.
+"""A live server that plays logs to Foxglove, with play, pause, speed and seek.
 
-Messages are passed on as they stand in the file. Where several logs play at once, those that name
-frames are written anew, for two cars must not both be called `car`.
+Messages are sent as they are stored in the file. If several logs are played at once, messages that
+name frames are re-encoded with a prefix per log, so that the frames of two cars differ.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ _PERIOD_S = 1 / 30
 
 
 class LiveServer:
-    """Plays to whoever connects; the clock begins to run when the first viewer looks.
+    """Server that plays logs to all connected viewers; the clock starts with the first subscriber.
 
-    Viewers find two parameters: `episode`, to jump to one's start, and `loop`.
+    Viewers can set two parameters: `episode`, which seeks to the episode's start, and `loop`.
     """
 
     def __init__(
@@ -33,18 +33,18 @@ class LiveServer:
         name: str = "mcaprl",
         port: int = DEFAULT_PORT,
     ) -> None:
-        """Start to listen.
+        """Start the server.
 
         Args:
-            player: what is played.
-            prefixes: of each log's topics; empty for none.
-            episode_starts_ns: on the player's clock.
-            name: that viewers show.
-            port: 0 takes any that is free.
+            player: Clock and messages of the logs.
+            prefixes: Prefix of each log's topics; empty for no prefix.
+            episode_starts_ns: Start of each episode on the player's clock, nanoseconds.
+            name: Name of the server, as viewers display it.
+            port: Port to listen on; 0 selects a free port.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
-            UsageError: the port is taken.
+            UsageError: The port is in use.
         """
         self._viewers = ViewerServer()
         self._foxglove, self._ws = self._viewers.foxglove, self._viewers.websocket
@@ -67,12 +67,12 @@ class LiveServer:
 
     @property
     def url(self) -> str:
-        """Where viewers connect."""
+        """WebSocket URL of the server."""
         return self._viewers.url
 
     @property
     def app_url(self) -> str:
-        """A link that opens Foxglove with it."""
+        """Link that opens Foxglove connected to the server."""
         return self._viewers.app_url
 
     def run(self, stop: threading.Event) -> None:
@@ -81,7 +81,7 @@ class LiveServer:
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send what has become due."""
+        """Send the messages that have become due."""
         with self._lock:
             restarts = self._player.ended and self._player.loops and self._player.playing
             if restarts:
@@ -93,9 +93,10 @@ class LiveServer:
             due += self._player.advance(elapsed_s)
             time_ns, stopped = self._player.time_ns, was_playing and not self._player.playing
             state = self._state(did_seek=restarts)
-            # Nobody seeks until all is sent, or messages of the old place would follow the answer.
+            # The lock is held until everything is sent: messages from before a seek must not
+            # follow the answer to it.
             if restarts:
-                # Viewers without a seek bar throw away what they have drawn, and begin anew.
+                # Viewers without a seek bar drop what they have drawn.
                 self._server.clear_session()
             for message in due:
                 self._send(message)
@@ -104,7 +105,7 @@ class LiveServer:
                 self._server.broadcast_playback_state(state)
 
     def close(self) -> None:
-        """Say goodbye to all viewers."""
+        """Stop the server."""
         self._viewers.close()
 
     def on_playback_control_request(self, request: Any) -> Any:
@@ -123,24 +124,24 @@ class LiveServer:
             return self._state(did_seek=self._seeked, request_id=request.request_id)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Show a new viewer all there is to see, and start the clock for the first one."""
+        """Send a new subscriber the current state, and start the clock for the first one."""
         with self._lock:
             if not self._looked_at:
                 self._looked_at = self._player.playing = True
             self._newly_subscribed = True
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        """Nothing to do: messages go to who asks for them."""
+        """Do nothing: messages are sent to subscribers only."""
 
     def on_get_parameters(self, client: Any, names: list[str], request_id: Any = None) -> list[Any]:
-        """Tell the parameters asked for; all, if none is named."""
+        """Return the requested parameters; all of them if none is named."""
         with self._lock:
             return [p for p in self._parameters() if not names or p.name in names]
 
     def on_set_parameters(
         self, client: Any, parameters: list[Any], request_id: Any = None
     ) -> list[Any]:
-        """Jump to an episode, or loop."""
+        """Seek to an episode, or set whether the player loops."""
         with self._lock:
             for parameter in parameters:
                 value = parameter.get_value()
@@ -151,10 +152,10 @@ class LiveServer:
             return self._parameters()
 
     def on_parameters_subscribe(self, names: list[str]) -> None:
-        """Nothing to do: values are told when they are set."""
+        """Do nothing: values are returned when they are set."""
 
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
-        """Likewise."""
+        """Do nothing."""
 
     def _jump(self, episode: int) -> None:
         if 0 <= episode < len(self._starts_ns):

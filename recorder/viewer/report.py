@@ -1,4 +1,4 @@
-"""A dataset at a glance: a picture for documents, a page to read. Extra: `report`."""
+"""Reports about a dataset: a PNG with histograms and an HTML page. Extra: `report`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mcaprl.recorder.viewer.tracks import Track, tracks_of
 
 _BINS = 30
 _SHOWN_EPISODES: Final = 3
-"""So many of the best, and of the worst."""
+"""Number of best episodes, and of worst episodes, that the page shows."""
 _MAP_CELLS = 80
 _MAX_ROWS = 60
 
@@ -29,21 +29,21 @@ def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
     """Write a PNG with histograms of returns and lengths, and counts of actions and ends.
 
     Args:
-        path: of the PNG; folders above it are made.
-        dataset: to be shown.
-        title: over the picture.
+        path: Path of the PNG; missing parent folders are created.
+        dataset: Dataset to plot.
+        title: Title of the figure.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        ReportError: the file cannot be written.
+        ReportError: The file cannot be written.
     """
     figure, ((returns, lengths), (actions, ends)) = new_figure((9, 6.5), 2, 2)
     statistics = dataset.statistics
     mean = statistics.mean_return
-    _histogram(returns, statistics.returns, f"return of an episode (mean {mean:.4g})")
-    _histogram(lengths, statistics.lengths, "steps of an episode")
+    _histogram(returns, statistics.returns, f"return per episode (mean {mean:.4g})")
+    _histogram(lengths, statistics.lengths, "steps per episode")
     _bars(actions, _actions_taken(dataset), "actions")
-    _bars(ends, statistics.ends, "ends of episodes")
+    _bars(ends, statistics.ends, "end reasons")
     figure.suptitle(title, x=0.02, ha="left", color=INK)
     save_png(figure, path)
 
@@ -55,18 +55,18 @@ def dataset_page(
     facts: Sequence[tuple[str, str]],
     findings: Sequence[Finding],
 ) -> None:
-    """Write a page that shows a dataset: facts, findings, plots, its best and worst episodes.
+    """Write an HTML page about a dataset: facts, findings, plots, best and worst episodes.
 
     Args:
-        path: of the HTML file.
-        dataset: to be shown.
-        title: of the page.
-        facts: names and values, for a table.
-        findings: of `lint`.
+        path: Path of the HTML file.
+        dataset: Dataset to report on.
+        title: Title of the page.
+        facts: Names and values of the table of facts.
+        findings: Findings of `lint`.
 
     Raises:
         MissingExtraError: matplotlib or jinja2 is not installed.
-        ReportError: the file cannot be written.
+        ReportError: The file cannot be written.
     """
     tracks = tracks_of(dataset)
     statistics = dataset.statistics
@@ -75,9 +75,9 @@ def dataset_page(
         f" {dataset.env_id or 'an unknown environment'}"
     )
     sections = [
-        Section("What it is", table=Table(("", ""), facts)),
+        Section("Overview", table=Table(("", ""), facts)),
         _findings_section(findings),
-        Section("What happened", figures=_figures(dataset, tracks)),
+        Section("Episodes", figures=_figures(dataset, tracks)),
         *_calibration_section(dataset),
         Section("Best and worst episodes", cards=_cards(dataset, tracks)),
         Section("Observations", table=_columns(dataset)),
@@ -87,13 +87,13 @@ def dataset_page(
 
 def _findings_section(findings: Sequence[Finding]) -> Section:
     if not findings:
-        return Section("Findings", text="Nothing was found that would spoil learning.")
+        return Section("Findings", text="No problems were found.")
     rows = [(one.severity, one.what, one.where, one.effect) for one in findings]
-    return Section("Findings", table=Table(("", "what", "where", "what it does"), rows))
+    return Section("Findings", table=Table(("", "what", "where", "effect"), rows))
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
-    """Nothing where probabilities are unknown."""
+    """Return the section on behavior probabilities; none if they are unknown."""
     found = calibration(dataset.behavior_probs, dataset.action_space)
     if found is None:
         return []
@@ -101,9 +101,8 @@ def _calibration_section(dataset: Dataset) -> list[Section]:
         (f"{one.probability:.3f}", f"{one.steps / len(dataset):.1%}", f"{one.actions:.2f}")
         for one in found.ranges
     ]
-    table = Table(("behavior_prob", "of the steps", "actions a state has of it"), rows)
-    text = f"The actions taken, each counted 1 / behavior_prob, speak of {found}."
-    return [Section("How likely the actions were", text, table=table)]
+    table = Table(("behavior_prob", "share of steps", "actions per state"), rows)
+    return [Section("Behavior probabilities", f"behavior_prob implies {found}.", table=table)]
 
 
 def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
@@ -111,31 +110,31 @@ def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
     small = (4.4, 2.6)
     found = []
     for caption, values in (
-        (f"Return of an episode, mean {statistics.mean_return:.4g}", statistics.returns),
-        ("Steps of an episode", statistics.lengths),
+        (f"Return per episode, mean {statistics.mean_return:.4g}", statistics.returns),
+        ("Steps per episode", statistics.lengths),
     ):
         figure, axes = new_figure(small)
         _histogram(axes, values, "")
         found.append(Figure.of(caption, figure))
     figure, axes = new_figure(small)
     axes.plot(statistics.returns, ".", color=COLORS[0], ms=4)
-    axes.set_xlabel("episode, as recorded")
-    found.append(Figure.of("Returns in the order of the log", figure))
+    axes.set_xlabel("episode")
+    found.append(Figure.of("Return by episode, in the order of the log", figure))
     for caption, counts in (
         ("Actions taken", _actions_taken(dataset)),
-        ("Why episodes ended", statistics.ends),
+        ("End reasons", statistics.ends),
     ):
         figure, axes = new_figure((small[0], max(1.6, 0.28 * len(counts) + 0.8)))
         _bars(axes, counts, "")
         found.append(Figure.of(caption, figure))
     coverage = _coverage(tracks)
     if coverage is not None:
-        found.append(Figure.of("Where the steps were, metres; darker is more", coverage))
+        found.append(Figure.of("Positions in meters; darker cells have more steps", coverage))
     return found
 
 
 def _coverage(tracks: Sequence[Track]) -> Any:
-    """A map of how many steps were where; None if the log tells no places."""
+    """Plot the number of steps at each position; None if the log has no positions."""
     places = np.concatenate([np.empty((0, 2)), *tracks])
     if not len(places):
         return None
@@ -160,7 +159,7 @@ def _cards(dataset: Dataset, tracks: Sequence[Track]) -> list[Card]:
 
 
 def _commands(dataset: Dataset) -> list[str]:
-    """What replays each episode; empty where the files do not tell which it is."""
+    """Return the command that replays each episode; empty if an episode's file is unknown."""
     counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
     if sum(counts) != len(dataset.episodes):
         return [""] * len(dataset.episodes)
@@ -181,7 +180,7 @@ def _card(kind: str, episode: Episode, track: Track, places: Track, command: str
 
 
 def _thumbnail(episode: Episode, track: Track, places: Track) -> str:
-    """The way of an episode on the map of all; without places, its rewards step by step."""
+    """Plot an episode's track over all positions; without positions, its cumulative reward."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)
@@ -193,12 +192,12 @@ def _thumbnail(episode: Episode, track: Track, places: Track) -> str:
     else:
         axes.plot(np.cumsum(episode.rewards), color=COLORS[1])
         axes.set_xlabel("step")
-        axes.set_title("return so far")
+        axes.set_title("cumulative reward")
     return to_svg(figure)
 
 
 def _columns(dataset: Dataset) -> Table:
-    """Ranges of the observed numbers."""
+    """Return the table of the observations' ranges."""
     rows = []
     for name, column in dataset.statistics.observations.items():
         names = dataset.observation_names
@@ -207,7 +206,7 @@ def _columns(dataset: Dataset) -> Table:
             numbers = (column.low[k], column.mean[k], column.std[k], column.high[k])
             rows.append([own, *(f"{number:.4g}" for number in numbers)])
     more = [[f"and {len(rows) - _MAX_ROWS} more", "", "", "", ""]] if len(rows) > _MAX_ROWS else []
-    return Table(("", "least", "mean", "spread", "most"), rows[:_MAX_ROWS] + more)
+    return Table(("", "min", "mean", "std", "max"), rows[:_MAX_ROWS] + more)
 
 
 def _actions_taken(dataset: Dataset) -> dict[str, int]:

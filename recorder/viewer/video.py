@@ -1,4 +1,4 @@
-"""Films and sheets of stills, as files, from pictures."""
+"""Video files and contact sheets from rendered images."""
 
 from __future__ import annotations
 
@@ -12,51 +12,56 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
-FILM_KINDS = (".mp4", ".gif")
-MOST_PICTURES_PER_S: Final = 50.0
-"""What viewers of GIFs can show; screens hardly show more."""
+VIDEO_KINDS = (".mp4", ".gif")
+MAX_FPS: Final = 50.0
+"""Frame rate limit of GIF viewers, which is close to that of screens."""
 _COLUMNS = 3
 _GAP_PX = 6
 
 
 def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
-    """Make sure, before the work, that a film or sheet can be written there.
+    """Check that a video or contact sheet can be written, before the images are rendered.
+
+    Args:
+        path: Path of the output.
+        kinds: Supported suffixes.
+        overwrite: Whether an existing file is replaced.
 
     Raises:
-        UnknownNameError: the path ends otherwise than these kinds.
-        OutputExistsError: there is a file, and `overwrite` is not set.
+        UnknownNameError: The path has another suffix.
+        OutputExistsError: The file exists and `overwrite` is not set.
         MissingExtraError: imageio is not installed.
     """
     import_extra("imageio", "video")
     if path.suffix == ".mp4":
         import_extra("av", "video")
     if path.suffix not in kinds:
-        raise UnknownNameError("kind of picture", path.suffix or path.name, kinds)
+        raise UnknownNameError("kind of output", path.suffix or path.name, kinds)
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
 
 
-def write_film(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -> int:
-    """Write a film as the pictures come; an `.mp4` is H.264, a `.gif` loops.
+def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
+    """Write a video frame by frame; an `.mp4` is encoded as H.264, a `.gif` loops.
 
     Args:
-        path: `.mp4` or `.gif`.
-        pictures: (height, width, 3), all of one size with even edges.
-        pictures_per_s: how fast it plays.
+        path: Path of the video, `.mp4` or `.gif`.
+        images: (height, width, 3) frames of one size with an even height and width.
+        fps: Frames per second.
 
     Returns:
-        How many pictures it has.
+        Number of frames.
 
     Raises:
-        UsageError: there are no pictures.
-        ReportError: it cannot be written.
+        UsageError: There are no frames.
+        ReportError: The file cannot be written.
     """
     unfinished = path.with_stem(f"{path.stem}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        count = _write(unfinished, pictures, pictures_per_s)
+        count = _write(unfinished, images, fps)
         if count == 0:
             raise UsageError(f"{path}: there is nothing to show")
         unfinished.replace(path)
@@ -67,40 +72,40 @@ def write_film(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -
     return count
 
 
-def _write(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -> int:
+def _write(path: Path, images: Iterable[Image], fps: float) -> int:
     imageio = import_extra("imageio.v3", "video")
     if path.suffix == ".gif":
-        stills = list(pictures)
+        stills = list(images)
         if stills:
-            milliseconds = round(1000 / pictures_per_s)
+            milliseconds = round(1000 / fps)
             imageio.imwrite(path, stills, plugin="pillow", duration=milliseconds, loop=0)
         return len(stills)
     count = 0
-    with imageio.imopen(path, "w", plugin="pyav") as film:
-        film.init_video_stream("libx264", fps=float(pictures_per_s))
-        for picture in pictures:
-            film.write_frame(picture)
+    with imageio.imopen(path, "w", plugin="pyav") as video:
+        video.init_video_stream("libx264", fps=float(fps))
+        for image in images:
+            video.write_frame(image)
             count += 1
     return count
 
 
-def write_sheet(path: Path, pictures: Sequence[Picture]) -> None:
-    """Write pictures side by side and below each other as one PNG, at half their size.
+def write_sheet(path: Path, images: Sequence[Image]) -> None:
+    """Write images as one PNG at half their size, see `contact_sheet`.
 
     Raises:
-        ReportError: it cannot be written.
+        ReportError: The file cannot be written.
     """
     imageio = import_extra("imageio.v3", "video")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        imageio.imwrite(path, contact_sheet(pictures))
+        imageio.imwrite(path, contact_sheet(images))
     except OSError as error:
         raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def contact_sheet(pictures: Sequence[Picture]) -> Picture:
-    """Pictures at half their size in three columns, with a gap between."""
-    halves = [_half(picture) for picture in pictures]
+def contact_sheet(images: Sequence[Image]) -> Image:
+    """Arrange images at half their size in three columns with gaps."""
+    halves = [_half(image) for image in images]
     height, width, _ = halves[0].shape
     columns = min(_COLUMNS, len(halves))
     rows = math.ceil(len(halves) / columns)
@@ -112,31 +117,31 @@ def contact_sheet(pictures: Sequence[Picture]) -> Picture:
     return sheet
 
 
-def filmed(length: int, steps_per_s: float) -> tuple[range, float]:
-    """Which steps of an episode a film shows, and how many pictures a second.
+def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
+    """Choose the steps of an episode that a video shows, and its frame rate.
 
-    All of them as long as that can be watched; else every second one, every third one, ... so that
-    the last is among them.
+    Every step is shown unless the frame rate would exceed `MAX_FPS`; then every second or third one
+    etc., and always the last.
 
     Args:
-        length: steps of the episode.
-        steps_per_s: at the film's speed.
+        length: Number of steps of the episode.
+        steps_per_s: Steps per second at the video's speed.
     """
-    stride = max(1, math.ceil(steps_per_s / MOST_PICTURES_PER_S - 1e-9))
+    stride = max(1, math.ceil(steps_per_s / MAX_FPS - 1e-9))
     return range(length % stride, length + 1, stride), steps_per_s / stride
 
 
-def spread(length: int, count: int) -> list[int]:
-    """Steps from the first to the last of an episode, evenly spread, each once.
+def evenly_spaced(length: int, count: int) -> list[int]:
+    """Return evenly spaced, distinct steps from the first to the last of an episode.
 
-    >>> spread(10, 3)
+    >>> evenly_spaced(10, 3)
     [0, 5, 10]
     """
     return sorted(set(np.rint(np.linspace(0, length, count)).astype(int).tolist()))
 
 
-def _half(picture: Picture) -> Picture:
-    height, width = (edge // 2 * 2 for edge in picture.shape[:2])
-    parts: Any = picture[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
-    mean: Picture = parts.mean(axis=(1, 3)).astype(np.uint8)
+def _half(image: Image) -> Image:
+    height, width = (edge // 2 * 2 for edge in image.shape[:2])
+    parts: Any = image[:height, :width].reshape(height // 2, 2, width // 2, 2, 3)
+    mean: Image = parts.mean(axis=(1, 3)).astype(np.uint8)
     return mean

@@ -15,7 +15,7 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
-from mcaprl.recorder.viewer.video import contact_sheet, filmed, spread
+from mcaprl.recorder.viewer.video import contact_sheet, evenly_spaced, shown_steps
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, eye_behind, poses_of
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
@@ -130,12 +130,12 @@ def test_sheet() -> None:
     assert sheet.shape == (46, 102, 3)
     assert [sheet[0, 0, 0], sheet[0, 36, 0], sheet[0, 72, 0], sheet[26, 0, 0]] == [10, 20, 30, 40]
     assert sheet[26, 36, 0] == 255
-    assert spread(2, 12) == [0, 1, 2]
+    assert evenly_spaced(2, 12) == [0, 1, 2]
 
 
 def test_a_fast_film_leaves_steps_out() -> None:
-    assert filmed(3, 50.0) == (range(4), 50.0)
-    steps, pictures_per_s = filmed(7, 120.0)
+    assert shown_steps(3, 50.0) == (range(4), 50.0)
+    steps, pictures_per_s = shown_steps(7, 120.0)
     assert list(steps) == [1, 4, 7], "the end is shown"
     assert pictures_per_s == 40.0
 
@@ -162,7 +162,7 @@ def test_films_of_a_scene_and_of_a_sim(
     capsys.readouterr()
     for arguments, why in (
         (["--video", "lane.mp4"], "lane.mp4 exists"),
-        (["--video", "lane.avi"], "unknown kind of picture '.avi'"),
+        (["--video", "lane.avi"], "unknown kind of output '.avi'"),
         (["--video", "new.mp4", "--episode", "7"], "has episodes 0 to 0"),
         (["cart.mcap", "--video", "new.mp4"], "a film shows one file"),
     ):
