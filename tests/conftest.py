@@ -1,4 +1,4 @@
-"""What all tests need: one thread for torch, no display, and no silent skips in CI."""
+"""Shared fixtures: one torch thread, no display, and no silent skips in CI."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, settings
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# Disks and JIT compilers make the first example slow; that is no fault of the code under test.
+# Disk access and JIT compilation make the first example slow, so there is no deadline.
 settings.register_profile(
     "mcaprl", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
@@ -22,7 +22,7 @@ settings.load_profile("mcaprl")
 
 @pytest.fixture(autouse=True, scope="session")
 def _one_thread() -> None:
-    """Two threads on a busy machine run many times slower than one."""
+    """Limit torch to one thread: on a busy machine, two are many times slower."""
     if importlib.util.find_spec("torch"):
         import torch
 
@@ -31,19 +31,19 @@ def _one_thread() -> None:
 
 @pytest.fixture(autouse=True)
 def _same_weights() -> None:
-    """Networks of a test are the same in each run: chance may leave one with dead units."""
+    """Seed torch, because some random initializations have dead units."""
     if "torch" in sys.modules:
         sys.modules["torch"].manual_seed(0)
 
 
 @pytest.fixture
 def log_path(tmp_path: Path) -> Path:
-    """Where a test may write its log."""
+    """Return the path of a test's log."""
     return tmp_path / "log.mcap"
 
 
 def need(available: bool, reason: str) -> None:
-    """Skip the test where a counterpart is missing; in CI nothing may be missing."""
+    """Skip the test if a counterpart is missing; in CI, fail."""
     if not available and os.environ.get("CI") == "true":
         pytest.fail(f"CI must have it: {reason}")
     if not available:

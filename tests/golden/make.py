@@ -1,4 +1,4 @@
-"""Writes logs of format version 1 that every later version must read.
+"""Writes logs of format version 1 that every later version has to read.
 
 `python -m tests.golden.make` writes only files that are missing: those that are there stay for
 ever. What is in each is stated in `contents.json`, as a hash of each column's bytes.
@@ -31,24 +31,24 @@ START_NS = 10**18
 
 
 def every_space(path: Path, compression: str) -> None:
-    """A Dict space with a leaf of each kind, two pictures among them."""
+    """Record a Dict space with a leaf of each kind, including two images."""
     record(path, MIXED_SPACE, spaces.Box(-1, 1, (2,), np.float32), [3, 2], compression=compression)
 
 
 def simple(path: Path, observation_space: spaces.Space[Any], action_space: Any) -> None:
-    """A space that is one array."""
+    """Record a space with a single leaf."""
     record(path, observation_space, action_space, [2, 3, 1])
 
 
 def appended(path: Path) -> None:
-    """Two recordings in one file."""
+    """Record twice into one file."""
     space = spaces.Box(-1, 1, (2,), np.float32)
     record(path, space, spaces.Discrete(3), [3, 2])
     record(path, space, spaces.Discrete(3), [4], seed=7, append=True, start_time_ns=2 * START_NS)
 
 
 def recovered(path: Path, *, keep_unfinished: bool) -> None:
-    """A log that was cut off in its second episode, behind its first 8191 steps."""
+    """Record a log that was cut off in its second episode, after 8191 steps."""
     whole = path.with_suffix(".whole")
     space = spaces.Box(-1, 1, (2,), np.float32)
     rows = [(np.full(2, step % 2, np.float32), 0.5, False, step == 8200) for step in range(8201)]
@@ -70,7 +70,7 @@ def recovered(path: Path, *, keep_unfinished: bool) -> None:
 
 
 def of_a_vector(path: Path) -> None:
-    """Two environments side by side, with `/rl/learner`."""
+    """Record a vector of two environments, with `/rl/learner`."""
     envs = SyncVectorEnv([Told, Told])
     env = mcaprl.RecordVecMcap(envs, path, policy_version=3, epsilon=0.5, start_time_ns=START_NS)
     with closing(env):
@@ -82,7 +82,7 @@ def of_a_vector(path: Path) -> None:
 
 
 def with_scene(path: Path) -> None:
-    """All that viewers show, from a sim."""
+    """Record all display topics of a sim."""
     env = mcaprl.RecordMcap(
         gym.make("mcaprl/LaneKeeping-v0"), path, policy="pilot", start_time_ns=START_NS
     )
@@ -93,13 +93,13 @@ def with_scene(path: Path) -> None:
 
 
 def told(path: Path) -> None:
-    """One episode of the environment whose every value is known."""
+    """Run one episode of the environment whose values are all known."""
     with closing(mcaprl.RecordMcap(Told(), path, start_time_ns=START_NS)) as env:
         play(env)
 
 
 def short_episodes(path: Path) -> None:
-    """Each told of in the chunk of its log lines; of some actions the probability is known."""
+    """Record episodes with log lines in one chunk, and probabilities of some actions."""
     space = spaces.Box(-1, 1, (2,), np.float32)
     lengths = [1 + k % 3 for k in range(12)]
     episodes = [
@@ -145,7 +145,7 @@ FILES: dict[str, Callable[[Path], None]] = {
 
 
 def contents_of(path: Path) -> dict[str, Any]:
-    """What is in a log, as it is stated: values of episodes, hashes of columns."""
+    """Return the reference contents of a log: values of episodes, hashes of columns."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         data = mcaprl.open(path)
@@ -169,7 +169,7 @@ def _digest(column: np.ndarray[Any, Any]) -> str:
 
 
 def main() -> None:
-    """Write what is missing."""
+    """Write the logs that are missing."""
     stated = json.loads(CONTENTS.read_text()) if CONTENTS.exists() else {}
     for name, write in FILES.items():
         path = FOLDER / f"{name}.mcap"

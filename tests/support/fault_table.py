@@ -1,4 +1,4 @@
-"""Puts what `make faults` has seen into docs/reliability.md, as a table.
+"""Writes the results of `make faults` into docs/reliability.md as a table.
 
 python -m tests.support.fault_table FIGURES PAGE
 """
@@ -12,7 +12,7 @@ BEGIN, END = "<!-- fault figures: begin -->\n", "<!-- fault figures: end -->\n"
 
 
 def with_table(page: str, figures: str) -> str:
-    """The page with these figures, `fault: what was seen` in each line, instead of its own."""
+    """Replace the page's table by these results, one `fault: result` per line."""
     before, _, rest = page.partition(BEGIN)
     _, _, behind = rest.partition(END)
     assert rest, "the page has no place for figures"

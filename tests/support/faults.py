@@ -1,4 +1,4 @@
-"""What the tests of faults share: recordings whose every episode can be told again, and counts."""
+"""Shared by the fault tests: recordings whose episodes can be recomputed, and counters."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ import mcaprl
 from mcaprl.recorder.dataset.episode import Episode
 
 LARGE = os.environ.get("MCAPRL_FAULTS") == "large"
-# Where to write what was seen; see `fault_table`.
+# File that results are appended to; see `fault_table`.
 FIGURES = os.environ.get("MCAPRL_FAULT_FIGURES")
 
 
 def count(small: int, large: int) -> int:
-    """How often a fault is tried: `make faults` asks for the large number."""
+    """Return the number of trials of a fault; `make faults` selects the large number."""
     return large if LARGE else small
 
 
 def tell(fault: str, **figures: Any) -> None:
-    """Print what was seen of a fault, one line; `make faults` puts it into the docs."""
+    """Print the result of a fault test in one line; `make faults` writes it into the docs."""
     line = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in figures.items())
     print(f"\n{fault}: {line}")
     if FIGURES is not None:
@@ -33,7 +33,7 @@ def tell(fault: str, **figures: Any) -> None:
 
 
 class Told(gym.Env[Any, Any]):
-    """Episode k has 5 + 7k % 40 steps, and all that is in it follows from k and the step."""
+    """Environment whose episode k has 5 + 7k % 40 steps; all values follow from k and the step."""
 
     observation_space = spaces.Dict(
         {
@@ -58,12 +58,12 @@ class Told(gym.Env[Any, Any]):
 
 
 def length_of(episode: int) -> int:
-    """Steps of an episode."""
+    """Return the number of steps of an episode."""
     return 5 + 7 * episode % 40
 
 
 def observation_of(episode: int, step: int) -> dict[str, Any]:
-    """What is seen after `step` steps."""
+    """Return the observation after `step` steps."""
     return {
         "x": np.array([episode, step, np.sin(episode + step)], np.float32),
         "picture": np.full((8, 8), (31 * episode + step) % 256, np.uint8),
@@ -71,12 +71,12 @@ def observation_of(episode: int, step: int) -> dict[str, Any]:
 
 
 def reward_of(episode: int, step: int) -> float:
-    """What the step to `step` brings."""
+    """Return the reward of the transition to `step`."""
     return float(np.cos(episode * 100 + step))
 
 
 def play(env: Any) -> None:
-    """One episode."""
+    """Run one episode."""
     env.reset()
     step = 0
     while not env.step(step % 4)[2]:
@@ -92,7 +92,7 @@ def write_log(path: Path, episodes: int, **options: Any) -> None:
 
 
 def assert_is_told(episode: Episode) -> None:
-    """An episode is, bit for bit, what it was."""
+    """Check that an episode equals the recorded one bit for bit."""
     number = episode.summary.episode
     length = length_of(number)
     assert episode.length == length

@@ -1,4 +1,4 @@
-"""Logs with `/rl/step` as other people's writers make them, in all their ways."""
+"""Logs with `/rl/step` by other writers, in various encodings and interleavings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ bool terminated
 bool truncated
 bool final
 """
-# The same fields in another order and other types, with texts, lists and nested messages between.
+# The same fields in another order and with other types, between strings, lists and nested messages.
 VARIABLE = """\
 std_msgs/Header header
 uint32 step
@@ -55,24 +55,24 @@ STEP_NS = 1_000_000
 
 @dataclass
 class Steps:
-    """Records of `/rl/step`, one array per field; episodes of the lengths given."""
+    """Records of `/rl/step`, one array per field, for episodes of the given lengths."""
 
     fields: dict[str, NDArray[Any]]
     times: NDArray[np.int64]
 
     @property
     def actual(self) -> NDArray[np.bool_]:
-        """Records that are transitions."""
+        """Mask of the records that are transitions."""
         return ~self.fields["final"]
 
     def rows(self) -> Iterator[tuple[int, dict[str, Any]]]:
-        """Time and fields of each record."""
+        """Yield the time and the fields of each record."""
         for row, time_ns in enumerate(self.times.tolist()):
             yield time_ns, {name: column[row] for name, column in self.fields.items()}
 
 
 def steps_of(lengths: list[int], *, start_ns: int = 10**18, seed: int = 0) -> Steps:
-    """Random values that every number type of PLAIN and VARIABLE holds exactly."""
+    """Create random values that every numeric type of PLAIN and VARIABLE represents exactly."""
     random = np.random.default_rng(seed)
     final = np.concatenate([np.arange(length + 1) == length for length in lengths])
     count = len(final)
@@ -95,7 +95,7 @@ def steps_of(lengths: list[int], *, start_ns: int = 10**18, seed: int = 0) -> St
 
 
 class Codec:
-    """Makes CDR of a type with rosbags."""
+    """Encoder of one message type to CDR, by rosbags."""
 
     def __init__(self, text: str, name: str = TYPE) -> None:
         self.text, self.name = text, name
@@ -114,7 +114,7 @@ class Codec:
 
 
 def plain_messages(steps: Steps, *, big_endian: bool = False) -> list[tuple[int, bytes]]:
-    """Records as PLAIN."""
+    """Encode records as PLAIN."""
     codec = Codec(PLAIN)
     return [
         (time_ns, codec.encode(big_endian=big_endian, **fields)) for time_ns, fields in steps.rows()
@@ -124,7 +124,7 @@ def plain_messages(steps: Steps, *, big_endian: bool = False) -> list[tuple[int,
 def variable_messages(
     steps: Steps, text_of: Callable[[int], str], *, big_endian: bool = False
 ) -> list[tuple[int, bytes]]:
-    """Records as VARIABLE, with texts that depend on the row; `behavior_prob` is missing."""
+    """Encode records as VARIABLE, with row-dependent strings and without `behavior_prob`."""
     codec, found = Codec(VARIABLE), []
     for row, (time_ns, fields) in enumerate(steps.rows()):
         text = text_of(row)
@@ -149,7 +149,7 @@ def write_with_mcap(
     channels: Callable[[int], int] = lambda row: 0,
     **options: Any,
 ) -> None:
-    """By mcap's Writer, with another topic's messages of all lengths between them."""
+    """Write by mcap's Writer, interleaved with a topic of messages of various lengths."""
     writer = Writer(str(path), **{"chunk_size": 2000, **options})
     writer.start("ros2")
     schema = writer.register_schema(TYPE, "ros2msg", text.encode())
@@ -191,7 +191,7 @@ MCAP_OPTIONS: dict[str, dict[str, Any]] = {
 
 
 def write_with_rosbags(folder: Path, messages: list[tuple[int, bytes]], text: str = PLAIN) -> Path:
-    """By rosbags, as a ROS 2 bag; tells where its MCAP file is."""
+    """Write a ROS 2 bag by rosbags; returns the path of its MCAP file."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, TYPE))
     with BagWriter(folder, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
@@ -203,7 +203,7 @@ def write_with_rosbags(folder: Path, messages: list[tuple[int, bytes]], text: st
 
 
 def write_with_foxglove(path: Path, messages: list[tuple[int, bytes]], text: str = PLAIN) -> None:
-    """By foxglove-sdk, with another topic between."""
+    """Write by foxglove-sdk, interleaved with another topic."""
     import foxglove
 
     context = foxglove.Context()

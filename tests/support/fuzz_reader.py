@@ -1,10 +1,10 @@
-"""A coverage-guided search for bytes that the reader cannot bear: `make fuzz`.
+"""Coverage-guided fuzzing of the reader: `make fuzz`.
 
     python -m tests.support.fuzz_reader FOLDER [options of libFuzzer]
 
-It begins with small logs in FOLDER, also with such as claim no CRC, so that what is behind the CRCs
-is reached. Bytes that break something are written to `crash-...`; mend the cause, and keep them in
-`tests/fuzz_corpus`, which `tests/recorder/columns/test_fuzz_corpus.py` tries ever after.
+It starts from small logs in FOLDER, with and without CRCs, so that the code after the CRC checks
+is reached. Failing inputs are written to `crash-...`; fix the cause, and add them to
+`tests/fuzz_corpus`, which `tests/recorder/columns/test_fuzz_corpus.py` reads.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Search until stopped."""
+    """Run the fuzzer until it is stopped."""
     import atheris
 
     with atheris.instrument_imports(include=["mcaprl"]):

@@ -1,4 +1,4 @@
-"""What is tried with bytes that a search comes upon, and where the search begins."""
+"""The function that is fuzzed, and the corpus that fuzzing starts from."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FOLDER = Path(tempfile.mkdtemp(prefix="mcaprl-fuzz-"))
 
 
 def try_bytes(data: bytes) -> None:
-    """Whatever the bytes are, nothing is raised but our own errors."""
+    """Read, check and recover the bytes; only errors of `mcaprl.errors` may be raised."""
     path, out = _FOLDER / "input.mcap", _FOLDER / "out.mcap"
     path.write_bytes(data)
     with warnings.catch_warnings():
@@ -38,12 +38,12 @@ def try_bytes(data: bytes) -> None:
             recovery = recover_log(path, out, overwrite=True)
         except McaprlError:
             return
-        # What is no log of ours is recovered as any MCAP.
+        # Files that are not logs of this format are recovered as generic MCAP files.
         assert recovery.episodes == 0 or check_log(out) == []
 
 
 def without_crcs(data: bytes) -> bytes:
-    """The same log, as a writer that gives no CRCs would have written it."""
+    """Return the log without CRCs."""
     bare = bytearray(data)
     for start, opcode, length in records_of(data):
         if opcode == Opcode.CHUNK:
@@ -56,7 +56,7 @@ def without_crcs(data: bytes) -> bytes:
 
 
 def write_seeds(folder: Path) -> None:
-    """Small logs of all kinds."""
+    """Return small logs of all kinds."""
     folder.mkdir(parents=True, exist_ok=True)
     for compression in ("none", "zstd", "lz4"):
         for name, space in (
@@ -67,6 +67,6 @@ def write_seeds(folder: Path) -> None:
             record(path, space, spaces.Discrete(2), [2, 1], compression=compression, overwrite=True)
             data = path.read_bytes()
             (folder / f"{path.name}-bare").write_bytes(without_crcs(data))
-            # Without a summary the reader goes another way.
+            # Without a summary, the reader scans the file.
             end = next(start for start, opcode, _ in records_of(data) if opcode == Opcode.DATA_END)
             (folder / f"{path.name}-cut").write_bytes(without_crcs(data)[:end])

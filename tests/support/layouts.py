@@ -1,4 +1,4 @@
-"""Whether a layout can show anything: its form, and that each of its paths is in the log."""
+"""Checks of layouts: their structure, and that every message path exists in the log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FILTER = re.compile(r"\{(\w+)==[^}]*\}")
 
 
 def check_layout(path: Path) -> dict[str, Any]:
-    """Check the layout that is attached to a log against the log's schemas; returns it."""
+    """Check a log's attached layout against the log's schemas, and return the layout."""
     reader = McapReader(path)
     attached = reader.attachment(LAYOUT_NAME)
     assert attached is not None
@@ -36,7 +36,7 @@ def check_layout(path: Path) -> dict[str, Any]:
 
 
 def series_of(layout: dict[str, Any]) -> dict[str, str]:
-    """All named series of a layout, and their paths."""
+    """Return all named series of a layout with their paths."""
     panels = layout["configById"].values()
     return {path["label"]: path["value"] for panel in panels for path in panel.get("paths", [])}
 
@@ -55,7 +55,7 @@ def _check_path(reader: McapReader, path: str) -> None:
 
 
 def _fields(text: str) -> dict[str, int | None]:
-    """The fields of a message definition, and how many numbers they have; None for one."""
+    """Return a message definition's fields with their array lengths; None for a scalar."""
     found: dict[str, int | None] = {}
     for line in text.split("=====")[0].splitlines():
         declaration = re.fullmatch(r"\w+(?:\[(\d+)\])?\s+(\w+)", line.split("#")[0].strip())
@@ -65,7 +65,7 @@ def _fields(text: str) -> dict[str, int | None]:
 
 
 def _panels(node: Any, panels: dict[str, Any]) -> list[str]:
-    """The panels of a layout, those behind tabs included."""
+    """Return the panels of a layout, including those in tabs."""
     if isinstance(node, str):
         tabs = panels[node].get("tabs", [])
         return [node, *(name for tab in tabs for name in _panels(tab["layout"], panels))]

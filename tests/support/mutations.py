@@ -1,4 +1,4 @@
-"""Ways to spoil an MCAP file, each a function of its bytes and a source of chance."""
+"""Mutations of MCAP files: functions of the file's bytes and a random generator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BOMB = zstandard.compress(bytes(2**28))
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Offset, opcode and whole length of each record of a sound file."""
+    """Return offset, opcode and total length of each record of a valid file."""
     offset = 8
     while offset < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, offset)
@@ -24,7 +24,7 @@ def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def flipped(data: bytes, chance: random.Random) -> bytes:
-    """Some bits are other ones."""
+    """Flip some bits."""
     spoilt = bytearray(data)
     for _ in range(chance.choice([1, 1, 1, 2, 8, 64])):
         spoilt[chance.randrange(len(spoilt))] ^= 1 << chance.randrange(8)
@@ -32,19 +32,19 @@ def flipped(data: bytes, chance: random.Random) -> bytes:
 
 
 def overwritten(data: bytes, chance: random.Random) -> bytes:
-    """A run of bytes is noise, or zero."""
+    """Overwrite a range of bytes with noise or zeros."""
     start, length = chance.randrange(len(data)), chance.choice([1, 4, 100, 5000])
     noise = bytes(length) if chance.random() < 0.5 else chance.randbytes(length)
     return data[:start] + noise[: len(data) - start] + data[start + length :]
 
 
 def cut(data: bytes, chance: random.Random) -> bytes:
-    """The end is missing."""
+    """Truncate the file."""
     return data[: chance.randrange(len(data))]
 
 
 def spliced(data: bytes, chance: random.Random) -> bytes:
-    """A run of bytes is missing, or there twice."""
+    """Remove or duplicate a range of bytes."""
     start, stop = sorted(chance.randrange(len(data)) for _ in range(2))
     if chance.random() < 0.5:
         return data[:start] + data[stop:]
@@ -52,7 +52,7 @@ def spliced(data: bytes, chance: random.Random) -> bytes:
 
 
 def wrong_length(data: bytes, chance: random.Random) -> bytes:
-    """A length in a record is another: of the record itself, or any eight or four bytes of it."""
+    """Change a length: the record's own, or any eight or four bytes of its content."""
     start, _, length = chance.choice(list(records_of(data)))
     spoilt, claimed = bytearray(data), chance.choice(LENGTHS)
     place = start + chance.choice([1, 1, chance.randrange(1, max(2, min(length - 8, 60)))])
@@ -64,7 +64,7 @@ def wrong_length(data: bytes, chance: random.Random) -> bytes:
 
 
 def bombed(data: bytes, chance: random.Random) -> bytes:
-    """A chunk is a small one that inflates to 256 MiB, whatever it claims."""
+    """Replace a chunk's data by a small one that decompresses to 256 MiB."""
     chunks = [record for record in records_of(data) if record[1] == Opcode.CHUNK]
     start, _, length = chance.choice(chunks)
     claimed = chance.choice([100, 2**20, 2**28 - 1, 2**28, 2**28 + 1, 2**40])
@@ -75,7 +75,7 @@ def bombed(data: bytes, chance: random.Random) -> bytes:
 
 
 def reordered(data: bytes, chance: random.Random) -> bytes:
-    """Records stand in another order, and the summary is missing."""
+    """Shuffle the records and remove the summary."""
     records = [record for record in records_of(data) if record[1] not in _BEHIND]
     if chance.random() < 0.5:
         chance.shuffle(records)
@@ -86,7 +86,7 @@ def reordered(data: bytes, chance: random.Random) -> bytes:
 
 
 def without_some(data: bytes, chance: random.Random) -> bytes:
-    """All records of a kind are missing: schemas, channels, the footer, ..."""
+    """Remove all records of one opcode: schemas, channels, the footer, ..."""
     kind = chance.choice(list(Opcode))
     return data[:8] + _joined(data, [r for r in records_of(data) if r[1] != kind]) + data[-8:]
 

@@ -17,11 +17,11 @@ GAMMA = 0.9
 PAYS = {0: 0.3, N_CELLS - 1: 1.0}
 INNER_CELLS = range(1, N_CELLS - 1)
 ACTION_SPACE = spaces.Discrete(2, start=5)
-"""Starts at 5, so that whoever forgets the start is found out."""
+"""Starts at 5, so that code which ignores `start` fails."""
 
 
 def corridor(visits: dict[tuple[int, int], int] | None = None, repeat: int = 20) -> Dataset:
-    """Transitions of the corridor, each an episode of its own.
+    """Create transitions of the corridor; each one is a separate episode.
 
     Args:
         visits: how often each (cell, action) is in the data; all of them once by default.
@@ -47,7 +47,7 @@ def corridor(visits: dict[tuple[int, int], int] | None = None, repeat: int = 20)
 
 
 def optimal_values() -> NDArray[np.float64]:
-    """(3, 2), Q of the inner cells by value iteration."""
+    """Compute Q of the inner cells, (3, 2), by value iteration."""
     q = np.zeros((N_CELLS, 2))
     for _ in range(100):
         for cell in INNER_CELLS:
@@ -57,17 +57,17 @@ def optimal_values() -> NDArray[np.float64]:
 
 
 def inner_observations() -> NDArray[np.float32]:
-    """(3, 5), the cells in which there is something to choose."""
+    """Return the observations of the inner cells, (3, 5), in which the action matters."""
     return one_hot(np.array(INNER_CELLS))
 
 
 def one_hot(cells: NDArray[np.int64]) -> NDArray[np.float32]:
-    """(N, 5) for N cells."""
+    """Return the one-hot observations of N cells, (N, 5)."""
     return np.eye(N_CELLS, dtype=np.float32)[cells]
 
 
 def crossing(lengths: tuple[int, ...] = (40, 30, 50), n_actions: int = 1) -> Dataset:
-    """Episodes of a walk whose observation is the step; every step pays 1."""
+    """Create episodes whose observation is the step and whose reward is 1 per step."""
     steps = np.concatenate([np.arange(length, dtype=np.float32) for length in lengths])[:, None]
     last = np.concatenate([np.arange(1, length + 1) == length for length in lengths])
     return Dataset.from_arrays(

@@ -1,4 +1,4 @@
-"""Environments and recordings whose every value is known."""
+"""Environments and recordings whose values are all known."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MIXED_SPACE = spaces.Dict(
 
 
 class ScriptedEnv(gym.Env[Any, Any]):
-    """Plays back what it is given: observations, rewards and ends, episode by episode."""
+    """Environment that plays back given observations, rewards and ends, episode by episode."""
 
     metadata: dict[str, Any] = {"render_fps": 20}  # noqa: RUF012 (as Gymnasium declares it)
 
@@ -60,7 +60,7 @@ class ScriptedEnv(gym.Env[Any, Any]):
 
 @dataclass
 class Truth:
-    """What a recording was made of, transition by transition."""
+    """The values that were recorded, transition by transition."""
 
     observations: list[Any] = field(default_factory=list)
     next_observations: list[Any] = field(default_factory=list)
@@ -80,7 +80,7 @@ def record(
     seed: int = 0,
     **options: Any,
 ) -> Truth:
-    """Record random values of the spaces, odd floats among them; tell what they were."""
+    """Record random values of the spaces, including NaN and infinities, and return them."""
     random = np.random.default_rng(seed)
     observation_space.seed(seed)
     action_space.seed(seed)
@@ -117,14 +117,14 @@ def record(
 
 
 def leaves_of(observation: Any) -> list[np.ndarray[Any, Any]]:
-    """The arrays of an observation, in the order of its space."""
+    """Return the arrays of an observation, in the order of its space."""
     if isinstance(observation, dict):
         return [leaf for part in observation.values() for leaf in leaves_of(part)]
     return [np.asarray(observation)]
 
 
 def assert_same_bits(actual: Any, expected: Any) -> None:
-    """Equal in dtype, shape and every bit: NaN equals NaN, and 0.0 is not -0.0."""
+    """Check equality of dtype, shape and every bit: NaN equals NaN, and 0.0 differs from -0.0."""
     actual, expected = np.ascontiguousarray(actual), np.ascontiguousarray(expected)
     assert actual.dtype == expected.dtype, f"{actual.dtype} is not {expected.dtype}"
     assert actual.shape == expected.shape, f"{actual.shape} is not {expected.shape}"
@@ -132,7 +132,7 @@ def assert_same_bits(actual: Any, expected: Any) -> None:
 
 
 def assert_holds(dataset: Any, truth: Truth) -> None:
-    """Every column of the dataset has the bits that were recorded."""
+    """Check that every column of the dataset has the recorded bits."""
     for name in ("rewards", "terminated", "truncated"):
         assert_same_bits(getattr(dataset, name), np.array(getattr(truth, name)))
     assert_same_bits(dataset.behavior_probs, np.array(truth.behavior_probs, np.float32))

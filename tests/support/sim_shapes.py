@@ -13,7 +13,7 @@ DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "arrow
 
 
 def rotated(frame: Frame, vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Turn a vector of a frame into its parent: v + 2 u x (u x v + w v)."""
+    """Rotate a vector from a frame into its parent: v + 2 u x (u x v + w v)."""
     axis, w = np.array(frame.rotation[:3]), frame.rotation[3]
     cross = np.cross(axis, vector) + w * np.array(vector)
     turned: NDArray[np.float64] = np.array(vector) + 2 * np.cross(axis, cross)
@@ -21,7 +21,7 @@ def rotated(frame: Frame, vector: tuple[float, float, float]) -> NDArray[np.floa
 
 
 def check_shape(shape: Shape, frames: Collection[str]) -> None:
-    """Make sure that a viewer can draw a shape."""
+    """Check that a viewer can draw a shape."""
     assert all(0.0 <= part <= 1.0 for part in shape.color)
     assert shape.points.dtype == np.float64
     assert shape.points.shape == (len(shape.points), 3)

@@ -1,4 +1,4 @@
-"""A chain of two states whose values follow from linear equations.
+"""An MDP with two states whose values follow from linear equations.
 
 Each step pays `PAYS[state, action]`, ends the episode with probability 0.25, and else leads to
 state 1 with probability `TO_ONE[state, action]`. Episodes start in state 0.
@@ -16,13 +16,13 @@ ENDS = 0.25
 PAYS = np.array([[1.0, 0.0], [0.0, 2.0]])
 TO_ONE = np.array([[0.2, 0.8], [0.3, 0.6]])
 BEHAVIOR = np.array([[0.6, 0.4], [0.5, 0.5]])
-"""(states, actions) probabilities of the policy that acts."""
+"""(states, actions) action probabilities of the behavior policy."""
 EVALUATED = np.array([[0.4, 0.6], [0.35, 0.65]])
-"""Those of the policy in question."""
+"""(states, actions) action probabilities of the evaluated policy."""
 
 
 def _values() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Q (2, 2) and V (2,) of EVALUATED: Q = r + gamma (1 - ENDS) P V, V = sum_a pi Q."""
+    """Solve Q (2, 2) and V (2,) of EVALUATED: Q = r + gamma (1 - ENDS) P V, V = sum_a pi Q."""
     after = np.stack([1 - TO_ONE, TO_ONE], axis=-1)
     step = np.einsum("sa,sat->st", EVALUATED, after)
     paid = (EVALUATED * PAYS).sum(1)
@@ -34,12 +34,12 @@ TRUE_Q, TRUE_V = _values()
 
 
 def true_value() -> float:
-    """The discounted return that EVALUATED has from the start."""
+    """Return the expected discounted return of EVALUATED from the start."""
     return float(TRUE_V[0])
 
 
 def play(policy: NDArray[np.float64] | None, *, episodes: int, seed: int) -> EpisodeTable:
-    """Episodes of a policy (None: BEHAVIOR), with ratios for EVALUATED and its true Q and V.
+    """Sample episodes of a policy (None: BEHAVIOR), with EVALUATED's ratios and true Q and V.
 
     They are cut off after 60 steps, which one in 30 million reaches.
     """
