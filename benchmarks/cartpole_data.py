@@ -29,7 +29,7 @@ Act = Callable[[NDArray[Any]], int]
 
 
 def make_logs(folder: Path) -> dict[str, mcaprl.Dataset]:
-    """Make the logs that are not there yet, and read all five."""
+    """Record the logs that do not exist yet, and read all five."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     if not all(path.exists() for path in paths.values()):
@@ -77,7 +77,7 @@ def _record_all(paths: dict[str, Path]) -> None:
 
 
 def record(path: Path, act: Act, steps: int) -> None:
-    """Record about so many steps, in whole episodes."""
+    """Record about this many steps, in whole episodes."""
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
     done = episode = 0
     while done < steps:
@@ -92,7 +92,7 @@ def record(path: Path, act: Act, steps: int) -> None:
 
 
 class _StopAt(BaseCallback):
-    """Stops training when the mean return of the last episodes is high enough."""
+    """Callback that stops training at a mean return of the last episodes."""
 
     def __init__(self, mean_return: float) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Five CartPole logs, five algorithms, four seeds, beside d3rlpy's on the same logs in one run.
+"""Five CartPole logs, five algorithms, four seeds, next to d3rlpy on the same logs in one run.
 
     python benchmarks/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
 
@@ -52,7 +52,7 @@ Act = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 def mean_return(act: Act, seed: int) -> float:
-    """Of the first episode in each of ten environments side by side."""
+    """Return the mean return of the first episode in each of ten vectorized environments."""
     envs = gym.make_vec("CartPole-v1", EPISODES, "vector_entry_point")
     observations, _ = envs.reset(seed=seed)
     returns, running = np.zeros(EPISODES), np.ones(EPISODES, bool)
@@ -65,7 +65,7 @@ def mean_return(act: Act, seed: int) -> float:
 
 
 def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
-    """The figure of each seed."""
+    """Train our algorithm and return the score of each seed."""
     learner_type = ALGORITHMS[algo]
     values = VALUES if issubclass(learner_type.config_type, BootstrapConfig) else {}
     config = learner_type.config_type(**SHARED, **values)
@@ -83,7 +83,7 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
 
 
 def greedy(learner: Any, seed: int) -> Act:
-    """How a seed would act now."""
+    """Return the current greedy policy of one seed."""
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
 
@@ -95,7 +95,7 @@ def greedy(learner: Any, seed: int) -> Act:
 
 
 def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
-    """d3rlpy's figure, of one seed."""
+    """Train d3rlpy's algorithm and return the score of one seed."""
     import d3rlpy
 
     d3rlpy.seed(0)
@@ -151,11 +151,11 @@ GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
         )
     ),
 }
-"""What must hold of our own."""
+"""Conditions that our results have to meet."""
 
 
 def verdict(gate: str, result: dict[str, Any]) -> str:
-    """Whether a gate holds, or that its cells are not there."""
+    """Return whether a gate holds, or that its cells are missing."""
     try:
         return "holds" if GATES[gate](result["mcaprl"], result["behavior"]) else "does not hold"
     except KeyError:
@@ -163,7 +163,7 @@ def verdict(gate: str, result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run what is not there yet of the grid, print it, and say which gates hold."""
+    """Run the missing cells of the grid, and print the table and the gates."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
@@ -187,7 +187,7 @@ def main() -> None:
 
 
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
-    """Side, algorithm and log of each cell: first ours, and what the gates are about."""
+    """Return side, algorithm and log of each cell; our cells and those of the gates come first."""
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
     if importlib.util.find_spec("d3rlpy") is None:
@@ -196,12 +196,12 @@ def cells(algos: list[str]) -> list[tuple[str, str, str]]:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """The table, and below it the gates."""
+    """Format the table, followed by the gates."""
     return "\n".join([table(result), "", *(f"- {verdict(gate, result)}: {gate}" for gate in GATES)])
 
 
 def table(result: dict[str, Any]) -> str:
-    """Markdown: each cell has our mean, the range of the seeds, and d3rlpy's; a dash is not run."""
+    """Format Markdown cells: our mean, the range over seeds, and d3rlpy's; a dash was not run."""
     lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
     for name in NAMES:
         texts = []

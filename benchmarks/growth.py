@@ -1,4 +1,4 @@
-"""How time and memory grow with the log: each size is read in a process of its own."""
+"""Growth of time and memory with the log's size; each size is read in a separate process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(json.dumps({**best, "kept": kept, "peak": peak}))
 
 
 def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
-    """Read logs of several sizes, and tell what a transition costs in each."""
+    """Measure the cost per transition of reading logs of several sizes."""
     found = {}
     for size in sizes:
         path = folder / "growth.mcap"

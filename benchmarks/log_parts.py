@@ -1,4 +1,4 @@
-"""Reading parts of logs, and logs of other kinds: short episodes, other writers', images."""
+"""Reading parts of logs, and other kinds of logs: short episodes, other writers, images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEPTH = rivals.DEPTH
 def tables(
     folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder
 ) -> list[Table]:
-    """Measure them, with files in `folder`; `log` has the transitions of `data`."""
+    """Measure them with files in `folder`; `log` contains the transitions of `data`."""
     return [
         _short_episodes(folder),
         _episode(folder, log, data, minari),
@@ -54,7 +54,7 @@ def _short_episodes(folder: Path) -> Table:
 
 
 def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> Table:
-    """We look the number up in the log; others are told the times or rows, or have it by number."""
+    """Measure reading one episode; other readers get its times or rows, or address it by index."""
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
@@ -169,7 +169,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
 
 
 def _with_episodes(encoded: list[bytes]) -> list[bytes]:
-    """Number the ready-made messages, so that they are whole episodes."""
+    """Number the prepared messages so that they form whole episodes."""
     dtype = message_dtype(rivals.TEXT)
     assert dtype is not None
     rows = np.frombuffer(b"".join(encoded), dtype).copy()

@@ -18,7 +18,7 @@ from mcaprl.recorder.repair.recover import recover_log
 
 
 def tables(folder: Path, transitions: int) -> list[Table]:
-    """Measure everything about logs, with files in `folder`."""
+    """Run the benchmarks of logs with files in `folder`."""
     data = vectors(transitions)
     part = vectors(int(transitions * SLOW_SHARE))
     encoded = rivals.messages(part)
@@ -147,7 +147,7 @@ def _reading(
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
     ]
-    # A table format is read only where it can be written.
+    # A table format is read only if it can be written.
     for name, write, read, path in (
         ("h5py, gzip 1", rivals.write_h5py, rivals.read_h5py, hdf5),
         ("Parquet, zstd 1", rivals.write_parquet, rivals.read_parquet, parquet),
@@ -168,7 +168,7 @@ def _reading(
 
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
-    """What files of the same transitions take; a log has times and counters besides."""
+    """Compare file sizes of the same transitions; a log also contains times and counters."""
     table = Table("Space that the transitions take", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
@@ -198,7 +198,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 
 
 def _threads(log: Path) -> Table:
-    """By the clock on the wall: threads take no less CPU time."""
+    """Measure wall time, because threads do not reduce CPU time."""
     return compare(
         "Reading that log with several threads",
         [
@@ -214,7 +214,7 @@ def _threads(log: Path) -> Table:
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Checking and recovering are reading, and, of the latter, writing."""
+    """Measure check (which reads) and recover (which reads and writes)."""
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

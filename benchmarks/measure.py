@@ -1,4 +1,4 @@
-"""Sides of a comparison, timed in turns within one process.
+"""Comparisons whose sides are timed in turns within one process.
 
 The machine may be busy with other things, so what counts is CPU time, the best of several turns,
 and the sides take turns so that a slow minute hits them all. What is reported are ratios: seconds
@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
-# Sides that go message by message do this share of it, and are scaled up: a turn of each takes some
-# tenths of a second, so that all have many, and a disturbance spoils but one.
+# Sides that work message by message do this share of the task, scaled up: a turn then takes some
+# tenths of a second, so that each side has many turns and a disturbance affects only one.
 SLOW_SHARE = 0.1
 SLOWEST_SHARE = 0.01
 
@@ -56,11 +56,11 @@ class Table:
     unit: str = "CPU time, ours = 1"
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values."""
+        """Return the table as JSON values."""
         return asdict(self)
 
     def to_markdown(self) -> str:
-        """As a section of a page."""
+        """Format the table as a section of a page."""
         lines = [f"## {self.title}", "", *([f"Goal: {self.goal}.", ""] if self.goal else [])]
         lines += [f"| side | {self.unit} |", "|---|---|"]
         lines += [f"| {name} | {ratio:.3g} |" for name, ratio in self.ratios.items()]
@@ -116,7 +116,7 @@ def compare(
 
 
 def after(prepare: Callable[[], object], run: Callable[[], object]) -> Callable[[], object]:
-    """A run that needs something prepared; an ImportError there is told when it runs."""
+    """Prepare a run; an ImportError is reported when the run is timed."""
     try:
         prepare()
     except ImportError as error:

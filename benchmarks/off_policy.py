@@ -1,4 +1,4 @@
-"""Off-policy estimates beside others' code, and how often their intervals are right.
+"""Off-policy estimates compared with other libraries, and the coverage of their intervals.
 
     python -m benchmarks.off_policy
 
@@ -37,17 +37,17 @@ SCOPE_RL_NAMES: Final = {
     "WPDIS": "SelfNormalizedPDIS",
     "DR": "DoublyRobust",
 }
-"""Its self-normalised DR leaves the weights of V as they are and is not our WDR."""
+"""SCOPE-RL's self-normalized DR does not normalize the weights of V, so it differs from our WDR."""
 
 
 def beside_scope_rl(logs: int) -> dict[str, float]:
-    """The largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
+    """Return the largest relative difference to SCOPE-RL's estimates over logs of 300 episodes."""
     from scope_rl.ope.discrete import basic_estimators
 
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
     for seed in range(logs):
         table = task.play(None, episodes=300, seed=seed)
-        # Two actions with pi and mu that have the table's ratios, and Q that has its Q and V.
+        # Two actions whose probabilities give the table's ratios, and values that give its Q and V.
         given = _as_scope_rl(table)
         for name, theirs in SCOPE_RL_NAMES.items():
             estimator = getattr(basic_estimators, theirs)()
@@ -59,9 +59,9 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 
 
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
-    """An episode table in SCOPE-RL's terms; the action that was taken is always its action 0."""
+    """Convert an episode table to SCOPE-RL's inputs; the action taken is always action 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
-    # Action 1 has what is left of the probability, and the Q that makes V what it is.
+    # Action 1 has the remaining probability, and the Q that yields the table's V.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
     return {
         "step_per_trajectory": table.rewards.shape[1],
@@ -75,19 +75,19 @@ def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
 
 
 class Balance:
-    """A CartPole policy that needs no training: push to the side that the pole falls to."""
+    """CartPole policy without training: push toward the side to which the pole falls."""
 
     def __init__(self, look_ahead_s: float) -> None:
-        """Look so far ahead; what looks back falls soon."""
+        """Set the look-ahead time; a negative one makes the pole fall early."""
         self._look_ahead_s = look_ahead_s
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.int64]:
-        """(B,) 1 is to the right."""
+        """Return the actions (B,); 1 pushes to the right."""
         angle, speed = observations[:, 2], observations[:, 3]
         return (angle + self._look_ahead_s * speed > 0).astype(np.int64)
 
     def action_probabilities(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(B, 2), all on one."""
+        """Return deterministic action probabilities (B, 2)."""
         return np.eye(2)[self.act(observations)]
 
 
@@ -105,7 +105,7 @@ EPSILON: Final = 0.5
 
 
 def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[str, Any]:
-    """Columns of episodes of a policy that errs, as `Dataset.from_arrays` takes them."""
+    """Record episodes of an epsilon-greedy policy as arguments of `Dataset.from_arrays`."""
     random = np.random.default_rng(seed)
     rows = []
     with closing(gym.make("CartPole-v1")) as env:
@@ -125,28 +125,28 @@ def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[
 
 
 def true_value(policy: Balance, episodes: int = 200) -> float:
-    """Its discounted return over fresh episodes."""
+    """Return the policy's mean discounted return over fresh episodes."""
     played = cartpole(policy, 0.0, episodes, seed=9)
     ends = np.flatnonzero(played["terminated"] | played["truncated"])
     lengths = np.diff(ends, prepend=-1)
-    # Each step pays 1.
+    # The reward is 1 per step.
     return float(((1 - FQE.gamma**lengths) / (1 - FQE.gamma)).mean())
 
 
 def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """FQE as `evaluate --data` has it."""
+    """Run FQE with the settings of `evaluate --data`."""
     data = mcaprl.Dataset.from_arrays(**columns, env_id="CartPole-v1")
     return OffPolicyEvaluator(data, FQE, seed).evaluate(policy, "").estimates[0].value or 0.0
 
 
 def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """d3rlpy's FQE with the same settings: the mean value of the first states."""
+    """Run d3rlpy's FQE with the same settings and return the mean value of the first states."""
     import d3rlpy
     from d3rlpy.ope.fqe import DiscreteFQE
     from d3rlpy.ope.fqe import FQEConfig as TheirConfig
 
     class Acting:
-        """What DiscreteFQE asks of the algorithm that it evaluates."""
+        """Adapter with the methods that DiscreteFQE calls on the evaluated algorithm."""
 
         @property
         def impl(self) -> Acting:
@@ -181,7 +181,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print both FQEs, on logs and networks of their own for each seed, and the truth."""
+    """Print both FQEs, with a separate log and network for each seed, and the true value."""
     print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
     for name, policy in POLICIES.items():
         found = []
@@ -195,7 +195,7 @@ def beside_d3rlpy(seeds: int) -> None:
 
 
 def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
-    """The share of logs whose interval holds the true value, for each estimator.
+    """Return the share of logs whose interval contains the true value, for each estimator.
 
     Returns:
         For our intervals, and for percentiles of the same resamplings.
@@ -219,8 +219,8 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--logs", type=int, default=1000, help="of the coverage")
-    parser.add_argument("--seeds", type=int, default=4, help="of both FQEs")
+    parser.add_argument("--logs", type=int, default=1000, help="number of logs for the coverage")
+    parser.add_argument("--seeds", type=int, default=4, help="number of seeds of both FQEs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")

@@ -1,4 +1,4 @@
-"""What recording and being watched cost beside learning: `python -m benchmarks.online`.
+"""Cost of recording and of live viewing relative to training: `python -m benchmarks.online`.
 
 The same training runs plainly, with a log, and shown to a viewer (Node, see tests/node), in turns,
 by CPU time of all its threads; the best of several counts. The training is the whole one that the
@@ -31,7 +31,7 @@ _VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
 
 
 def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
-    """CPU seconds of a training, its one evaluation included; and how many frames were seen."""
+    """Return CPU seconds of a training with its one evaluation, and the number of frames viewed."""
     folder.mkdir()
     path = folder / "log.mcap" if kind == "recorded" else None
     shown = LiveTraining(task, port=0) if kind == "watched" else nullcontext()
@@ -47,7 +47,7 @@ def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
 
 
 def _viewer(url: str) -> subprocess.Popen[str]:
-    """Somebody who looks at everything."""
+    """Viewer that subscribes to all topics."""
     viewer = subprocess.Popen(["node", str(_VIEWER), url], stdout=subprocess.PIPE, text=True)
     assert viewer.stdout is not None
     viewer.stdout.readline()
@@ -55,7 +55,7 @@ def _viewer(url: str) -> subprocess.Popen[str]:
 
 
 def _silent(_: TrainingProgress) -> None:
-    """Show nothing."""
+    """Return nothing to display."""
 
 
 def main() -> None:

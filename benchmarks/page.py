@@ -1,4 +1,4 @@
-"""Puts tables into docs/results.md, between the marks that say whose place it is."""
+"""Writes tables into docs/results.md, between the markers with the table's name."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PAGE = Path(__file__).parent.parent / "docs" / "results.md"
 
 
 def write_section(name: str, text: str, page: Path = PAGE) -> None:
-    """Replace what stands between `<!-- name -->` and `<!-- /name -->`.
+    """Replace the text between `<!-- name -->` and `<!-- /name -->`.
 
     Raises:
         ValueError: the page does not have these two marks, once each.

@@ -1,4 +1,4 @@
-"""How well a log alone tells the checkpoints of a training run apart.
+"""How well estimates from a log alone rank the checkpoints of a training run.
 
     python -m benchmarks.ranking FOLDER --sim lane
     python -m benchmarks.ranking FOLDER --sim racer
@@ -41,7 +41,7 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8
 STEPS: Final = {"lane": 16_000, "racer": 8_000}
-"""While learning is under way: later, checkpoints are hardly worse than each other."""
+"""Checkpoints from early training: later ones hardly differ."""
 EPISODES: Final = 100
 FIRST_SEED: Final = 5_000_000
 GAMMA: Final = 0.97
@@ -49,7 +49,7 @@ RULES: Final = ("the later the better", "own mean Q")
 
 
 def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Path]]:
-    """The log of a training, and its checkpoints."""
+    """Train once and return the log and the checkpoints."""
     log = folder / "training.mcap"
     every = steps // CHECKPOINTS
     kept = [folder / f"step-{every * (k + 1)}.zip" for k in range(CHECKPOINTS)]
@@ -80,7 +80,7 @@ def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Pat
 
 
 def true_values(sim: str, policy: OnlinePolicy) -> tuple[float, float]:
-    """Mean return of the greedy policy over fresh episodes: discounted, and as it is."""
+    """Return the greedy policy's mean discounted and undiscounted return over fresh episodes."""
     with closing(make_sims(sim, EPISODES)) as envs:
         each: Any = [episode_seed(FIRST_SEED, k) for k in range(EPISODES)]
         observations, _ = envs.reset(seed=each)
@@ -96,7 +96,7 @@ def true_values(sim: str, policy: OnlinePolicy) -> tuple[float, float]:
 
 
 def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[str, Any]]:
-    """True and estimated values of each checkpoint."""
+    """Return true and estimated values of each checkpoint."""
     dataset = mcaprl.open(log)
     firsts = np.array([episode.observations[0] for episode in dataset.episodes])
     evaluator = OffPolicyEvaluator(dataset, config)
@@ -117,7 +117,7 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
 
 
 def judged(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
-    """Rank correlation with discounted and plain returns, regret@1 and the share of verdicts."""
+    """Return rank correlation with discounted and plain returns, regret@1, share of verdicts."""
     estimated, discounted, plain = (
         np.array([row["estimates"][estimator] if own is None else row[own] for row in rows])
         for own in (None, "discounted", "return")
@@ -151,11 +151,13 @@ def _mean_and_range(column: NDArray[np.float64]) -> str:
 
 
 def main() -> None:
-    """Train, ask, compare."""
+    """Train, estimate and compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sim", choices=STEPS, required=True)
-    parser.add_argument("--updates", type=int, default=3_000, help="of the model behind FQE")
+    parser.add_argument(
+        "--updates", type=int, default=3_000, help="number of updates of the FQE model"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     config = FQEConfig(

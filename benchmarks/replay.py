@@ -1,4 +1,4 @@
-"""What long logs ask of a viewer: chunks, index, and the memory that our player takes to jump.
+"""Cost of long logs for a viewer: chunks, index, and memory that our player uses to seek.
 
     python benchmarks/replay.py
 
@@ -28,7 +28,7 @@ JUMPS = 20
 
 
 def main() -> None:
-    """Make the logs, jump about in each, print a table."""
+    """Record the logs, seek in each, and print a table."""
     print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory to jump, MB |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -36,7 +36,7 @@ def main() -> None:
             path = Path(folder) / "log.mcap"
             path.unlink(missing_ok=True)
             steps = make(path)
-            # In a process of its own: the making took memory, too.
+            # In a separate process, because recording used memory, too.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
                 print(f"| {name} | {steps} | {pool.submit(_row, path).result()} |", flush=True)
 
@@ -88,7 +88,7 @@ def _row(path: Path) -> str:
 
 
 def _peak_mb() -> float:
-    # Not ru_maxrss, which a child takes over from its parent.
+    # Not ru_maxrss, which a child process inherits from its parent.
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 

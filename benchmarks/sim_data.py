@@ -1,4 +1,4 @@
-"""Six logs of each of our sims, of about 20,000 transitions each, to learn from offline.
+"""Six logs of each sim with about 20,000 transitions each, for offline learning.
 
 random   actions at random
 medium   an online run's policy as soon as it scores half of the pilot, one action in ten random
@@ -38,29 +38,29 @@ from mcaprl.sims.lane.env import LaneKeepingEnv
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
 MEDIUM_SCORE = 0.5
-"""Where random is 0 and the pilot 1, over the 30 episodes of an evaluation while learning."""
+"""Mean returns of random and pilot, which score 0 and 1, over 30 evaluation episodes."""
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
-"""The action of each sim that its weak pilot prefers."""
+"""The action that the weak pilot of each sim prefers."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
-"""Slower than that, the weak pilot errs as little as when it is awake."""
+"""Below this speed, the weak pilot does not take its preferred wrong action."""
 WEAK, CLUMSY = 0.6, 0.1
-"""How often the weak pilot does the wrong thing, and how often, of the rest, any action."""
+"""Probability of the wrong action, and of a random action otherwise."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 
 
 class WeakPilot(EpsilonGreedy):
-    """A pilot that does the wrong thing most of the time."""
+    """Pilot that takes a wrong action most of the time."""
 
     def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
-        """Take the pilot of `env`; where it does right it is a little clumsy."""
+        """Wrap the pilot of `env`, with a small probability of random actions."""
         super().__init__(make_pilot(env), CLUMSY, env.action_space)
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
         self._sim, self._timid_above_m_s = env.unwrapped, TIMID_ABOVE_M_S.get(sim)
 
     def choose(self, observation: Any) -> tuple[Any, float]:
-        """The action for one observation, and the probability with which it is chosen."""
+        """Return the action for one observation, and its probability."""
         assert self.policy is not None
         weak = WEAK if self._is_weak_here() else 0.0
         chances = np.full(self._count, (1 - weak) * CLUMSY / self._count)
@@ -76,7 +76,7 @@ class WeakPilot(EpsilonGreedy):
 
 
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:
-    """Make the logs of a sim that are not there yet; gives the paths of all six."""
+    """Record the missing logs of a sim, and return the paths of all six."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     online = folder / "online"
@@ -89,7 +89,7 @@ def make_logs(folder: Path, sim: str) -> dict[str, Path]:
 
 
 def _learn_online(sim: str, out: Path, log: Path) -> None:
-    """Learn with the sim's own settings, and stop halfway; `out` has the best policy then."""
+    """Train with the sim's settings and stop halfway; `out` contains the best policy."""
 
     def stop_halfway(now: TrainingProgress) -> None:
         if now.terms["score"] >= MEDIUM_SCORE:
@@ -106,11 +106,11 @@ def _learn_online(sim: str, out: Path, log: Path) -> None:
 
 
 class _HalfwayError(Exception):
-    """Stops an online run."""
+    """Raised to stop an online run."""
 
 
 def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
-    """Who acts in each log, one after the other."""
+    """Return the behavior policies of each log, in order."""
 
     def pilot(epsilon: float) -> MakeBehavior:
         return lambda env: EpsilonGreedy(make_pilot(env), epsilon, env.action_space)
@@ -131,7 +131,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
 
 
 def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes until each behavior has made its part of the steps."""
+    """Record whole episodes until each behavior policy has its share of the steps."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,

@@ -1,4 +1,4 @@
-"""Six logs of each of our sims, five algorithms, four seeds: what is learned from which log.
+"""Offline learning from six logs of each sim with five algorithms and four seeds.
 
     python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
 
@@ -45,21 +45,21 @@ ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {}),
 }
-"""CQL twice: with the default weight of its penalty, which is 1, and with a tenth of it."""
+"""CQL with the default weight of its penalty, 1, and with 0.1."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 TARGET_INTERVAL = 150
-"""Updates between two copies into the target: with the default, values would not get far ahead."""
+"""Updates between syncs of the target network; the default would propagate values too slowly."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
     "racer": {"gamma": 0.98, "n_steps": 3},
 }
-"""Of the learners of values; behavior cloning takes of these the learning rate alone."""
+"""Settings of the value-based algorithms; behavior cloning uses only the learning rate."""
 Cell = dict[str, Any]
 
 
 def main() -> None:
-    """Make the cells that are asked for and not there, and the tables if all are."""
+    """Run the selected cells that are missing, and write the tables if all exist."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sims", default=",".join(SETTINGS))
@@ -83,7 +83,7 @@ def main() -> None:
 def _fill(
     folder: Path, sim: str, paths: dict[str, Path], wanted: Sequence[tuple[str, str]]
 ) -> None:
-    """Make the cells that are not there."""
+    """Run the missing cells."""
     with closing(make_sim(sim)) as env:
         random = run(sim, [None])
         pilot = run(sim, [make_pilot(env)], env)
@@ -127,7 +127,7 @@ def learn(
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """The same episodes for all; in `env`, one by one, or side by side."""
+    """Evaluate policies on the same episodes, one by one in `env` or vectorized."""
     with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
         return evaluate(
             env or own,
@@ -140,12 +140,12 @@ def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyS
 
 
 def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) -> float:
-    """0 as random, 1 as the pilot."""
+    """Normalize returns: random scores 0, the pilot 1."""
     return (mean_return - random.mean_return) / (pilot.mean_return - random.mean_return)
 
 
 def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
-    """Markdown: each cell has the mean score and its interval."""
+    """Format Markdown cells with the mean score and its interval."""
     lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
     lines.append("|---|" + "---|" * len(ALGOS))
     for name in NAMES:

@@ -1,4 +1,4 @@
-"""The sims beside highway-env's own environments, on one core.
+"""The sims compared with highway-env's environments, on one core.
 
 `python -m benchmarks.sims` prints steps per second of this machine; `make bench` has the ratios.
 """
@@ -22,7 +22,7 @@ QUADROTOR_STEPS = 5
 
 
 STEPS = 1_000_000
-"""So many steps are the task; each side takes a share of them."""
+"""Number of steps of the task; each side does a share of them."""
 
 
 GOALS = {
@@ -36,7 +36,7 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """A turn of each of our sims takes some hundredths of a second: short enough to be undisturbed.
+    """List our sims; a turn takes some hundredths of a second, too short for many disturbances.
 
     What is under way at its end goes on in the next.
     """
@@ -76,7 +76,7 @@ def tables() -> list[Table]:
 
 
 def main() -> None:
-    """Print how many steps each of our sims makes, in the best of a hundred turns."""
+    """Print the steps per second of each of our sims, best of a hundred turns."""
     for side in ours():
         taken_s = min(_cpu_s(side) for _ in range(100))
         rate, goal = side.share * STEPS / taken_s, GOALS.get(side.name)
@@ -91,7 +91,7 @@ def _cpu_s(side: Side) -> float:
 
 def _highway(env_id: str) -> gym.Env[Any, Any]:
     with warnings.catch_warnings():
-        # Its spaces are float64 here and there; Gymnasium says so when they are made.
+        # Some of its spaces are float64, for which Gymnasium warns.
         warnings.simplefilter("ignore")
         return gym.make(env_id, disable_env_checker=True)
 
@@ -112,7 +112,7 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
 
 
 def _pictures(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
-    """A frame for each step, and none for a reset."""
+    """Render a frame at each step, and none at reset."""
     sim: Any = env.unwrapped
     sim.action_space.seed(0)
     actions = [sim.action_space.sample() for _ in range(frames)]

@@ -1,4 +1,4 @@
-"""What is measured: transitions of known size, and an environment that costs nothing."""
+"""Workloads: transitions of known size, and an environment that costs almost nothing."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ IMAGE_STEPS, IMAGE_SHAPE = 20_000, (84, 84)
 
 
 class Constant(gym.Env[Any, Any]):
-    """Gives the same observation again and again, so that what a recorder adds can be seen."""
+    """Environment that always returns one observation, so that the recorder's cost is visible."""
 
     observation_space, action_space = OBSERVATION, ACTION
 
     def __init__(self, episode_steps: int = EPISODE_STEPS) -> None:
-        """Prepare the one observation."""
+        """Prepare the observation."""
         self.observation = np.arange(19, dtype=np.float32)
         self.step_number, self.episode_steps = 0, episode_steps
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode."""
+        """Start an episode."""
         self.step_number = 0
         return self.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Give the same observation again."""
+        """Return the observation."""
         self.step_number += 1
         return self.observation, 1.0, False, self.step_number == self.episode_steps, {}
 
@@ -47,7 +47,7 @@ def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -
 
 
 def vectors(transitions: int) -> mcaprl.Dataset:
-    """Random numbers, which no compression makes smaller by much: 19 float32 and 9 actions."""
+    """Create random transitions with 19 float32 and 9 actions, which hardly compress."""
     random = np.random.default_rng(0)
     episodes = transitions // EPISODE_STEPS
     frames = random.standard_normal((episodes, EPISODE_STEPS + 1, 19), np.float32)
@@ -60,7 +60,7 @@ def vectors(transitions: int) -> mcaprl.Dataset:
 
 
 def images(transitions: int) -> mcaprl.Dataset:
-    """Depth images of a slope with noise, and vectors."""
+    """Create depth images of a ramp with noise, and vectors."""
     random = np.random.default_rng(0)
     frames = transitions + transitions // EPISODE_STEPS
     slope = np.add.outer(np.arange(84), np.arange(84) // 2).astype(np.uint8)

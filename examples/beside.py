@@ -1,4 +1,4 @@
-"""Offline CQL learns from the log that an online agent is still writing; both are drawn.
+"""Offline CQL learns from the log that an online agent is still writing; both are plotted.
 
     python examples/beside.py FOLDER        writes below FOLDER, which must not exist
 
@@ -45,7 +45,7 @@ OFFLINE = {
 
 
 def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
-    """Start a command of ours."""
+    """Start an mcaprl command."""
     arguments += tuple(
         text for name, value in options.items() for text in (f"--{name}", f"{value}")
     )
@@ -54,7 +54,7 @@ def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 
 
 def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[int, float]:
-    """Score each policy that a run saves until it ends, by the updates behind it."""
+    """Score each policy that a run saves until it ends, by number of updates."""
     found: dict[int, float] = {}
     with closing(make_sim(SIM)) as env:
         scale = measure_scale(env, episodes=EPISODES, seed=SELECTION_SEED)
@@ -77,7 +77,7 @@ def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[
 def draw(
     path: Path, points: list[CurvePoint], known: dict[int, float], scores: dict[int, float]
 ) -> None:
-    """Both scores over the transitions that were recorded, or known, by then."""
+    """Plot both scores over the transitions recorded or known at that time."""
     figure, (left, right) = new_figure((9, 3.6), 1, 2)
     left.plot([p.step for p in points], [p.score for p in points], color=COLORS[0], label="online")
     x = [known[updates] for updates in scores]
@@ -94,7 +94,7 @@ def draw(
 
 
 def main() -> None:
-    """Run both, compare, draw."""
+    """Run both, compare and plot."""
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "beside")
     out.mkdir()
     log, online, offline = out / "log.mcap", out / "online", out / "offline"
