@@ -64,7 +64,7 @@ docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
 
 wheel: $(VENV)/.dev
-	PYTHON="$(BIN)/python" sh .ci/bare-wheel
+	PYTHON="$(BIN)/python" sh .ci/check-wheel
 
 clean:
 	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules
