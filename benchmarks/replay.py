@@ -29,7 +29,7 @@ JUMPS = 20
 
 def main() -> None:
     """Make the logs, jump about in each, print a table."""
-    print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory to jump, MB |")
+    print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory for a seek, MB |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name, make in (("a million steps", _million), ("an hour with scene", _hour)):
