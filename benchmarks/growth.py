@@ -51,25 +51,25 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
     time = Table(
         "Reading logs of several sizes",
         {f"{size:,} transitions": per_step[size] / middle for size in sizes},
-        goal="linear: a transition costs the same in each",
+        goal="linear: the same time per transition at each size",
         unit=f"CPU time per transition, of {sizes[len(sizes) // 2]:,} = 1",
     )
     memory = Table(
-        "Memory while reading them",
+        "Memory while reading logs of several sizes",
         {f"{size:,} transitions": found[size]["peak"] / found[size]["kept"] for size in sizes},
         goal="the dataset and a few chunks",
-        unit="peak of memory while reading, the finished dataset = 1",
+        unit="peak memory, the finished dataset = 1",
     )
     checking = Table(
-        "Checking them",
+        "Checking logs of several sizes",
         {_size(size, told): told["check"] / told["seconds"] for size, told in found.items()},
-        goal="a check of a good gigabyte runs at reading speed",
+        goal="a check of more than a gigabyte takes as long as reading",
         unit="CPU time, reading the same log = 1",
     )
     recovering = Table(
-        "Recovering them",
+        "Recovering logs of several sizes",
         {_size(size, told): told["recover"] / told["seconds"] for size, told in found.items()},
-        goal="linear, as reading is: what is recovered is read, packed and checked",
+        goal="linear, like reading: recovery reads, compresses and checks",
         unit="CPU time, reading the same log = 1",
     )
     every = [time, checking, recovering, memory]

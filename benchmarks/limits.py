@@ -14,7 +14,7 @@ from mcaprl.recorder.columns.records import map_file
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 PLAIN = "plain zstd of the same chunks"
-LEAST_WORK = "likewise from the file, CRCs checked"
+LEAST_WORK = "mapped file, decompressed, CRCs checked"
 
 
 def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:

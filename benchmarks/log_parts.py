@@ -138,7 +138,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
             Side(OURS, lambda: mcaprl.open(packed, images="memory")),
             Side(PLAIN, limits.plain(packed, STEP_TOPIC, DEPTH)),
             Side(LEAST_WORK, limits.least(packed, STEP_TOPIC, DEPTH)),
-            Side("memcpy of the pictures", lambda: [pictures.copy()]),
+            Side("memcpy of the images", lambda: [pictures.copy()]),
             Side(f"{OURS}, vectors alone", lambda: mcaprl.open(packed, columns=["state"])),
             Side(
                 "mcap + mcap-ros2-support",
@@ -162,14 +162,14 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
             Side(f"{OURS}, in memory", lambda: [memory.batch(rows) for rows in batches]),
             Side("NumPy, one array in memory", lambda: [(frames[r], frames[r]) for r in batches]),
         ],
-        goal="300,000 transitions a second on disk; NumPy's speed is the limit",
+        goal="300,000 transitions per second on disk; NumPy's speed is the limit",
         ours=f"{OURS}, on disk",
     )
     return [reading, drawing]
 
 
 def _with_episodes(encoded: list[bytes]) -> list[bytes]:
-    """Number the ready-made messages, so that they are whole episodes."""
+    """Number the prebuilt messages, so that they form complete episodes."""
     dtype = message_dtype(rivals.TEXT)
     assert dtype is not None
     rows = np.frombuffer(b"".join(encoded), dtype).copy()

@@ -47,19 +47,19 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
         run_env(mcaprl.RecordMcap(Constant(), scratch, overwrite=True), episodes)
 
     table = compare(
-        "Recording: CPU time that is added to each step of an environment",
+        "Recording: CPU time added to each environment step",
         [
             Side(bare, lambda: rivals.record_bare(episodes)),
             Side(OURS, record, floor=bare),
             Side(
-                "mcap's Writer, messages ready-made", lambda: rivals.write_mcap(messages, scratch)
+                "mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)
             ),
             Side(
-                "foxglove-sdk, messages ready-made",
+                "foxglove-sdk, prebuilt messages",
                 lambda: rivals.write_foxglove(messages, scratch),
             ),
             Side(
-                "rosbags' Writer, messages ready-made",
+                "rosbags' Writer, prebuilt messages",
                 lambda: rivals.write_rosbags(messages, folder / "bag"),
             ),
             Side(
@@ -75,7 +75,8 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
                 floor=bare,
             ),
         ],
-        goal="4 times less than mcap's Writer, 2 than foxglove-sdk, 15 than Minari's DataCollector",
+        goal="4 times less than mcap's Writer, 2 times less than foxglove-sdk,"
+        " 15 times less than Minari",
         rounds=12,
     )
     table.ratios.pop(bare)
@@ -93,23 +94,23 @@ def _writing(
     scratch = folder / "written"
     chunks = limits.raw_chunks(log, STEP_TOPIC)
     return compare(
-        "Writing transitions that are in memory",
+        "Writing transitions from memory",
         [
             Side(OURS, lambda: data.save(folder / "written.mcap", overwrite=True)),
             Side("plain zstd 1 of the same chunks", lambda: limits.level_1_chunks(chunks)),
             Side("memcpy of the same chunks", lambda: [bytearray(chunk) for chunk in chunks]),
             Side(
-                "mcap's Writer, messages ready-made",
+                "mcap's Writer, prebuilt messages",
                 lambda: rivals.write_mcap(encoded, scratch),
                 SLOW_SHARE,
             ),
             Side(
-                "foxglove-sdk, messages ready-made",
+                "foxglove-sdk, prebuilt messages",
                 lambda: rivals.write_foxglove(encoded, scratch),
                 SLOW_SHARE,
             ),
             Side(
-                "rosbags' Writer, messages ready-made",
+                "rosbags' Writer, prebuilt messages",
                 lambda: rivals.write_rosbags(encoded, folder / "bag"),
                 SLOW_SHARE,
             ),
@@ -142,7 +143,7 @@ def _reading(
         Side(OURS, lambda: mcaprl.open(log)),
         Side(PLAIN, limits.plain(log)),
         Side(LEAST_WORK, limits.least(log)),
-        Side("plain zstd of the same records, packed by its level 1", limits.plain_level_1(log)),
+        Side("plain zstd of the same records, compressed at level 1", limits.plain_level_1(log)),
         Side("memcpy of the columns", lambda: [c.copy() for c in rivals.columns_of(data).values()]),
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
@@ -169,7 +170,7 @@ def _reading(
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
     """What files of the same transitions take; a log has times and counters besides."""
-    table = Table("Space that the transitions take", unit="bytes, ours = 1")
+    table = Table("File size", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
         other = folder / f"{compression}.mcap"
@@ -179,7 +180,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
     chunks = limits.raw_chunks(log, STEP_TOPIC)
     rest = ours - sum(map(len, limits.compressed_chunks(log, (STEP_TOPIC,))))
     by_level_1 = rest + sum(map(len, limits.level_1_chunks(chunks)))
-    table.ratios[f"{OURS}, if packed by zstd's level 1"] = by_level_1 / ours
+    table.ratios[f"{OURS}, compressed at zstd level 1"] = by_level_1 / ours
     for name, write, path in (
         ("h5py, gzip 1", rivals.write_h5py, folder / "table.h5"),
         ("Parquet, zstd 1", rivals.write_parquet, folder / "table.parquet"),
@@ -200,7 +201,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 def _threads(log: Path) -> Table:
     """By the clock on the wall: threads take no less CPU time."""
     return compare(
-        "Reading that log with several threads",
+        "Reading the log of vectors with several threads",
         [
             Side(OURS, lambda: mcaprl.open(log)),
             Side(f"{OURS}, 2 threads", lambda: mcaprl.open(log, threads=2)),
@@ -209,7 +210,7 @@ def _threads(log: Path) -> Table:
             Side("check, 2 threads", lambda: check_log(log, threads=2)),
         ],
         clock=time.perf_counter,
-        unit=f"time that passes on {os.cpu_count()} cores, ours with one thread = 1",
+        unit=f"wall-clock time on {os.cpu_count()} cores, ours with one thread = 1",
     )
 
 

@@ -65,9 +65,9 @@ def tables() -> list[Table]:
         _single("highway-env, racetrack-v1", _highway("highway_env:racetrack-v1"), 50),
     ]
     table = compare(
-        "A step of a sim, actions at random, resets included",
+        "A sim step with random actions, resets included",
         sides,
-        goal="a thousand steps of the car in the time of one of highway-env's racetrack",
+        goal="1,000 steps of the car in the time of one step of highway-env's racetrack",
         rounds=20,
         ours="car",
     )
