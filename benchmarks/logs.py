@@ -51,9 +51,7 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
         [
             Side(bare, lambda: rivals.record_bare(episodes)),
             Side(OURS, record, floor=bare),
-            Side(
-                "mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)
-            ),
+            Side("mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)),
             Side(
                 "foxglove-sdk, prebuilt messages",
                 lambda: rivals.write_foxglove(messages, scratch),

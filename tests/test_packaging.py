@@ -131,7 +131,9 @@ def test_the_project_pins_what_it_was_tested_with() -> None:
 
 
 def test_pre_commit_runs_the_commands_of_make_check() -> None:
-    (recipe,) = re.findall(r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    (recipe,) = re.findall(
+        r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE
+    )
     hooks = (ROOT / ".pre-commit-config.yaml").read_text()
     commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
     assert re.findall(r"entry: (.*)", hooks) == commands
