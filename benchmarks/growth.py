@@ -1,4 +1,4 @@
-"""How time and memory grow with the log: each size is read in a process of its own."""
+"""Measure how time and memory grow with the log, with a separate process for each size."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(json.dumps({**best, "kept": kept, "peak": peak}))
 
 
 def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
-    """Read logs of several sizes, and tell what a transition costs in each."""
+    """Read logs of several sizes, and return the cost per transition of each."""
     found = {}
     for size in sizes:
         path = folder / "growth.mcap"
@@ -46,7 +46,7 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
         found[size]["bytes"] = path.stat().st_size
         path.unlink()
         path.with_name(f"{path.name}.recovered.mcap").unlink()
-    per_step = {size: told["seconds"] / size for size, told in found.items()}
+    per_step = {size: row["seconds"] / size for size, row in found.items()}
     middle = per_step[sizes[len(sizes) // 2]]
     time = Table(
         "Reading logs of several sizes",
@@ -62,13 +62,13 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
     )
     checking = Table(
         "Checking logs of several sizes",
-        {_size(size, told): told["check"] / told["seconds"] for size, told in found.items()},
+        {_size(size, row): row["check"] / row["seconds"] for size, row in found.items()},
         goal="a check of more than a gigabyte takes as long as reading",
         unit="CPU time, reading the same log = 1",
     )
     recovering = Table(
         "Recovering logs of several sizes",
-        {_size(size, told): told["recover"] / told["seconds"] for size, told in found.items()},
+        {_size(size, row): row["recover"] / row["seconds"] for size, row in found.items()},
         goal="linear, like reading: recovery reads, compresses and checks",
         unit="CPU time, reading the same log = 1",
     )
@@ -78,5 +78,5 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
     return every
 
 
-def _size(transitions: int, told: dict[str, float]) -> str:
-    return f"{transitions:,} transitions, {told['bytes'] / 1e6:,.0f} MB"
+def _size(transitions: int, row: dict[str, float]) -> str:
+    return f"{transitions:,} transitions, {row['bytes'] / 1e6:,.0f} MB"

@@ -1,4 +1,4 @@
-"""What no reader can do without: the limits beside which we and others are measured."""
+"""Measure lower limits: the work that every reader has to do."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ LEAST_WORK = "mapped file, decompressed, CRCs checked"
 
 
 def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
-    """Plain decompression of a log's chunks, by default those of `/rl/step`."""
+    """Return a side that decompresses a log's chunks, by default those of `/rl/step`."""
     chunks = compressed_chunks(path, topics or (STEP_TOPIC,), **times)
     return lambda: plain_zstd(chunks)
 
 
 def least(path: Path, *topics: str) -> Callable[[], object]:
-    """What a reader of columns cannot do without."""
+    """Return a side with the least work of a reader of columns."""
     headers = chunk_headers(path, topics or (STEP_TOPIC,))
     return lambda: least_work(path, headers)
 
 
 def plain_level_1(path: Path) -> Callable[[], None]:
-    """Plain decompression of the records of `/rl/step`, as zstd packs them by itself."""
+    """Return a side that decompresses the records of `/rl/step`, compressed by zstd at level 1."""
     chunks = level_1_chunks(raw_chunks(path, STEP_TOPIC))
     return lambda: plain_zstd(chunks)
 
@@ -38,7 +38,7 @@ def plain_level_1(path: Path) -> Callable[[], None]:
 def compressed_chunks(
     path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
 ) -> list[memoryview]:
-    """The bytes of the chunks that hold a topic in a time, as they stand in the file."""
+    """Return the compressed bytes of the chunks that contain a topic in a time range."""
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
     found = []
@@ -51,7 +51,7 @@ def compressed_chunks(
 
 
 def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
-    """Decompress chunks, and nothing else: what no reader can do without."""
+    """Decompress chunks, and do nothing else."""
     import zstandard
 
     for data in chunks:
@@ -59,7 +59,7 @@ def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
 
 
 def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
-    """Of the chunks that hold a topic."""
+    """Return the headers of the chunks that contain a topic."""
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
     found = [chunk for chunk in reader.chunks if ids & set(chunk.message_index_offsets)]
@@ -67,9 +67,9 @@ def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
 
 
 def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
-    """Map a file, decompress these chunks one after the other, check them against their CRCs.
+    """Map a file, decompress these chunks one after the other, and check their CRCs.
 
-    No reader can do without: columns in new memory come on top, and finding and checking messages.
+    A reader has to do more: create columns in new memory, and find and validate messages.
     """
     import zstandard
 
@@ -83,14 +83,14 @@ def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
 
 
 def raw_chunks(path: Path, topic: str) -> list[bytes]:
-    """The records of a topic's chunks."""
+    """Return the decompressed records of a topic's chunks."""
     import zstandard
 
     return [zstandard.decompress(data) for data in compressed_chunks(path, (topic,))]
 
 
 def level_1_chunks(chunks: list[bytes]) -> list[bytes]:
-    """Chunks as zstd's level 1 packs them."""
+    """Return chunks, compressed by zstd at level 1."""
     import zstandard
 
     compressor = zstandard.ZstdCompressor(level=1)

@@ -1,4 +1,4 @@
-"""Reading parts of logs, and logs of other kinds: short episodes, other writers', images."""
+"""Measure reading parts of logs and other kinds of logs: short episodes, other writers', images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEPTH = rivals.DEPTH
 def tables(
     folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder
 ) -> list[Table]:
-    """Measure them, with files in `folder`; `log` has the transitions of `data`."""
+    """Measure them with files in `folder`; `log` contains the transitions of `data`."""
     return [
         _short_episodes(folder),
         _episode(folder, log, data, minari),
@@ -39,7 +39,7 @@ def tables(
 
 
 def _short_episodes(folder: Path) -> Table:
-    """As recorded: a chunk of `/rl/step`, and others, for each episode."""
+    """Measure a recording with one chunk of `/rl/step`, and others, for each episode."""
     path, steps = folder / "short.mcap", 20
     run_env(mcaprl.RecordMcap(Constant(steps), path), 1000, steps)
     return compare(
@@ -54,7 +54,7 @@ def _short_episodes(folder: Path) -> Table:
 
 
 def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> Table:
-    """We look the number up in the log; others are told the times or rows, or have it by number."""
+    """Measure one episode: selected by number in our reader, by time, rows or number in others."""
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
@@ -113,7 +113,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
     packed, plain, small = (folder / f"{name}.mcap" for name in ("images", "plain", "few-images"))
     hdf5, npz = folder / "images.h5", folder / "images.npz"
     data, part = images(IMAGE_STEPS), images(int(IMAGE_STEPS * SLOW_SHARE))
-    pictures = data.observations["depth"]
+    depth = data.observations["depth"]
     data.save(packed)
     data.save(plain, compression="none")
     part.save(small)
@@ -138,7 +138,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
             Side(OURS, lambda: mcaprl.open(packed, images="memory")),
             Side(PLAIN, limits.plain(packed, STEP_TOPIC, DEPTH)),
             Side(LEAST_WORK, limits.least(packed, STEP_TOPIC, DEPTH)),
-            Side("memcpy of the images", lambda: [pictures.copy()]),
+            Side("memcpy of the images", lambda: [depth.copy()]),
             Side(f"{OURS}, vectors alone", lambda: mcaprl.open(packed, columns=["state"])),
             Side(
                 "mcap + mcap-ros2-support",

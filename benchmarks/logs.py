@@ -1,4 +1,4 @@
-"""Recording, writing and reading logs."""
+"""Measure recording, writing and reading logs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
 
 
 def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
-    episodes, bare = 100, "the environment alone"
+    episodes, unrecorded = 100, "the environment alone"
     messages = (encoded * (1 + episodes * EPISODE_STEPS // len(encoded)))[
         : episodes * EPISODE_STEPS
     ]
@@ -49,8 +49,8 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
     table = compare(
         "Recording: CPU time added to each environment step",
         [
-            Side(bare, lambda: rivals.record_bare(episodes)),
-            Side(OURS, record, floor=bare),
+            Side(unrecorded, lambda: rivals.record_nothing(episodes)),
+            Side(OURS, record, floor=unrecorded),
             Side("mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)),
             Side(
                 "foxglove-sdk, prebuilt messages",
@@ -64,20 +64,20 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
                 "Minari's DataCollector, HDF5",
                 lambda: minari.record(10, "hdf5"),
                 share=10 / episodes,
-                floor=bare,
+                floor=unrecorded,
             ),
             Side(
                 "Minari's DataCollector, Arrow",
                 lambda: minari.record(10, "arrow"),
                 share=10 / episodes,
-                floor=bare,
+                floor=unrecorded,
             ),
         ],
         goal="4 times less than mcap's Writer, 2 times less than foxglove-sdk,"
         " 15 times less than Minari",
         rounds=12,
     )
-    table.ratios.pop(bare)
+    table.ratios.pop(unrecorded)
     return table
 
 
@@ -146,7 +146,7 @@ def _reading(
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
     ]
-    # A table format is read only where it can be written.
+    # A table format can be read only after it was written.
     for name, write, read, path in (
         ("h5py, gzip 1", rivals.write_h5py, rivals.read_h5py, hdf5),
         ("Parquet, zstd 1", rivals.write_parquet, rivals.read_parquet, parquet),
@@ -167,7 +167,7 @@ def _reading(
 
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
-    """What files of the same transitions take; a log has times and counters besides."""
+    """Measure file sizes for the same transitions; only a log has times and counters."""
     table = Table("File size", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
@@ -197,7 +197,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 
 
 def _threads(log: Path) -> Table:
-    """By the clock on the wall: threads take no less CPU time."""
+    """Measure wall-clock time: threads use as much CPU time."""
     return compare(
         "Reading the log of vectors with several threads",
         [
@@ -213,7 +213,7 @@ def _threads(log: Path) -> Table:
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Checking and recovering are reading, and, of the latter, writing."""
+    """Measure checking, which is reading, and recovering, which is reading and writing."""
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

@@ -1,14 +1,15 @@
-"""Off-policy estimates beside others' code, and how often their intervals are right.
+"""Compare off-policy estimates with other libraries, and measure the coverage of their intervals.
 
     python -m benchmarks.off_policy
 
 Importance sampling: the six estimators on the same logs as SCOPE-RL's, to the last digits. Fitted Q
-evaluation: beside d3rlpy's DiscreteFQE on the same log, policy and settings, and beside the returns
-that the policy really has in the sim. Coverage: how many of `--logs` logs' 95 % intervals hold the
-true value, on a task whose value follows from linear equations (tests/support/two_state_task.py).
+evaluation: compared with d3rlpy's DiscreteFQE on the same log, policy and settings, and with the
+policy's true returns in the sim. Coverage: the fraction of `--logs` logs whose 95 % interval
+contains the true value, on a task whose value is the solution of linear equations
+(tests/support/two_state_task.py).
 
-Needs d3rlpy and SCOPE-RL for the first two (`make bench-learning` installs them); what is not
-installed is left out, and said.
+The first two need d3rlpy and SCOPE-RL (`make bench-learning` installs them); what is not installed
+is reported and left out.
 """
 
 from __future__ import annotations
@@ -37,11 +38,11 @@ SCOPE_RL_NAMES: Final = {
     "WPDIS": "SelfNormalizedPDIS",
     "DR": "DoublyRobust",
 }
-"""Its self-normalised DR leaves the weights of V as they are and is not our WDR."""
+"""Its self-normalized DR leaves the weights of V as they are and is not our WDR."""
 
 
 def beside_scope_rl(logs: int) -> dict[str, float]:
-    """The largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
+    """Return the largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
     from scope_rl.ope.discrete import basic_estimators
 
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
@@ -59,7 +60,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 
 
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
-    """An episode table in SCOPE-RL's terms; the action that was taken is always its action 0."""
+    """Return an episode table in SCOPE-RL's format; the logged action is always its action 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
     # Action 1 has what is left of the probability, and the Q that makes V what it is.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
@@ -75,19 +76,19 @@ def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
 
 
 class Balance:
-    """A CartPole policy that needs no training: push to the side that the pole falls to."""
+    """A CartPole policy without training: it pushes to the side to which the pole falls."""
 
     def __init__(self, look_ahead_s: float) -> None:
-        """Look so far ahead; what looks back falls soon."""
+        """Store the number of seconds to look ahead; without looking ahead the pole falls soon."""
         self._look_ahead_s = look_ahead_s
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.int64]:
-        """(B,) 1 is to the right."""
+        """Return actions (B,): 1 pushes to the right."""
         angle, speed = observations[:, 2], observations[:, 3]
         return (angle + self._look_ahead_s * speed > 0).astype(np.int64)
 
     def action_probabilities(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(B, 2), all on one."""
+        """Return one-hot probabilities (B, 2)."""
         return np.eye(2)[self.act(observations)]
 
 
@@ -105,7 +106,7 @@ EPSILON: Final = 0.5
 
 
 def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[str, Any]:
-    """Columns of episodes of a policy that errs, as `Dataset.from_arrays` takes them."""
+    """Return columns of episodes of a partly random policy, for `Dataset.from_arrays`."""
     random = np.random.default_rng(seed)
     rows = []
     with closing(gym.make("CartPole-v1")) as env:
@@ -125,7 +126,7 @@ def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[
 
 
 def true_value(policy: Balance, episodes: int = 200) -> float:
-    """Its discounted return over fresh episodes."""
+    """Return the policy's mean discounted return over fresh episodes."""
     played = cartpole(policy, 0.0, episodes, seed=9)
     ends = np.flatnonzero(played["terminated"] | played["truncated"])
     lengths = np.diff(ends, prepend=-1)
@@ -134,19 +135,19 @@ def true_value(policy: Balance, episodes: int = 200) -> float:
 
 
 def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """FQE as `evaluate --data` has it."""
+    """Return the FQE estimate, with the settings of `evaluate --data`."""
     data = mcaprl.Dataset.from_arrays(**columns, env_id="CartPole-v1")
     return OffPolicyEvaluator(data, FQE, seed).evaluate(policy, "").estimates[0].value or 0.0
 
 
 def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """d3rlpy's FQE with the same settings: the mean value of the first states."""
+    """Return d3rlpy's FQE with the same settings: the mean value of the first states."""
     import d3rlpy
     from d3rlpy.ope.fqe import DiscreteFQE
     from d3rlpy.ope.fqe import FQEConfig as TheirConfig
 
     class Acting:
-        """What DiscreteFQE asks of the algorithm that it evaluates."""
+        """The interface that DiscreteFQE needs of the algorithm that it evaluates."""
 
         @property
         def impl(self) -> Acting:
@@ -181,7 +182,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print both FQEs, on logs and networks of their own for each seed, and the truth."""
+    """Print both FQE estimates, on separate logs and networks for each seed, and the true value."""
     print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
     for name, policy in POLICIES.items():
         found = []
@@ -195,10 +196,10 @@ def beside_d3rlpy(seeds: int) -> None:
 
 
 def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
-    """The share of logs whose interval holds the true value, for each estimator.
+    """Return the fraction of logs whose interval contains the true value, for each estimator.
 
     Returns:
-        For our intervals, and for percentiles of the same resamplings.
+        For our intervals, and for percentiles of the same bootstrap samples.
     """
     held = {kind: dict.fromkeys(ESTIMATORS, 0.0) for kind in ("ours", "percentiles")}
     for seed in range(logs):
@@ -237,8 +238,8 @@ def main() -> None:
     for episodes in (50, 300):
         print(f"{arguments.logs} logs of {episodes} episodes; 95 % intervals that hold the truth:")
         for kind, shares in coverage(arguments.logs, episodes).items():
-            told = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
-            print(f"  {kind}: {told}", flush=True)
+            text = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
+            print(f"  {kind}: {text}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Puts tables into docs/results.md, between the marks that say whose place it is."""
+"""Write tables into docs/results.md, between the marks of their section."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ PAGE = Path(__file__).parent.parent / "docs" / "results.md"
 
 
 def write_section(name: str, text: str, page: Path = PAGE) -> None:
-    """Replace what stands between `<!-- name -->` and `<!-- /name -->`.
+    """Replace the text between `<!-- name -->` and `<!-- /name -->`.
 
     Raises:
-        ValueError: the page does not have these two marks, once each.
+        ValueError: The page does not have these two marks, once each.
     """
     begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->"
     before, found, rest = page.read_text().partition(begin)

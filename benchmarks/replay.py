@@ -1,8 +1,8 @@
-"""What long logs ask of a viewer: chunks, index, and the memory that our player takes to jump.
+"""Measure what long logs cost a viewer: chunks, index, and the memory of our player for a seek.
 
     python benchmarks/replay.py
 
-Logs are made in a temporary folder: a million steps without a scene, and an hour of the lane sim
+Creates two logs in a temporary folder: a million steps without a scene, and an hour of the lane sim
 with one.
 """
 
@@ -28,7 +28,7 @@ JUMPS = 20
 
 
 def main() -> None:
-    """Make the logs, jump about in each, print a table."""
+    """Create the logs, seek in each, and print a table."""
     print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory for a seek, MB |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
@@ -36,7 +36,7 @@ def main() -> None:
             path = Path(folder) / "log.mcap"
             path.unlink(missing_ok=True)
             steps = make(path)
-            # In a process of its own: the making took memory, too.
+            # In a separate process, because creating the log takes memory, too.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
                 print(f"| {name} | {steps} | {pool.submit(_row, path).result()} |", flush=True)
 

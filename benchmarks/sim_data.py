@@ -1,16 +1,16 @@
-"""Six logs of each of our sims, of about 20,000 transitions each, to learn from offline.
+"""Create six logs of each sim, of about 20,000 transitions each, for offline training.
 
-random   actions at random
-medium   an online run's policy as soon as it scores half of the pilot, one action in ten random
+random   random actions
+medium   an online policy that scores half of the pilot, with 10 % random actions
 expert   the sim's pilot
-replay   all that this online run did until then
-mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and actions at random
-weak     a pilot that mostly does the wrong thing, and now and then what it should: the drone's and
-         the racer's are drowsy and do nothing, the car's is timid and brakes above 5 m/s
+replay   all transitions of this online training until then
+mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and random actions
+weak     a pilot that mostly does the wrong thing: the drone's and the racer's do nothing, the
+         car's brakes above 5 m/s
 
-Most actions of the weak pilot are bad ones, in most states: who imitates it does as badly. What
-would be better is in the log all the same, and its rewards tell. A drowsy car would be off its lane
-within eight seconds, and its log would show little of the course.
+Most actions of the weak pilot are bad ones, in most states, so imitation performs as badly. The
+better actions are in the log, and its rewards identify them. A car that does nothing would leave
+its lane within eight seconds, and its log would show little of the course.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class WeakPilot(EpsilonGreedy):
     """A pilot that does the wrong thing most of the time."""
 
     def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
-        """Take the pilot of `env`; where it does right it is a little clumsy."""
+        """Wrap the pilot of `env`; its correct actions include some random ones."""
         super().__init__(make_pilot(env), CLUMSY, env.action_space)
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
         self._sim, self._timid_above_m_s = env.unwrapped, TIMID_ABOVE_M_S.get(sim)
 
     def choose(self, observation: Any) -> tuple[Any, float]:
-        """The action for one observation, and the probability with which it is chosen."""
+        """Return the action for one observation, and its probability."""
         assert self.policy is not None
         weak = WEAK if self._is_weak_here() else 0.0
         chances = np.full(self._count, (1 - weak) * CLUMSY / self._count)
@@ -76,7 +76,7 @@ class WeakPilot(EpsilonGreedy):
 
 
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:
-    """Make the logs of a sim that are not there yet; gives the paths of all six."""
+    """Create the missing logs of a sim, and return the paths of all six."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     online = folder / "online"
@@ -89,7 +89,7 @@ def make_logs(folder: Path, sim: str) -> dict[str, Path]:
 
 
 def _learn_online(sim: str, out: Path, log: Path) -> None:
-    """Learn with the sim's own settings, and stop halfway; `out` has the best policy then."""
+    """Train with the sim's default settings, and stop halfway; `out` has the best policy then."""
 
     def stop_halfway(now: TrainingProgress) -> None:
         if now.terms["score"] >= MEDIUM_SCORE:
@@ -110,7 +110,7 @@ class _HalfwayError(Exception):
 
 
 def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
-    """Who acts in each log, one after the other."""
+    """Return the behavior policies of each log, in order."""
 
     def pilot(epsilon: float) -> MakeBehavior:
         return lambda env: EpsilonGreedy(make_pilot(env), epsilon, env.action_space)

@@ -1,6 +1,6 @@
-"""The sims beside highway-env's own environments, on one core.
+"""Measure the sims relative to highway-env's environments, on one core.
 
-`python -m benchmarks.sims` prints steps per second of this machine; `make bench` has the ratios.
+`python -m benchmarks.sims` prints steps per second on this machine; `make bench` has the ratios.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ QUADROTOR_STEPS = 5
 
 
 STEPS = 1_000_000
-"""So many steps are the task; each side takes a share of them."""
+"""Number of steps of the task; each side takes a share of them."""
 
 
 GOALS = {
@@ -36,15 +36,15 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """A turn of each of our sims takes some hundredths of a second: short enough to be undisturbed.
+    """Return our sims as sides, with turns of some hundredths of a second to limit disturbances.
 
-    What is under way at its end goes on in the next.
+    An episode that is not finished at the end of a turn continues in the next one.
     """
     return [
         _single("car", make_sim("lane"), 10_000),
         _batch(f"car, {CARS} in a batch", make_sims("lane", CARS), 200),
         _single("car with 16 rays", make_sim("lane", observation="rays"), 2_000),
-        _pictures("depth image of 84x84", make_sim("lane"), 100),
+        _frames_of("depth image of 84x84", make_sim("lane"), 100),
         _single("car with a depth image", make_sim("lane", observation="depth"), 100),
         _batch(
             f"quadrotor, 0.1 s of flight, {DRONES} in a batch",
@@ -76,7 +76,7 @@ def tables() -> list[Table]:
 
 
 def main() -> None:
-    """Print how many steps each of our sims makes, in the best of a hundred turns."""
+    """Print the steps per second of each sim, in the best of a hundred turns."""
     for side in ours():
         taken_s = min(_cpu_s(side) for _ in range(100))
         rate, goal = side.share * STEPS / taken_s, GOALS.get(side.name)
@@ -111,8 +111,8 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
     return Side(name, run, share=steps / STEPS)
 
 
-def _pictures(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
-    """A frame for each step, and none for a reset."""
+def _frames_of(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
+    """Return a side that renders a frame for each step, and none for a reset."""
     sim: Any = env.unwrapped
     sim.action_space.seed(0)
     actions = [sim.action_space.sample() for _ in range(frames)]
