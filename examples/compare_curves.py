@@ -1,4 +1,4 @@
-"""Draw the curves of online runs in one picture.
+"""Plot the learning curves of online runs in one image.
 
 python examples/compare_curves.py RUN... --out curves.png [--value mean_progress_m]
 """
@@ -12,12 +12,12 @@ from mcaprl.online.curve_picture import VALUES, curve_picture, read_run
 
 
 def main() -> None:
-    """Read the runs and draw."""
+    """Read the runs and plot them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     parser.add_argument("--out", required=True, type=Path)
     parser.add_argument("--title", default="")
-    parser.add_argument("--value", choices=VALUES, help="what of the curves; default: the score")
+    parser.add_argument("--value", choices=VALUES, help="value to plot; default: the score")
     arguments = parser.parse_args()
     runs = [read_run(folder) for folder in arguments.runs]
     curve_picture(arguments.out, runs, arguments.title, arguments.value)
