@@ -1,27 +1,27 @@
-# One verb per task; `make` alone lists them. Everything is installed into $(VENV).
+# One target per task; `make` without a target lists them. Everything is installed into $(VENV).
 PYTHON ?= python3
 VENV ?= .venv
 BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt
-# Whatever of these changes, the environments are set up anew.
+# A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
 
 .PHONY: help demo test faults fuzz check bench bench-learning bench-gpu sim-grid docs wheel clean
 
 help:
-	@echo "make demo    record a car, learn from its log offline, evaluate, make the replay"
-	@echo "make test    run all tests"
-	@echo "make faults  kill recorders, spoil files and fail writes by the thousand"
-	@echo "make fuzz    search for bytes that the reader cannot bear, for ten minutes"
-	@echo "make check   format, lint, types, and the direction of imports"
-	@echo "make bench   measure speed against other libraries, as ratios"
-	@echo "make bench-learning   the same of learning and off-policy estimates, beside d3rlpy, SB3, SCOPE-RL"
-	@echo "make bench-gpu   updates per second on a GPU, and the share of what it can do"
-	@echo "make sim-grid    learn offline from six logs of each sim, four seeds; it takes long, and goes on if stopped"
-	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
-	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
-	@echo "make clean   remove what these made"
+	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
+	@echo "make test             run all tests"
+	@echo "make faults           run the fault tests at full size: kills, damaged files, failed writes"
+	@echo "make fuzz             fuzz the reader for ten minutes"
+	@echo "make check            check format, lint, words, types and import contracts"
+	@echo "make bench            measure speed relative to other libraries"
+	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
+	@echo "make bench-gpu        measure updates per second on a GPU, and the share of its peak"
+	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
+	@echo "make docs             generate docs/cli.md and the images of the docs"
+	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
+	@echo "make clean            remove the environments and everything that was built"
 
 demo: $(VENV)/.demo
 	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
@@ -42,6 +42,7 @@ fuzz: $(VENV)/.fuzz
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
@@ -63,7 +64,7 @@ docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
 
 wheel: $(VENV)/.dev
-	PYTHON="$(BIN)/python" sh .ci/bare-wheel
+	PYTHON="$(BIN)/python" sh .ci/check-wheel
 
 clean:
 	rm -rf $(VENV) $(BENCH) build dist demo *.egg-info tests/node/node_modules
@@ -84,7 +85,7 @@ $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,fast]' --group dev
 	@touch $@
 
-# The libraries that we are measured against.
+# The libraries that the benchmarks compare with.
 $(BENCH)/.ready: $(SETTINGS)
 	@echo "installing into $(BENCH)"
 	$(PYTHON) -m venv $(BENCH)
@@ -93,8 +94,8 @@ $(BENCH)/.ready: $(SETTINGS)
 	  -e '.[sims,offline,fast]' --group bench
 	@touch $@
 
-# d3rlpy pins an older gymnasium than we need, and runs with ours: it goes in without its pins, and
-# so does SCOPE-RL.
+# d3rlpy requires an older gymnasium but runs with the one of constraints.txt; it and SCOPE-RL are
+# installed without their dependencies.
 $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	@echo "installing into $(VENV)/rivals"
 	$(BIN)/python -m venv $(VENV)/rivals
@@ -107,7 +108,7 @@ $(VENV)/.fuzz: $(VENV)/.dev
 	$(PIP) --group fuzz
 	@touch $@
 
-# Node's MCAP libraries judge our logs; without npm those tests are skipped.
+# Node's MCAP libraries read the logs in tests; without npm those tests are skipped.
 tests/node/node_modules: tests/node/package-lock.json
 	@if command -v npm >/dev/null; then cd tests/node && npm ci --silent --no-audit --no-fund; \
 	  else echo "npm is not installed: tests with Node's readers will be skipped"; fi

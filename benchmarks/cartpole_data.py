@@ -1,9 +1,9 @@
-"""Five CartPole-v1 logs of 50,000 transitions each, from agents of Stable-Baselines3.
+"""Create five CartPole-v1 logs of 50,000 transitions each, from agents of Stable-Baselines3.
 
-random   actions at random
-medium   PPO halfway: the first iteration at which it stands for 200 steps, actions drawn
-expert   PPO at the end, its best actions
-replay   all that DQN did while it learned
+random   random actions
+medium   PPO halfway: the first iteration with a mean return of 200, actions sampled
+expert   PPO at the end, greedy actions
+replay   all transitions of DQN's training
 mixed    half random, half expert
 """
 
@@ -29,7 +29,7 @@ Act = Callable[[NDArray[Any]], int]
 
 
 def make_logs(folder: Path) -> dict[str, mcaprl.Dataset]:
-    """Record the logs that do not exist yet, and read all five."""
+    """Create the missing logs, and read all five."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     if not all(path.exists() for path in paths.values()):
@@ -77,7 +77,7 @@ def _record_all(paths: dict[str, Path]) -> None:
 
 
 def record(path: Path, act: Act, steps: int) -> None:
-    """Record about this many steps, in whole episodes."""
+    """Record at least this number of steps, in whole episodes."""
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
     done = episode = 0
     while done < steps:
@@ -92,7 +92,7 @@ def record(path: Path, act: Act, steps: int) -> None:
 
 
 class _StopAt(BaseCallback):
-    """Callback that stops training at a mean return of the last episodes."""
+    """Callback that stops training when the mean return of the last episodes is high enough."""
 
     def __init__(self, mean_return: float) -> None:
         super().__init__()

@@ -1,11 +1,12 @@
-"""Five CartPole logs, five algorithms, four seeds, next to d3rlpy on the same logs in one run.
+"""Train five algorithms on five CartPole logs with four seeds, and d3rlpy's on the same logs.
 
     python benchmarks/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
 
-5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target every 200, 256x256. A figure is
-the mean return of the last three evaluations (after 4000, 4500 and 5000 updates), 10 episodes each.
-d3rlpy takes part where it is installed, with one seed. Each cell is kept in FOLDER/grid.json, so a
-run that was stopped goes on; the table goes to docs/results.md, with the gates that hold or do not.
+5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target update every 200, 256x256. A
+result is the mean return of the last three evaluations (after 4000, 4500 and 5000 updates) of 10
+episodes each. d3rlpy takes part with one seed where it is installed. FOLDER/grid.json has each
+finished cell, so an interrupted run resumes. The table and the results of the gates are written to
+docs/results.md.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ Act = Callable[[NDArray[Any]], NDArray[Any]]
 
 
 def mean_return(act: Act, seed: int) -> float:
-    """Return the mean return of the first episode in each of ten vectorized environments."""
+    """Return the mean return of the first episode in each of ten parallel environments."""
     envs = gym.make_vec("CartPole-v1", EPISODES, "vector_entry_point")
     observations, _ = envs.reset(seed=seed)
     returns, running = np.zeros(EPISODES), np.ones(EPISODES, bool)
@@ -65,7 +66,7 @@ def mean_return(act: Act, seed: int) -> float:
 
 
 def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
-    """Train our algorithm and return the score of each seed."""
+    """Return the mean return of each seed."""
     learner_type = ALGORITHMS[algo]
     values = VALUES if issubclass(learner_type.config_type, BootstrapConfig) else {}
     config = learner_type.config_type(**SHARED, **values)
@@ -83,7 +84,7 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
 
 
 def greedy(learner: Any, seed: int) -> Act:
-    """Return the current greedy policy of one seed."""
+    """Return the greedy action of a seed's current network."""
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
 
@@ -95,7 +96,7 @@ def greedy(learner: Any, seed: int) -> Act:
 
 
 def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
-    """Train d3rlpy's algorithm and return the score of one seed."""
+    """Return d3rlpy's mean return, of one seed."""
     import d3rlpy
 
     d3rlpy.seed(0)
@@ -151,7 +152,7 @@ GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
         )
     ),
 }
-"""Conditions that our results have to meet."""
+"""What must hold of our own."""
 
 
 def verdict(gate: str, result: dict[str, Any]) -> str:
@@ -163,7 +164,7 @@ def verdict(gate: str, result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the missing cells of the grid, and print the table and the gates."""
+    """Run the missing cells of the grid, print it, and evaluate the gates."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
@@ -187,7 +188,7 @@ def main() -> None:
 
 
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
-    """Return side, algorithm and log of each cell; our cells and those of the gates come first."""
+    """Return side, algorithm and log of each cell: first ours, and those of the gates."""
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
     if importlib.util.find_spec("d3rlpy") is None:
@@ -196,12 +197,12 @@ def cells(algos: list[str]) -> list[tuple[str, str, str]]:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Format the table, followed by the gates."""
+    """Return the table, followed by the gates."""
     return "\n".join([table(result), "", *(f"- {verdict(gate, result)}: {gate}" for gate in GATES)])
 
 
 def table(result: dict[str, Any]) -> str:
-    """Format Markdown cells: our mean, the range over seeds, and d3rlpy's; a dash was not run."""
+    """Return Markdown: our mean, the range of the seeds, and d3rlpy's mean; a dash if not run."""
     lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
     for name in NAMES:
         texts = []

@@ -1,4 +1,4 @@
-"""Growth of time and memory with the log's size; each size is read in a separate process."""
+"""Measure how time and memory grow with the log, with a separate process for each size."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ print(json.dumps({**best, "kept": kept, "peak": peak}))
 
 
 def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
-    """Measure the cost per transition of reading logs of several sizes."""
+    """Read logs of several sizes, and return the cost per transition of each."""
     found = {}
     for size in sizes:
         path = folder / "growth.mcap"
@@ -46,30 +46,30 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
         found[size]["bytes"] = path.stat().st_size
         path.unlink()
         path.with_name(f"{path.name}.recovered.mcap").unlink()
-    per_step = {size: told["seconds"] / size for size, told in found.items()}
+    per_step = {size: row["seconds"] / size for size, row in found.items()}
     middle = per_step[sizes[len(sizes) // 2]]
     time = Table(
         "Reading logs of several sizes",
         {f"{size:,} transitions": per_step[size] / middle for size in sizes},
-        goal="linear: a transition costs the same in each",
+        goal="linear: the same time per transition at each size",
         unit=f"CPU time per transition, of {sizes[len(sizes) // 2]:,} = 1",
     )
     memory = Table(
-        "Memory while reading them",
+        "Memory while reading logs of several sizes",
         {f"{size:,} transitions": found[size]["peak"] / found[size]["kept"] for size in sizes},
         goal="the dataset and a few chunks",
-        unit="peak of memory while reading, the finished dataset = 1",
+        unit="peak memory, the finished dataset = 1",
     )
     checking = Table(
-        "Checking them",
-        {_size(size, told): told["check"] / told["seconds"] for size, told in found.items()},
-        goal="a check of a good gigabyte runs at reading speed",
+        "Checking logs of several sizes",
+        {_size(size, row): row["check"] / row["seconds"] for size, row in found.items()},
+        goal="a check of more than a gigabyte takes as long as reading",
         unit="CPU time, reading the same log = 1",
     )
     recovering = Table(
-        "Recovering them",
-        {_size(size, told): told["recover"] / told["seconds"] for size, told in found.items()},
-        goal="linear, as reading is: what is recovered is read, packed and checked",
+        "Recovering logs of several sizes",
+        {_size(size, row): row["recover"] / row["seconds"] for size, row in found.items()},
+        goal="linear, like reading: recovery reads, compresses and checks",
         unit="CPU time, reading the same log = 1",
     )
     every = [time, checking, recovering, memory]
@@ -78,5 +78,5 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
     return every
 
 
-def _size(transitions: int, told: dict[str, float]) -> str:
-    return f"{transitions:,} transitions, {told['bytes'] / 1e6:,.0f} MB"
+def _size(transitions: int, row: dict[str, float]) -> str:
+    return f"{transitions:,} transitions, {row['bytes'] / 1e6:,.0f} MB"

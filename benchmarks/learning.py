@@ -1,14 +1,14 @@
-"""Updates per second of Double DQN and CQL beside d3rlpy's and SB3's DQN, as ratios.
+"""Measure updates per second of Double DQN and CQL relative to d3rlpy's and SB3's DQN.
 
     python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
 
 One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
-time on one thread, the best of several turns. The last row is the whole way: a log of LOG_ROWS
-steps on disk is read and packed, and CQL makes LOG_UPDATES updates of batch 256; the other way is
-mcap with mcap-ros2-support, and d3rlpy. There a part of the work is done and scaled up: a tenth of
-the log, and as many updates as fit into the turns. Prints the ratios, writes them to
-benchmarks/learning.json, and the table into docs/results.md. With --only 256, 32 or whole the other
-rows stay as an earlier run found them.
+time on one thread, the best of several turns. The last row covers the whole path: a log of LOG_ROWS
+steps on disk is read and packed, and CQL makes LOG_UPDATES updates of batch 256; the alternative is
+mcap with mcap-ros2-support, and d3rlpy. The alternative does a part of the work, and its time is
+scaled up: a tenth of the log, and as many updates as fit into the turns. Prints the ratios, writes
+them to benchmarks/learning.json, and writes the table to docs/results.md. With --only 256, 32 or
+whole, the other rows keep the values of an earlier run.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ Update = Callable[[], object]
 
 
 def transitions() -> mcaprl.Dataset:
-    """Random transitions in episodes of 1000."""
+    """Return random transitions in episodes of 1000."""
     random = np.random.default_rng(0)
     frames = random.normal(size=(ROWS // EPISODE, EPISODE + 1, WIDTH)).astype(np.float32)
     return mcaprl.Dataset.from_arrays(
@@ -75,14 +75,14 @@ def transitions() -> mcaprl.Dataset:
 
 
 def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Update:
-    """One update of so many seeds."""
+    """Return a function that makes one update of this number of seeds."""
     config = ALGORITHMS[algo].config_type(batch_size=batch_size)
     buffer = TransitionBuffer.from_dataset(data, config.packing)
     return ALGORITHMS[algo](config, buffer, range(seeds)).update
 
 
 def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
-    """One update of d3rlpy, its batch drawn from its own buffer."""
+    """Return a function that makes one update of d3rlpy, with a batch from its buffer."""
     log = d3rlpy.dataset.MDPDataset(
         data.observations,
         data.actions,
@@ -100,7 +100,7 @@ def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
 
 
 def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
-    """Ten updates of SB3's DQN, which is not double."""
+    """Return a function that makes ten updates of SB3's DQN, which is not a Double DQN."""
 
     class Spaces(gym.Env[Any, Any]):
         observation_space = spaces.Box(-np.inf, np.inf, (WIDTH,), np.float32)
@@ -120,11 +120,11 @@ def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
 
 @dataclass(frozen=True)
 class Turns:
-    """How sides take turns.
+    """Number and length of the turns of each side.
 
     Attributes:
-        rounds: turns of each.
-        seconds: of CPU time, of one.
+        rounds: Number of turns of each side.
+        seconds: CPU time of one turn.
     """
 
     rounds: int
@@ -132,7 +132,7 @@ class Turns:
 
 
 def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, float]:
-    """Updates per CPU second of each side, in its best turn; a call makes so many updates."""
+    """Return updates per CPU second of each side in its best turn."""
     best = dict.fromkeys(sides, 0.0)
     for _ in range(turns.rounds):
         for name, (update, count) in sides.items():
@@ -145,7 +145,7 @@ def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, 
 
 
 def whole_way(folder: Path, turns: Turns) -> float:
-    """How many times the CPU time of ours the others need from a log on disk to a policy."""
+    """Return the ratio of the CPU times from a log on disk to a policy, theirs to ours."""
     log, part = folder / "log.mcap", folder / "part.mcap"
     vectors(LOG_ROWS).save(log)
     rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
@@ -162,7 +162,7 @@ def whole_way(folder: Path, turns: Turns) -> float:
 
 
 def logged(columns: dict[str, Any]) -> Any:
-    """Columns under the names that a dataset has for them; where episodes end is given away."""
+    """Return columns under the names of a dataset; the ends of episodes are given."""
     rows = len(columns["action"])
     return SimpleNamespace(
         observations=columns["observation"],
@@ -174,7 +174,7 @@ def logged(columns: dict[str, Any]) -> Any:
 
 
 def rows_of(size: int, turns: Turns) -> dict[str, float]:
-    """The ratios at one batch size."""
+    """Return the ratios at one batch size."""
     data = transitions()
     sides = {
         "ddqn": (ours(data, "double-dqn", size), 1),
@@ -217,7 +217,7 @@ def main() -> None:
 
 
 def as_table(results: dict[str, float]) -> str:
-    """Markdown, with the goals and the versions."""
+    """Return the table as Markdown, with the goals and the versions."""
     lines = ["| what | times as fast | goal |", "|---|---|---|"]
     lines += [f"| {name} | {x:.2f} | {GOALS.get(name, '')} |" for name, x in results.items()]
     versions = ", ".join(f"{name} {version(name)}" for name in LIBRARIES)

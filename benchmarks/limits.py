@@ -1,4 +1,4 @@
-"""Lower bounds of any reader: decompression, CRC checks and copies."""
+"""Measure lower limits: the work that every reader has to do."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from mcaprl.recorder.columns.records import map_file
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 PLAIN = "plain zstd of the same chunks"
-LEAST_WORK = "likewise from the file, CRCs checked"
+LEAST_WORK = "mapped file, decompressed, CRCs checked"
 
 
 def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
-    """Measure plain decompression of a log's chunks, by default those of `/rl/step`."""
+    """Return a side that decompresses a log's chunks, by default those of `/rl/step`."""
     chunks = compressed_chunks(path, topics or (STEP_TOPIC,), **times)
     return lambda: plain_zstd(chunks)
 
 
 def least(path: Path, *topics: str) -> Callable[[], object]:
-    """Measure decompression and CRC checks from the file."""
+    """Return a side with the least work of a reader of columns."""
     headers = chunk_headers(path, topics or (STEP_TOPIC,))
     return lambda: least_work(path, headers)
 
 
 def plain_level_1(path: Path) -> Callable[[], None]:
-    """Measure decompression of the records of `/rl/step` that zstd itself compressed at level 1."""
+    """Return a side that decompresses the records of `/rl/step`, compressed by zstd at level 1."""
     chunks = level_1_chunks(raw_chunks(path, STEP_TOPIC))
     return lambda: plain_zstd(chunks)
 
@@ -38,7 +38,7 @@ def plain_level_1(path: Path) -> Callable[[], None]:
 def compressed_chunks(
     path: Path, topics: tuple[str, ...], start_ns: int = 0, stop_ns: int = 2**63
 ) -> list[memoryview]:
-    """Return the compressed chunks of a topic in a time range, as stored in the file."""
+    """Return the compressed bytes of the chunks that contain a topic in a time range."""
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
     found = []
@@ -51,7 +51,7 @@ def compressed_chunks(
 
 
 def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
-    """Decompress chunks and do nothing else."""
+    """Decompress chunks, and do nothing else."""
     import zstandard
 
     for data in chunks:
@@ -59,7 +59,7 @@ def plain_zstd(chunks: Sequence[bytes | memoryview]) -> None:
 
 
 def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
-    """Return the index records of the chunks that contain a topic."""
+    """Return the headers of the chunks that contain a topic."""
     reader = McapReader(path)
     ids = {channel.id for channel in reader.channels.values() if channel.topic in topics}
     found = [chunk for chunk in reader.chunks if ids & set(chunk.message_index_offsets)]
@@ -69,7 +69,7 @@ def chunk_headers(path: Path, topics: tuple[str, ...]) -> list[ChunkHeader]:
 def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
     """Map a file, decompress these chunks one after the other, and check their CRCs.
 
-    No reader can do without: columns in new memory come on top, and finding and checking messages.
+    A reader has to do more: create columns in new memory, and find and validate messages.
     """
     import zstandard
 
@@ -83,14 +83,14 @@ def least_work(path: Path, headers: Sequence[ChunkHeader]) -> None:
 
 
 def raw_chunks(path: Path, topic: str) -> list[bytes]:
-    """Return the records of a topic's chunks."""
+    """Return the decompressed records of a topic's chunks."""
     import zstandard
 
     return [zstandard.decompress(data) for data in compressed_chunks(path, (topic,))]
 
 
 def level_1_chunks(chunks: list[bytes]) -> list[bytes]:
-    """Compress chunks by zstd at level 1."""
+    """Return chunks, compressed by zstd at level 1."""
     import zstandard
 
     compressor = zstandard.ZstdCompressor(level=1)

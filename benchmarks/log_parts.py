@@ -1,4 +1,4 @@
-"""Reading parts of logs, and other kinds of logs: short episodes, other writers, images."""
+"""Measure reading parts of logs and other kinds of logs: short episodes, other writers', images."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def tables(
 
 
 def _short_episodes(folder: Path) -> Table:
-    """As recorded: a chunk of `/rl/step`, and others, for each episode."""
+    """Measure a recording with one chunk of `/rl/step`, and others, for each episode."""
     path, steps = folder / "short.mcap", 20
     run_env(mcaprl.RecordMcap(Constant(steps), path), 1000, steps)
     return compare(
@@ -54,7 +54,7 @@ def _short_episodes(folder: Path) -> Table:
 
 
 def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> Table:
-    """Measure reading one episode; other readers get its times or rows, or address it by index."""
+    """Measure one episode: selected by number in our reader, by time, rows or number in others."""
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
@@ -113,7 +113,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
     packed, plain, small = (folder / f"{name}.mcap" for name in ("images", "plain", "few-images"))
     hdf5, npz = folder / "images.h5", folder / "images.npz"
     data, part = images(IMAGE_STEPS), images(int(IMAGE_STEPS * SLOW_SHARE))
-    pictures = data.observations["depth"]
+    depth = data.observations["depth"]
     data.save(packed)
     data.save(plain, compression="none")
     part.save(small)
@@ -138,7 +138,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
             Side(OURS, lambda: mcaprl.open(packed, images="memory")),
             Side(PLAIN, limits.plain(packed, STEP_TOPIC, DEPTH)),
             Side(LEAST_WORK, limits.least(packed, STEP_TOPIC, DEPTH)),
-            Side("memcpy of the pictures", lambda: [pictures.copy()]),
+            Side("memcpy of the images", lambda: [depth.copy()]),
             Side(f"{OURS}, vectors alone", lambda: mcaprl.open(packed, columns=["state"])),
             Side(
                 "mcap + mcap-ros2-support",
@@ -162,14 +162,14 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
             Side(f"{OURS}, in memory", lambda: [memory.batch(rows) for rows in batches]),
             Side("NumPy, one array in memory", lambda: [(frames[r], frames[r]) for r in batches]),
         ],
-        goal="300,000 transitions a second on disk; NumPy's speed is the limit",
+        goal="300,000 transitions per second on disk; NumPy's speed is the limit",
         ours=f"{OURS}, on disk",
     )
     return [reading, drawing]
 
 
 def _with_episodes(encoded: list[bytes]) -> list[bytes]:
-    """Number the prepared messages so that they form whole episodes."""
+    """Number the prebuilt messages, so that they form complete episodes."""
     dtype = message_dtype(rivals.TEXT)
     assert dtype is not None
     rows = np.frombuffer(b"".join(encoded), dtype).copy()

@@ -1,4 +1,4 @@
-"""Recording, writing and reading logs."""
+"""Measure recording, writing and reading logs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaprl.recorder.repair.recover import recover_log
 
 
 def tables(folder: Path, transitions: int) -> list[Table]:
-    """Run the benchmarks of logs with files in `folder`."""
+    """Measure everything about logs, with files in `folder`."""
     data = vectors(transitions)
     part = vectors(int(transitions * SLOW_SHARE))
     encoded = rivals.messages(part)
@@ -37,7 +37,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
 
 
 def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) -> Table:
-    episodes, bare = 100, "the environment alone"
+    episodes, unrecorded = 100, "the environment alone"
     messages = (encoded * (1 + episodes * EPISODE_STEPS // len(encoded)))[
         : episodes * EPISODE_STEPS
     ]
@@ -47,38 +47,37 @@ def _recording(folder: Path, encoded: list[bytes], minari: rivals.MinariFolder) 
         run_env(mcaprl.RecordMcap(Constant(), scratch, overwrite=True), episodes)
 
     table = compare(
-        "Recording: CPU time that is added to each step of an environment",
+        "Recording: CPU time added to each environment step",
         [
-            Side(bare, lambda: rivals.record_bare(episodes)),
-            Side(OURS, record, floor=bare),
+            Side(unrecorded, lambda: rivals.record_nothing(episodes)),
+            Side(OURS, record, floor=unrecorded),
+            Side("mcap's Writer, prebuilt messages", lambda: rivals.write_mcap(messages, scratch)),
             Side(
-                "mcap's Writer, messages ready-made", lambda: rivals.write_mcap(messages, scratch)
-            ),
-            Side(
-                "foxglove-sdk, messages ready-made",
+                "foxglove-sdk, prebuilt messages",
                 lambda: rivals.write_foxglove(messages, scratch),
             ),
             Side(
-                "rosbags' Writer, messages ready-made",
+                "rosbags' Writer, prebuilt messages",
                 lambda: rivals.write_rosbags(messages, folder / "bag"),
             ),
             Side(
                 "Minari's DataCollector, HDF5",
                 lambda: minari.record(10, "hdf5"),
                 share=10 / episodes,
-                floor=bare,
+                floor=unrecorded,
             ),
             Side(
                 "Minari's DataCollector, Arrow",
                 lambda: minari.record(10, "arrow"),
                 share=10 / episodes,
-                floor=bare,
+                floor=unrecorded,
             ),
         ],
-        goal="4 times less than mcap's Writer, 2 than foxglove-sdk, 15 than Minari's DataCollector",
+        goal="4 times less than mcap's Writer, 2 times less than foxglove-sdk,"
+        " 15 times less than Minari",
         rounds=12,
     )
-    table.ratios.pop(bare)
+    table.ratios.pop(unrecorded)
     return table
 
 
@@ -93,23 +92,23 @@ def _writing(
     scratch = folder / "written"
     chunks = limits.raw_chunks(log, STEP_TOPIC)
     return compare(
-        "Writing transitions that are in memory",
+        "Writing transitions from memory",
         [
             Side(OURS, lambda: data.save(folder / "written.mcap", overwrite=True)),
             Side("plain zstd 1 of the same chunks", lambda: limits.level_1_chunks(chunks)),
             Side("memcpy of the same chunks", lambda: [bytearray(chunk) for chunk in chunks]),
             Side(
-                "mcap's Writer, messages ready-made",
+                "mcap's Writer, prebuilt messages",
                 lambda: rivals.write_mcap(encoded, scratch),
                 SLOW_SHARE,
             ),
             Side(
-                "foxglove-sdk, messages ready-made",
+                "foxglove-sdk, prebuilt messages",
                 lambda: rivals.write_foxglove(encoded, scratch),
                 SLOW_SHARE,
             ),
             Side(
-                "rosbags' Writer, messages ready-made",
+                "rosbags' Writer, prebuilt messages",
                 lambda: rivals.write_rosbags(encoded, folder / "bag"),
                 SLOW_SHARE,
             ),
@@ -142,12 +141,12 @@ def _reading(
         Side(OURS, lambda: mcaprl.open(log)),
         Side(PLAIN, limits.plain(log)),
         Side(LEAST_WORK, limits.least(log)),
-        Side("plain zstd of the same records, packed by its level 1", limits.plain_level_1(log)),
+        Side("plain zstd of the same records, compressed at level 1", limits.plain_level_1(log)),
         Side("memcpy of the columns", lambda: [c.copy() for c in rivals.columns_of(data).values()]),
         Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
         Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
     ]
-    # A table format is read only if it can be written.
+    # A table format can be read only after it was written.
     for name, write, read, path in (
         ("h5py, gzip 1", rivals.write_h5py, rivals.read_h5py, hdf5),
         ("Parquet, zstd 1", rivals.write_parquet, rivals.read_parquet, parquet),
@@ -168,8 +167,8 @@ def _reading(
 
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
-    """Compare file sizes of the same transitions; a log also contains times and counters."""
-    table = Table("Space that the transitions take", unit="bytes, ours = 1")
+    """Measure file sizes for the same transitions; only a log has times and counters."""
+    table = Table("File size", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
         other = folder / f"{compression}.mcap"
@@ -179,7 +178,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
     chunks = limits.raw_chunks(log, STEP_TOPIC)
     rest = ours - sum(map(len, limits.compressed_chunks(log, (STEP_TOPIC,))))
     by_level_1 = rest + sum(map(len, limits.level_1_chunks(chunks)))
-    table.ratios[f"{OURS}, if packed by zstd's level 1"] = by_level_1 / ours
+    table.ratios[f"{OURS}, compressed at zstd level 1"] = by_level_1 / ours
     for name, write, path in (
         ("h5py, gzip 1", rivals.write_h5py, folder / "table.h5"),
         ("Parquet, zstd 1", rivals.write_parquet, folder / "table.parquet"),
@@ -198,9 +197,9 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 
 
 def _threads(log: Path) -> Table:
-    """Measure wall time, because threads do not reduce CPU time."""
+    """Measure wall-clock time: threads use as much CPU time."""
     return compare(
-        "Reading that log with several threads",
+        "Reading the log of vectors with several threads",
         [
             Side(OURS, lambda: mcaprl.open(log)),
             Side(f"{OURS}, 2 threads", lambda: mcaprl.open(log, threads=2)),
@@ -209,12 +208,12 @@ def _threads(log: Path) -> Table:
             Side("check, 2 threads", lambda: check_log(log, threads=2)),
         ],
         clock=time.perf_counter,
-        unit=f"time that passes on {os.cpu_count()} cores, ours with one thread = 1",
+        unit=f"wall-clock time on {os.cpu_count()} cores, ours with one thread = 1",
     )
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Measure check (which reads) and recover (which reads and writes)."""
+    """Measure checking, which is reading, and recovering, which is reading and writing."""
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

@@ -1,8 +1,8 @@
-"""Comparisons whose sides are timed in turns within one process.
+"""Time the sides of a comparison in turns within one process.
 
-The machine may be busy with other things, so what counts is CPU time, the best of several turns,
-and the sides take turns so that a slow minute hits them all. What is reported are ratios: seconds
-depend on the machine, ratios much less.
+The machine may do other work, so the measure is CPU time, the best of several turns, and the sides
+take turns so that a slow minute affects all of them. The results are ratios, because seconds depend
+much more on the machine.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
-# Sides that work message by message do this share of the task, scaled up: a turn then takes some
-# tenths of a second, so that each side has many turns and a disturbance affects only one.
+# Sides that go message by message do this share of it, and are scaled up: a turn of each takes some
+# tenths of a second, so that all have many, and a disturbance spoils but one.
 SLOW_SHARE = 0.1
 SLOWEST_SHARE = 0.01
 
@@ -24,11 +24,11 @@ class Side:
     """One way to do a task.
 
     Attributes:
-        name: of the library, and what of it.
-        run: does the task once.
-        share: how much of the task it does; the time is scaled up. For sides that would take
-            minutes.
-        floor: the name of a side whose time is taken off, as of an environment without recorder.
+        name: Name of the library, and of the part that is used.
+        run: Function that does the task once.
+        share: Fraction of the task that `run` does; the time is scaled up. For sides that would
+            take minutes.
+        floor: Name of a side whose time is subtracted, such as an environment without recorder.
     """
 
     name: str
@@ -39,14 +39,14 @@ class Side:
 
 @dataclass
 class Table:
-    """A task, and how long each side takes for it.
+    """A task, and the time of each side.
 
     Attributes:
-        title: the task.
-        ratios: CPU time by side, where ours takes 1.
-        missing: sides that could not be measured, and why.
-        goal: what we want to reach, in words.
-        unit: what the ratios are of.
+        title: Name of the task.
+        ratios: CPU time by side, relative to ours.
+        missing: Sides that could not be measured, with the reason.
+        goal: Goal in words.
+        unit: Unit of the ratios.
     """
 
     title: str
@@ -56,11 +56,11 @@ class Table:
     unit: str = "CPU time, ours = 1"
 
     def to_json(self) -> dict[str, Any]:
-        """Return the table as JSON values."""
+        """Return plain values."""
         return asdict(self)
 
     def to_markdown(self) -> str:
-        """Format the table as a section of a page."""
+        """Return a section of a page."""
         lines = [f"## {self.title}", "", *([f"Goal: {self.goal}.", ""] if self.goal else [])]
         lines += [f"| side | {self.unit} |", "|---|---|"]
         lines += [f"| {name} | {ratio:.3g} |" for name, ratio in self.ratios.items()]
@@ -81,13 +81,13 @@ def compare(
     """Time sides in turns.
 
     Args:
-        title: the task.
-        sides: who does it; one whose `run` raises ImportError is noted as missing.
-        goal: what we want to reach, in words.
-        rounds: turns of each side.
-        ours: the side whose time is 1.
-        clock: what measures it, in seconds.
-        unit: what the ratios are of, in words.
+        title: Name of the task.
+        sides: Sides to time; one whose `run` raises ImportError is listed as missing.
+        goal: Goal in words.
+        rounds: Number of turns of each side.
+        ours: Name of the side whose time is 1.
+        clock: Function that returns the time in seconds.
+        unit: Unit of the ratios, in words.
     """
     table, best = (
         Table(title, goal=goal, unit=unit),
@@ -116,7 +116,7 @@ def compare(
 
 
 def after(prepare: Callable[[], object], run: Callable[[], object]) -> Callable[[], object]:
-    """Prepare a run; an ImportError is reported when the run is timed."""
+    """Prepare a run; return one that raises the ImportError if the preparation raises it."""
     try:
         prepare()
     except ImportError as error:

@@ -1,14 +1,15 @@
-"""Off-policy estimates compared with other libraries, and the coverage of their intervals.
+"""Compare off-policy estimates with other libraries, and measure the coverage of their intervals.
 
     python -m benchmarks.off_policy
 
 Importance sampling: the six estimators on the same logs as SCOPE-RL's, to the last digits. Fitted Q
-evaluation: beside d3rlpy's DiscreteFQE on the same log, policy and settings, and beside the returns
-that the policy really has in the sim. Coverage: how many of `--logs` logs' 95 % intervals hold the
-true value, on a task whose value follows from linear equations (tests/support/two_state_task.py).
+evaluation: compared with d3rlpy's DiscreteFQE on the same log, policy and settings, and with the
+policy's true returns in the sim. Coverage: the fraction of `--logs` logs whose 95 % interval
+contains the true value, on a task whose value is the solution of linear equations
+(tests/support/two_state_task.py).
 
-Needs d3rlpy and SCOPE-RL for the first two (`make bench-learning` installs them); what is not
-installed is left out, and said.
+The first two need d3rlpy and SCOPE-RL (`make bench-learning` installs them); what is not installed
+is reported and left out.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ SCOPE_RL_NAMES: Final = {
     "WPDIS": "SelfNormalizedPDIS",
     "DR": "DoublyRobust",
 }
-"""SCOPE-RL's self-normalized DR does not normalize the weights of V, so it differs from our WDR."""
+"""Its self-normalized DR leaves the weights of V as they are and is not our WDR."""
 
 
 def beside_scope_rl(logs: int) -> dict[str, float]:
-    """Return the largest relative difference to SCOPE-RL's estimates over logs of 300 episodes."""
+    """Return the largest relative difference to SCOPE-RL's estimates, over logs of 300 episodes."""
     from scope_rl.ope.discrete import basic_estimators
 
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
     for seed in range(logs):
         table = task.play(None, episodes=300, seed=seed)
-        # Two actions whose probabilities give the table's ratios, and values that give its Q and V.
+        # Two actions with pi and mu that have the table's ratios, and Q that has its Q and V.
         given = _as_scope_rl(table)
         for name, theirs in SCOPE_RL_NAMES.items():
             estimator = getattr(basic_estimators, theirs)()
@@ -59,9 +60,9 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 
 
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
-    """Convert an episode table to SCOPE-RL's inputs; the action taken is always action 0."""
+    """Return an episode table in SCOPE-RL's format; the logged action is always its action 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
-    # Action 1 has the remaining probability, and the Q that yields the table's V.
+    # Action 1 has what is left of the probability, and the Q that makes V what it is.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
     return {
         "step_per_trajectory": table.rewards.shape[1],
@@ -75,19 +76,19 @@ def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
 
 
 class Balance:
-    """CartPole policy without training: push toward the side to which the pole falls."""
+    """A CartPole policy without training: it pushes to the side to which the pole falls."""
 
     def __init__(self, look_ahead_s: float) -> None:
-        """Set the look-ahead time; a negative one makes the pole fall early."""
+        """Store the number of seconds to look ahead; without looking ahead the pole falls soon."""
         self._look_ahead_s = look_ahead_s
 
     def act(self, observations: NDArray[np.floating]) -> NDArray[np.int64]:
-        """Return the actions (B,); 1 pushes to the right."""
+        """Return actions (B,): 1 pushes to the right."""
         angle, speed = observations[:, 2], observations[:, 3]
         return (angle + self._look_ahead_s * speed > 0).astype(np.int64)
 
     def action_probabilities(self, observations: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return deterministic action probabilities (B, 2)."""
+        """Return one-hot probabilities (B, 2)."""
         return np.eye(2)[self.act(observations)]
 
 
@@ -105,7 +106,7 @@ EPSILON: Final = 0.5
 
 
 def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[str, Any]:
-    """Record episodes of an epsilon-greedy policy as arguments of `Dataset.from_arrays`."""
+    """Return columns of episodes of a partly random policy, for `Dataset.from_arrays`."""
     random = np.random.default_rng(seed)
     rows = []
     with closing(gym.make("CartPole-v1")) as env:
@@ -129,24 +130,24 @@ def true_value(policy: Balance, episodes: int = 200) -> float:
     played = cartpole(policy, 0.0, episodes, seed=9)
     ends = np.flatnonzero(played["terminated"] | played["truncated"])
     lengths = np.diff(ends, prepend=-1)
-    # The reward is 1 per step.
+    # Each step pays 1.
     return float(((1 - FQE.gamma**lengths) / (1 - FQE.gamma)).mean())
 
 
 def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """Run FQE with the settings of `evaluate --data`."""
+    """Return the FQE estimate, with the settings of `evaluate --data`."""
     data = mcaprl.Dataset.from_arrays(**columns, env_id="CartPole-v1")
     return OffPolicyEvaluator(data, FQE, seed).evaluate(policy, "").estimates[0].value or 0.0
 
 
 def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """Run d3rlpy's FQE with the same settings and return the mean value of the first states."""
+    """Return d3rlpy's FQE with the same settings: the mean value of the first states."""
     import d3rlpy
     from d3rlpy.ope.fqe import DiscreteFQE
     from d3rlpy.ope.fqe import FQEConfig as TheirConfig
 
     class Acting:
-        """Adapter with the methods that DiscreteFQE calls on the evaluated algorithm."""
+        """The interface that DiscreteFQE needs of the algorithm that it evaluates."""
 
         @property
         def impl(self) -> Acting:
@@ -181,7 +182,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print both FQEs, with a separate log and network for each seed, and the true value."""
+    """Print both FQE estimates, on separate logs and networks for each seed, and the true value."""
     print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
     for name, policy in POLICIES.items():
         found = []
@@ -195,10 +196,10 @@ def beside_d3rlpy(seeds: int) -> None:
 
 
 def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
-    """Return the share of logs whose interval contains the true value, for each estimator.
+    """Return the fraction of logs whose interval contains the true value, for each estimator.
 
     Returns:
-        For our intervals, and for percentiles of the same resamplings.
+        For our intervals, and for percentiles of the same bootstrap samples.
     """
     held = {kind: dict.fromkeys(ESTIMATORS, 0.0) for kind in ("ours", "percentiles")}
     for seed in range(logs):
@@ -219,8 +220,8 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
 def main() -> None:
     """Compare and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--logs", type=int, default=1000, help="number of logs for the coverage")
-    parser.add_argument("--seeds", type=int, default=4, help="number of seeds of both FQEs")
+    parser.add_argument("--logs", type=int, default=1000, help="of the coverage")
+    parser.add_argument("--seeds", type=int, default=4, help="of both FQEs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
@@ -237,8 +238,8 @@ def main() -> None:
     for episodes in (50, 300):
         print(f"{arguments.logs} logs of {episodes} episodes; 95 % intervals that hold the truth:")
         for kind, shares in coverage(arguments.logs, episodes).items():
-            told = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
-            print(f"  {kind}: {told}", flush=True)
+            text = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
+            print(f"  {kind}: {text}", flush=True)
 
 
 if __name__ == "__main__":

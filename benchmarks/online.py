@@ -1,9 +1,9 @@
-"""Cost of recording and of live viewing relative to training: `python -m benchmarks.online`.
+"""Measure what recording and the live view add to a training: `python -m benchmarks.online`.
 
-The same training runs plainly, with a log, and shown to a viewer (Node, see tests/node), in turns,
-by CPU time of all its threads; the best of several counts. The training is the whole one that the
-lane sim is learnt with; `--steps` makes it shorter, and recording dearer: the first episodes last
-twenty steps, and each is written when it ends.
+The same training runs plainly, with a log, and with a viewer (Node, see tests/node), in turns, by
+the CPU time of all its threads; the best of several counts. It is the whole training of the lane
+sim with its default settings. `--steps` shortens it and increases the share of recording: the first
+episodes last twenty steps, and each is written at its end.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
 
 
 def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
-    """Return CPU seconds of a training with its one evaluation, and the number of frames viewed."""
+    """Return the CPU seconds of a training with its one evaluation, and the number of frames."""
     folder.mkdir()
     path = folder / "log.mcap" if kind == "recorded" else None
     shown = LiveTraining(task, port=0) if kind == "watched" else nullcontext()
@@ -47,7 +47,7 @@ def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
 
 
 def _viewer(url: str) -> subprocess.Popen[str]:
-    """Viewer that subscribes to all topics."""
+    """A viewer that subscribes to all topics."""
     viewer = subprocess.Popen(["node", str(_VIEWER), url], stdout=subprocess.PIPE, text=True)
     assert viewer.stdout is not None
     viewer.stdout.readline()
@@ -55,7 +55,7 @@ def _viewer(url: str) -> subprocess.Popen[str]:
 
 
 def _silent(_: TrainingProgress) -> None:
-    """Return nothing to display."""
+    """Show nothing."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Writes tables into docs/results.md, between the markers with the table's name."""
+"""Write tables into docs/results.md, between the marks of their section."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def write_section(name: str, text: str, page: Path = PAGE) -> None:
     """Replace the text between `<!-- name -->` and `<!-- /name -->`.
 
     Raises:
-        ValueError: the page does not have these two marks, once each.
+        ValueError: The page does not have these two marks, once each.
     """
     begin, end = f"<!-- {name} -->\n", f"<!-- /{name} -->"
     before, found, rest = page.read_text().partition(begin)

@@ -1,16 +1,16 @@
-"""How well estimates from a log alone rank the checkpoints of a training run.
+"""Measure how well a log alone ranks the checkpoints of a training run.
 
     python -m benchmarks.ranking FOLDER --sim lane
     python -m benchmarks.ranking FOLDER --sim racer
 
-Double DQN learns online and records what it does; its checkpoints are kept. Then every checkpoint
-is asked about twice: the sim runs its greedy policy through fresh episodes, which gives its true
-value, and each estimator guesses that value from the log that the run itself recorded. The orders
-are compared by Spearman's correlation and by regret@1, of each training seed; a table has their
-mean and range over seeds. Two simple rules stand beside the estimators: the last checkpoint is the
-best one, and the checkpoint that thinks most of itself is (its own mean Q of the first states).
+Double DQN trains online and records its transitions; its checkpoints are saved. Each checkpoint is
+then evaluated twice: its greedy policy runs fresh episodes in the sim, which gives its true value,
+and each estimator computes that value from the run's log. The rankings are compared by Spearman's
+correlation and by regret@1, for each training seed; the table has their mean and range over seeds.
+Two simple rules serve as references: the last checkpoint is the best one, and the checkpoint with
+the highest mean Q of the first states is.
 
-What is found goes to FOLDER/SIM/ranking.json; what is there already is not done again.
+FOLDER/SIM/ranking.json has all results; finished parts are not repeated.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8
 STEPS: Final = {"lane": 16_000, "racer": 8_000}
-"""Checkpoints from early training: later ones hardly differ."""
+"""While learning is under way: later, checkpoints are hardly worse than each other."""
 EPISODES: Final = 100
 FIRST_SEED: Final = 5_000_000
 GAMMA: Final = 0.97
@@ -49,7 +49,7 @@ RULES: Final = ("the later the better", "own mean Q")
 
 
 def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Path]]:
-    """Train once and return the log and the checkpoints."""
+    """Return the log of a training, and its checkpoints."""
     log = folder / "training.mcap"
     every = steps // CHECKPOINTS
     kept = [folder / f"step-{every * (k + 1)}.zip" for k in range(CHECKPOINTS)]
@@ -116,8 +116,8 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
     return found
 
 
-def judged(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
-    """Return rank correlation with discounted and plain returns, regret@1, share of verdicts."""
+def agreement(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
+    """Return rank correlations with both returns, regret@1 and the fraction of verdicts."""
     estimated, discounted, plain = (
         np.array([row["estimates"][estimator] if own is None else row[own] for row in rows])
         for own in (None, "discounted", "return")
@@ -134,7 +134,7 @@ def show(sim: str, by_seed: list[list[dict[str, Any]]]) -> None:
     """Print one row for each estimator: means over training seeds, and the range."""
     print(f"\n{sim}: {len(by_seed)} training seeds, {len(by_seed[0])} checkpoints each")
     for name in by_seed[0][0]["estimates"]:
-        figures = np.array([judged(rows, name) for rows in by_seed])
+        figures = np.array([agreement(rows, name) for rows in by_seed])
         cells = [_mean_and_range(column) for column in figures.T[:3]]
         print(f"| {name} | {' | '.join(cells)} | {figures[:, 3].mean():.0%} |")
     errors = [row["estimates"]["FQE"] - row["discounted"] for rows in by_seed for row in rows]
@@ -155,9 +155,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sim", choices=STEPS, required=True)
-    parser.add_argument(
-        "--updates", type=int, default=3_000, help="number of updates of the FQE model"
-    )
+    parser.add_argument("--updates", type=int, default=3_000, help="of the model of FQE")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     config = FQEConfig(

@@ -1,8 +1,8 @@
-"""Cost of long logs for a viewer: chunks, index, and memory that our player uses to seek.
+"""Measure what long logs cost a viewer: chunks, index, and the memory of our player for a seek.
 
     python benchmarks/replay.py
 
-Logs are made in a temporary folder: a million steps without a scene, and an hour of the lane sim
+Creates two logs in a temporary folder: a million steps without a scene, and an hour of the lane sim
 with one.
 """
 
@@ -28,15 +28,15 @@ JUMPS = 20
 
 
 def main() -> None:
-    """Record the logs, seek in each, and print a table."""
-    print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory to jump, MB |")
+    """Create the logs, seek in each, and print a table."""
+    print("| log | steps | MB | chunks | largest chunk, MB | index, MB | memory for a seek, MB |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
         for name, make in (("a million steps", _million), ("an hour with scene", _hour)):
             path = Path(folder) / "log.mcap"
             path.unlink(missing_ok=True)
             steps = make(path)
-            # In a separate process, because recording used memory, too.
+            # In a separate process, because creating the log takes memory, too.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
                 print(f"| {name} | {steps} | {pool.submit(_row, path).result()} |", flush=True)
 
@@ -88,7 +88,7 @@ def _row(path: Path) -> str:
 
 
 def _peak_mb() -> float:
-    # Not ru_maxrss, which a child process inherits from its parent.
+    # Not ru_maxrss, which a child takes over from its parent.
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 

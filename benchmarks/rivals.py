@@ -1,4 +1,4 @@
-"""The same tasks by other libraries, as their documentation recommends."""
+"""Do the same tasks with other libraries, each in the way of its documentation."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mcaprl.recorder.format.schema import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)
 Fields = dict[str, tuple[str, ...]]
-"""Fields that are read, by topic."""
+"""What is read, by topic."""
 Span = tuple[int | None, int | None]
-"""Half-open range of log_times in nanoseconds; None for all."""
+"""Half-open range of log_times, in nanoseconds; None for all."""
 DEPTH = "/rl/observation/depth"
 VECTOR_FIELDS: Fields = {"/rl/step": ("observation", "action", "reward")}
 IMAGE_FIELDS: Fields = {"/rl/step": ("observation_state", "action", "reward"), DEPTH: ("data",)}
 
 
 def messages(data: mcaprl.Dataset) -> list[bytes]:
-    """Encode CDR messages of `/rl/step` in advance, so that only writing is timed."""
+    """Return prebuilt CDR of `/rl/step`, so that only the writing is timed."""
     dtype = message_dtype(TEXT)
     assert dtype is not None
     rows = np.zeros(len(data), dtype)
@@ -38,7 +38,7 @@ def messages(data: mcaprl.Dataset) -> list[bytes]:
 
 
 def write_mcap(encoded: list[bytes], path: Path) -> None:
-    """Write by mcap's Writer with zstd."""
+    """Write with mcap's Writer, with zstd."""
     from mcap.writer import CompressionType, Writer
 
     with path.open("wb") as file:
@@ -52,7 +52,7 @@ def write_mcap(encoded: list[bytes], path: Path) -> None:
 
 
 def write_interleaved(encoded: list[bytes], path: Path) -> None:
-    """Write by mcap's Writer, interleaved with a topic of messages of other lengths."""
+    """Write with mcap's Writer, interleaved with messages of other lengths on another topic."""
     from mcap.writer import CompressionType, Writer
 
     with path.open("wb") as file:
@@ -72,7 +72,7 @@ def write_interleaved(encoded: list[bytes], path: Path) -> None:
 
 
 def write_foxglove(encoded: list[bytes], path: Path) -> None:
-    """Write by foxglove-sdk, whose writer is in Rust."""
+    """Write with foxglove-sdk, whose writer is in Rust."""
     import foxglove
 
     context = foxglove.Context()
@@ -85,7 +85,7 @@ def write_foxglove(encoded: list[bytes], path: Path) -> None:
 
 
 def write_rosbags(encoded: list[bytes], folder: Path) -> None:
-    """Write by rosbags as a bag in MCAP."""
+    """Write with rosbags, as a bag in MCAP."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -101,7 +101,7 @@ def write_rosbags(encoded: list[bytes], folder: Path) -> None:
 def read_mcap(
     path: Path, fields: Fields = VECTOR_FIELDS, span_ns: Span = (None, None)
 ) -> dict[str, NDArray[Any]]:
-    """Read by mcap and mcap-ros2-support, message by message."""
+    """Read with mcap and mcap-ros2-support, message by message."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
@@ -118,7 +118,7 @@ def read_mcap(
 def read_rosbags(
     path: Path, fields: Fields = VECTOR_FIELDS, span_ns: Span = (None, None)
 ) -> dict[str, NDArray[Any]]:
-    """Read by rosbags, message by message."""
+    """Read with rosbags, message by message."""
     from rosbags.highlevel import AnyReader
 
     columns, (start, stop) = _empty(fields), span_ns
@@ -144,10 +144,10 @@ def _as_arrays(columns: dict[str, list[Any]]) -> dict[str, NDArray[Any]]:
 
 
 class MinariFolder:
-    """Minari datasets in a separate folder."""
+    """Minari's datasets in a separate folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Set the folder of Minari's datasets."""
+        """Set Minari's root to the folder."""
         os.environ["MINARI_DATASETS_PATH"] = str(folder)
         self._folder = folder
 
@@ -166,7 +166,7 @@ class MinariFolder:
         env.close()
 
     def write(self, data: mcaprl.Dataset, data_format: str) -> str:
-        """Write a dataset and return its name."""
+        """Write a dataset, and return its name."""
         import minari
         from minari.data_collector import EpisodeBuffer
 
@@ -194,12 +194,12 @@ class MinariFolder:
         return name
 
     def name(self, data: mcaprl.Dataset, data_format: str) -> str:
-        """Return the size of a dataset in bytes."""
+        """Return the name of a dataset that `write` writes."""
         what = "images" if isinstance(data.observations, dict) else "vectors"
         return f"bench/{what}-{data_format}-v0"
 
     def read(self, name: str, episodes: list[int] | None = None) -> list[Any]:
-        """Read observations, actions and rewards of some or all episodes into arrays."""
+        """Read observations, actions and rewards into arrays; default: of all episodes."""
         import minari
 
         found = list(minari.load_dataset(name).iterate_episodes(episodes))
@@ -210,7 +210,7 @@ class MinariFolder:
 
 
 def _frames(observations: Any, following: Any) -> Any:
-    """Return the observations as Minari stores them: one more than steps."""
+    """Return the observations of an episode as in Minari: one more than steps."""
     if isinstance(observations, dict):
         return {name: _frames(observations[name], following[name]) for name in observations}
     return np.concatenate([observations, following[-1:]])
@@ -223,14 +223,14 @@ def _joined(parts: list[Any]) -> Any:
 
 
 class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
-    """Environment with a spec, which Minari requires."""
+    """Environment with an empty spec, which Minari requires."""
 
     def __init__(self) -> None:
         super().__init__(Constant())
 
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table formats; next observations are the next rows."""
+    """Return the columns that the table formats store; next observations are the next rows'."""
     here = data.observations
     return {
         **(here if isinstance(here, dict) else {"observation": here}),
@@ -242,7 +242,7 @@ def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
 
 
 def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
-    """Write by h5py into one HDF5 file, chunked with gzip 1: h5py has no zstd."""
+    """Write with h5py, in one HDF5 file, chunked and with gzip 1: it has no built-in zstd."""
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -253,7 +253,7 @@ def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
 
 
 def read_h5py(path: Path, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
-    """Read by h5py."""
+    """Read with h5py."""
     import h5py
 
     with h5py.File(path) as file:
@@ -261,7 +261,7 @@ def read_h5py(path: Path, rows: slice = slice(None)) -> dict[str, NDArray[Any]]:
 
 
 def write_parquet(data: mcaprl.Dataset, path: Path) -> None:
-    """Write by pyarrow with zstd 1."""
+    """Write with pyarrow, with zstd 1."""
     import pyarrow
     import pyarrow.parquet
 
@@ -276,7 +276,7 @@ def write_parquet(data: mcaprl.Dataset, path: Path) -> None:
 
 
 def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
-    """Read by pyarrow in this thread."""
+    """Read with pyarrow, in this thread."""
     import pyarrow.parquet
 
     table = pyarrow.parquet.read_table(path, use_threads=False)
@@ -291,17 +291,17 @@ def read_parquet(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_npz(data: mcaprl.Dataset, path: Path) -> None:
-    """Write by NumPy, compressed."""
+    """Write with NumPy, compressed."""
     columns: dict[str, Any] = columns_of(data)
     np.savez_compressed(path, **columns)
 
 
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """Read by NumPy."""
+    """Read with NumPy."""
     with np.load(path) as file:
         return {name: file[name] for name in file.files}
 
 
-def record_bare(episodes: int) -> None:
-    """Wrap the environment in a wrapper that does nothing."""
+def record_nothing(episodes: int) -> None:
+    """Step through the environment in a wrapper that does nothing."""
     run_env(gym.Wrapper(Constant()), episodes)

@@ -31,18 +31,20 @@ LIBRARIES = (
 _PAGE = """\
 # Speed
 
-Measured by the command below, which also writes this page. All sides of a table run in one process,
-in turns, on the same data, in one thread; CPU time counts, and the best of several turns. Seconds
-depend on the machine, so there are ratios only. Side by side with ours stand the limits: copies in
-memory; plain decompression of the same chunks by zstd, each into the place of the one before; and
-the least that any reader must do: map the file, decompress, check CRCs. Columns in new memory come
-on top of that, for which the copies of them stand.
+`make bench` measures these tables and writes this page. All sides of a table run in one process,
+in turns, on the same data, in one thread. The measure is CPU time, the best of several turns.
+Seconds depend on the machine, so the tables contain ratios only. Each table includes lower
+limits: a copy in memory; plain decompression of the same chunks by zstd, each into the buffer of
+the previous one; and the minimum of any reader, which maps the file, decompresses it and checks
+the CRCs. A reader also copies the columns into new memory, which the copies of the columns
+measure.
 
-A goal that is not reached stays where it is. What keeps pictures and other writers' logs from it is
-both of these, and NumPy's pass over a chunk for each check and each column. What keeps a single
-episode from it is Python, which finds out what the log holds and where: unpacking its chunk is but
-an eighth of the time. Minari reads one sooner: it is told where each is by HDF5 or Arrow, and
-checks no CRC. foxglove-sdk writes files, and reads none.
+A missed goal stays in its table. For logs of images and other writers' logs, the reasons are the
+minimum of any reader, the copy into new memory, and one pass of NumPy over a chunk for each check
+and each column. For a single episode the reason is the Python code that finds out what the log
+contains and where: decompressing the chunk is an eighth of the time. Minari reads a single
+episode sooner, because HDF5 or Arrow has its position, and it checks no CRC. foxglove-sdk writes
+files and does not read them.
 
 ```sh
 make bench

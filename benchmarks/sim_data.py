@@ -1,16 +1,16 @@
-"""Six logs of each sim with about 20,000 transitions each, for offline learning.
+"""Create six logs of each sim, of about 20,000 transitions each, for offline training.
 
-random   actions at random
-medium   an online run's policy as soon as it scores half of the pilot, one action in ten random
+random   random actions
+medium   an online policy that scores half of the pilot, with 10 % random actions
 expert   the sim's pilot
-replay   all that this online run did until then
-mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and actions at random
-weak     a pilot that mostly does the wrong thing, and now and then what it should: the drone's and
-         the racer's are drowsy and do nothing, the car's is timid and brakes above 5 m/s
+replay   all transitions of this online training until then
+mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and random actions
+weak     a pilot that mostly does the wrong thing: the drone's and the racer's do nothing, the
+         car's brakes above 5 m/s
 
-Most actions of the weak pilot are bad ones, in most states: who imitates it does as badly. What
-would be better is in the log all the same, and its rewards tell. A drowsy car would be off its lane
-within eight seconds, and its log would show little of the course.
+Most actions of the weak pilot are bad ones, in most states, so imitation performs as badly. The
+better actions are in the log, and its rewards identify them. A car that does nothing would leave
+its lane within eight seconds, and its log would show little of the course.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from mcaprl.sims.lane.env import LaneKeepingEnv
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
 MEDIUM_SCORE = 0.5
-"""Mean returns of random and pilot, which score 0 and 1, over 30 evaluation episodes."""
+"""Where random is 0 and the pilot 1, over the 30 episodes of an evaluation while learning."""
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
-"""The action that the weak pilot of each sim prefers."""
+"""The action of each sim that its weak pilot prefers."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
-"""Below this speed, the weak pilot does not take its preferred wrong action."""
+"""Slower than that, the weak pilot errs as little as when it is awake."""
 WEAK, CLUMSY = 0.6, 0.1
-"""Probability of the wrong action, and of a random action otherwise."""
+"""How often the weak pilot does the wrong thing, and how often, of the rest, any action."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 
 
 class WeakPilot(EpsilonGreedy):
-    """Pilot that takes a wrong action most of the time."""
+    """A pilot that does the wrong thing most of the time."""
 
     def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
-        """Wrap the pilot of `env`, with a small probability of random actions."""
+        """Wrap the pilot of `env`; its correct actions include some random ones."""
         super().__init__(make_pilot(env), CLUMSY, env.action_space)
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
@@ -76,7 +76,7 @@ class WeakPilot(EpsilonGreedy):
 
 
 def make_logs(folder: Path, sim: str) -> dict[str, Path]:
-    """Record the missing logs of a sim, and return the paths of all six."""
+    """Create the missing logs of a sim, and return the paths of all six."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     online = folder / "online"
@@ -89,7 +89,7 @@ def make_logs(folder: Path, sim: str) -> dict[str, Path]:
 
 
 def _learn_online(sim: str, out: Path, log: Path) -> None:
-    """Train with the sim's settings and stop halfway; `out` contains the best policy."""
+    """Train with the sim's default settings, and stop halfway; `out` has the best policy then."""
 
     def stop_halfway(now: TrainingProgress) -> None:
         if now.terms["score"] >= MEDIUM_SCORE:
@@ -106,7 +106,7 @@ def _learn_online(sim: str, out: Path, log: Path) -> None:
 
 
 class _HalfwayError(Exception):
-    """Raised to stop an online run."""
+    """Stops an online run."""
 
 
 def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
@@ -131,7 +131,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
 
 
 def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes until each behavior policy has its share of the steps."""
+    """Record whole episodes until each behavior has made its part of the steps."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,

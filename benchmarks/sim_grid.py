@@ -1,13 +1,13 @@
-"""Offline learning from six logs of each sim with five algorithms and four seeds.
+"""Train five algorithms on six logs of each sim, with four seeds.
 
     python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
 
 The logs are those of `sim_data`; the settings of each sim are below and the same for all its logs.
-What counts are the networks after the last update: nothing is chosen by how it does in the sim. A
-score is the mean return over 30 episodes of each seed where random is 0 and the pilot 1, with a
-95 % bootstrap interval over seeds and episodes. Each cell is kept in FOLDER/SIM/scores.json; those
-that are there are not made anew, so a run that was stopped goes on. In the end the tables go to
-docs/results.md, with a dash for each cell that is not there yet.
+The networks after the last update are scored: nothing is selected by its score in the sim. A score
+is the mean return over 30 episodes of each seed, normalized so that random is 0 and the pilot 1,
+with a 95 % bootstrap interval over seeds and episodes. FOLDER/SIM/scores.json has each finished
+cell, so an interrupted run resumes. At the end the tables are written to docs/results.md, with a
+dash for each missing cell.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {}),
 }
-"""CQL with the default weight of its penalty, 1, and with 0.1."""
+"""CQL twice: with the default weight of its penalty, which is 1, and with a tenth of it."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 TARGET_INTERVAL = 150
-"""Updates between syncs of the target network; the default would propagate values too slowly."""
+"""Updates between two copies into the target: with the default, values would not get far ahead."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
     "racer": {"gamma": 0.98, "n_steps": 3},
 }
-"""Settings of the value-based algorithms; behavior cloning uses only the learning rate."""
+"""Of the learners of values; behavior cloning takes of these the learning rate alone."""
 Cell = dict[str, Any]
 
 
 def main() -> None:
-    """Run the selected cells that are missing, and write the tables if all exist."""
+    """Compute the requested missing cells, and the tables if all cells exist."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sims", default=",".join(SETTINGS))
@@ -83,7 +83,7 @@ def main() -> None:
 def _fill(
     folder: Path, sim: str, paths: dict[str, Path], wanted: Sequence[tuple[str, str]]
 ) -> None:
-    """Run the missing cells."""
+    """Compute the missing cells."""
     with closing(make_sim(sim)) as env:
         random = run(sim, [None])
         pilot = run(sim, [make_pilot(env)], env)
@@ -127,7 +127,7 @@ def learn(
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Evaluate policies on the same episodes, one by one in `env` or vectorized."""
+    """Run the same episodes for each policy; in `env` one by one, or in a batch."""
     with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
         return evaluate(
             env or own,
@@ -140,12 +140,12 @@ def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyS
 
 
 def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) -> float:
-    """Normalize returns: random scores 0, the pilot 1."""
+    """Return the mean return on the scale random = 0, pilot = 1."""
     return (mean_return - random.mean_return) / (pilot.mean_return - random.mean_return)
 
 
 def table(sim: str, cells: dict[str, dict[str, Cell]]) -> str:
-    """Format Markdown cells with the mean score and its interval."""
+    """Return the table as Markdown: each cell has the mean score and its interval."""
     lines = [f"**{sim}**", "", f"| log (behavior) | {' | '.join(ALGOS)} |"]
     lines.append("|---|" + "---|" * len(ALGOS))
     for name in NAMES:

@@ -1,6 +1,6 @@
-"""The sims compared with highway-env's environments, on one core.
+"""Measure the sims relative to highway-env's environments, on one core.
 
-`python -m benchmarks.sims` prints steps per second of this machine; `make bench` has the ratios.
+`python -m benchmarks.sims` prints steps per second on this machine; `make bench` has the ratios.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ QUADROTOR_STEPS = 5
 
 
 STEPS = 1_000_000
-"""Number of steps of the task; each side does a share of them."""
+"""Number of steps of the task; each side takes a share of them."""
 
 
 GOALS = {
@@ -36,15 +36,15 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """List our sims; a turn takes some hundredths of a second, too short for many disturbances.
+    """Return our sims as sides, with turns of some hundredths of a second to limit disturbances.
 
-    What is under way at its end goes on in the next.
+    An episode that is not finished at the end of a turn continues in the next one.
     """
     return [
         _single("car", make_sim("lane"), 10_000),
         _batch(f"car, {CARS} in a batch", make_sims("lane", CARS), 200),
         _single("car with 16 rays", make_sim("lane", observation="rays"), 2_000),
-        _pictures("depth image of 84x84", make_sim("lane"), 100),
+        _frames_of("depth image of 84x84", make_sim("lane"), 100),
         _single("car with a depth image", make_sim("lane", observation="depth"), 100),
         _batch(
             f"quadrotor, 0.1 s of flight, {DRONES} in a batch",
@@ -65,9 +65,9 @@ def tables() -> list[Table]:
         _single("highway-env, racetrack-v1", _highway("highway_env:racetrack-v1"), 50),
     ]
     table = compare(
-        "A step of a sim, actions at random, resets included",
+        "A sim step with random actions, resets included",
         sides,
-        goal="a thousand steps of the car in the time of one of highway-env's racetrack",
+        goal="1,000 steps of the car in the time of one step of highway-env's racetrack",
         rounds=20,
         ours="car",
     )
@@ -76,7 +76,7 @@ def tables() -> list[Table]:
 
 
 def main() -> None:
-    """Print the steps per second of each of our sims, best of a hundred turns."""
+    """Print the steps per second of each sim, in the best of a hundred turns."""
     for side in ours():
         taken_s = min(_cpu_s(side) for _ in range(100))
         rate, goal = side.share * STEPS / taken_s, GOALS.get(side.name)
@@ -91,7 +91,7 @@ def _cpu_s(side: Side) -> float:
 
 def _highway(env_id: str) -> gym.Env[Any, Any]:
     with warnings.catch_warnings():
-        # Some of its spaces are float64, for which Gymnasium warns.
+        # Its spaces are float64 here and there; Gymnasium says so when they are made.
         warnings.simplefilter("ignore")
         return gym.make(env_id, disable_env_checker=True)
 
@@ -111,8 +111,8 @@ def _single(name: str, env: gym.Env[Any, Any], steps: int) -> Side:
     return Side(name, run, share=steps / STEPS)
 
 
-def _pictures(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
-    """Render a frame at each step, and none at reset."""
+def _frames_of(name: str, env: gym.Env[Any, Any], frames: int) -> Side:
+    """Return a side that renders a frame for each step, and none for a reset."""
     sim: Any = env.unwrapped
     sim.action_space.seed(0)
     actions = [sim.action_space.sample() for _ in range(frames)]

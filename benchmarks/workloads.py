@@ -1,4 +1,4 @@
-"""Workloads: transitions of known size, and an environment that costs almost nothing."""
+"""Provide the workloads: transitions of known size, and an environment without cost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IMAGE_STEPS, IMAGE_SHAPE = 20_000, (84, 84)
 
 
 class Constant(gym.Env[Any, Any]):
-    """Environment that always returns one observation, so that the recorder's cost is visible."""
+    """Environment with a constant observation, so that only the recorder takes time."""
 
     observation_space, action_space = OBSERVATION, ACTION
 
@@ -27,12 +27,12 @@ class Constant(gym.Env[Any, Any]):
         self.step_number, self.episode_steps = 0, episode_steps
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode."""
+        """Begin an episode."""
         self.step_number = 0
         return self.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Return the observation."""
+        """Return the same observation."""
         self.step_number += 1
         return self.observation, 1.0, False, self.step_number == self.episode_steps, {}
 
@@ -47,7 +47,7 @@ def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -
 
 
 def vectors(transitions: int) -> mcaprl.Dataset:
-    """Create random transitions with 19 float32 and 9 actions, which hardly compress."""
+    """Return random numbers, which hardly compress: 19 float32 and 9 actions."""
     random = np.random.default_rng(0)
     episodes = transitions // EPISODE_STEPS
     frames = random.standard_normal((episodes, EPISODE_STEPS + 1, 19), np.float32)
@@ -60,17 +60,17 @@ def vectors(transitions: int) -> mcaprl.Dataset:
 
 
 def images(transitions: int) -> mcaprl.Dataset:
-    """Create depth images of a ramp with noise, and vectors."""
+    """Return depth images of a plane with noise, and vectors."""
     random = np.random.default_rng(0)
     frames = transitions + transitions // EPISODE_STEPS
-    slope = np.add.outer(np.arange(84), np.arange(84) // 2).astype(np.uint8)
+    plane = np.add.outer(np.arange(84), np.arange(84) // 2).astype(np.uint8)
     noise = random.integers(0, 8, (frames, *IMAGE_SHAPE), np.uint8)
-    pictures = slope + random.integers(0, 60, (frames, 1, 1), np.uint8) + noise
+    depth = plane + random.integers(0, 60, (frames, 1, 1), np.uint8) + noise
     states = random.standard_normal((frames, 19), np.float32)
     here = np.arange(transitions) + np.arange(transitions) // EPISODE_STEPS
     return mcaprl.Dataset.from_arrays(
-        observations={"depth": pictures[here], "state": states[here]},
-        next_observations={"depth": pictures[here + 1], "state": states[here + 1]},
+        observations={"depth": depth[here], "state": states[here]},
+        next_observations={"depth": depth[here + 1], "state": states[here + 1]},
         observation_space=spaces.Dict(
             {"depth": spaces.Box(0, 255, IMAGE_SHAPE, np.uint8), "state": OBSERVATION}
         ),

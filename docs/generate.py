@@ -1,10 +1,10 @@
-"""Writes what the docs show and nobody should type: `make docs`.
+"""Generate the command reference and the images of the docs: `make docs`.
 
-docs/cli.md                    the commands and their options, from the program itself
-docs/images/SIM-pilot.png      an episode of each sim: from above, and to its depth cameras
-docs/images/SIM-random.png     likewise, of random actions
-docs/images/comparison.png     from the last `make demo`, if there was one
-docs/images/trajectories.png   likewise
+docs/cli.md                    the commands and their options, from the help of the program
+docs/images/SIM-pilot.png      an episode of the pilot in each sim: from above, and its depth images
+docs/images/SIM-random.png     the same with random actions
+docs/images/comparison.png     copied from the last `make demo`, if there is one
+docs/images/trajectories.png   copied from the last `make demo`, if there is one
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ IMAGES = DOCS / "images"
 DEMO_REPORT = DOCS.parent / "demo" / "report"
 SEED = 1
 SHEET_WIDTH = 14.4
-# Of the colours of depth pictures, which are logarithmic.
+# Range of the color scale of depth images, which is logarithmic.
 NEAREST_M, FARTHEST_M = 2.0, 200.0
 
 
 class Sheet(NamedTuple):
-    """A contact sheet: what it shows of an episode.
+    """A contact sheet of an episode.
 
     Attributes:
-        sim: short name.
-        steps: at most so many.
-        start: where it begins.
-        columns: pictures along it.
-        cameras: arguments that choose a depth camera, a row for each.
-        road: of highway-lane.
+        sim: Short name of the sim.
+        steps: Maximum number of steps.
+        start: Name of the start.
+        columns: Number of frames.
+        cameras: Arguments that select a depth camera, for each row.
+        road: Road of highway-lane.
     """
 
     sim: str
@@ -63,7 +63,7 @@ SHEETS = {
 
 
 def command_reference() -> str:
-    """The help of every command, as Markdown."""
+    """Return the help of every command, as Markdown."""
     parts = ["# The commands\n\nWritten by `make docs` from the program's own help.\n"]
     with click.Context(cli, info_name="mcaprl", terminal_width=100, **cli.context_settings) as top:
         parts.append(_section("mcaprl", cli.get_help(top)))
@@ -76,14 +76,14 @@ def command_reference() -> str:
 
 
 def contact_sheet(sheet: Sheet, policy: str) -> Figure:
-    """Pictures along an episode: from above, and below that what the depth cameras see.
+    """Draw frames of an episode from above, and depth images in the rows below.
 
     Args:
-        sheet: what to show.
+        sheet: Contact sheet to draw.
         policy: `pilot` or `random`.
     """
     arguments = {"start": sheet.start} | ({"road": sheet.road} if sheet.road else {})
-    # Equal but for the camera: the same seed and actions make them go through the same episode.
+    # They differ in the camera only: the same seed and actions produce the same episode.
     envs = [
         make_sim(sheet.sim, render_mode="rgb_array", **arguments, **camera)
         for camera in sheet.cameras or ({},)
@@ -106,14 +106,14 @@ def contact_sheet(sheet: Sheet, policy: str) -> Figure:
 
 
 def _episode(envs: list[gym.Env[Any, Any]], policy: str, steps: int) -> Iterator[str]:
-    """Run the same episode in all environments; give, for each observation, why it is the last."""
+    """Run one episode in all environments; yield the reason of the end after each observation."""
     pilot, actions = make_pilot(envs[0]), envs[0].action_space
     actions.seed(SEED)
     for env in envs:
         env.reset(seed=SEED)
     yield ""
     for _ in range(steps):
-        # Pilots look at the sim itself.
+        # Pilots read the state of the sim, not the observation.
         action = actions.sample() if policy == "random" else pilot.act(np.zeros((1, 1)))[0]
         ends = [env.step(action)[2:] for env in envs]
         terminated, truncated, info = ends[0]
@@ -128,11 +128,11 @@ def _title(sim: Any, step: int, reason: str) -> str:
     return f"{title}, {reason}" if reason else title
 
 
-def _show(axes: Any, picture: Any, title: str) -> None:
-    if picture.ndim == 2:
-        axes.imshow(picture, cmap="turbo_r", vmin=np.log(NEAREST_M), vmax=np.log(FARTHEST_M))
+def _show(axes: Any, image: Any, title: str) -> None:
+    if image.ndim == 2:
+        axes.imshow(image, cmap="turbo_r", vmin=np.log(NEAREST_M), vmax=np.log(FARTHEST_M))
     else:
-        axes.imshow(picture)
+        axes.imshow(image)
     axes.set_title(title, fontsize=9)
     axes.set_axis_off()
 
@@ -142,13 +142,13 @@ def _section(title: str, text: str) -> str:
 
 
 def main() -> None:
-    """Write all of it."""
+    """Write the reference and the images."""
     IMAGES.mkdir(exist_ok=True)
     (DOCS / "cli.md").write_text(command_reference())
     for name, sheet in SHEETS.items():
         for policy in SCRIPTED:
-            picture = IMAGES / f"{name}-{policy}.png"
-            contact_sheet(sheet, policy).savefig(picture, facecolor="white", bbox_inches="tight")
+            path = IMAGES / f"{name}-{policy}.png"
+            contact_sheet(sheet, policy).savefig(path, facecolor="white", bbox_inches="tight")
     for name in ("comparison.png", "trajectories.png"):
         if (DEMO_REPORT / name).exists():
             shutil.copy(DEMO_REPORT / name, IMAGES / name)

@@ -1,8 +1,8 @@
-"""Offline CQL learns from the log that an online agent is still writing; both are plotted.
+"""Train offline CQL on the log that an online agent is writing, and plot both.
 
-    python examples/beside.py FOLDER        writes below FOLDER, which must not exist
+    python examples/beside.py FOLDER        creates FOLDER, which must not exist
 
-Runs these two at once, and looks at each policy that the second one saves:
+Runs these two commands in parallel, and scores each policy that the second one saves:
 
     mcaprl train-online powerline --record FOLDER/log.mcap --out FOLDER/online ...
     mcaprl train-offline FOLDER/log.mcap --follow --algo cql --out FOLDER/offline ...
@@ -54,7 +54,7 @@ def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 
 
 def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[int, float]:
-    """Score each policy that a run saves until it ends, by number of updates."""
+    """Return the score of each policy that a run saves until it ends, by its number of updates."""
     found: dict[int, float] = {}
     with closing(make_sim(SIM)) as env:
         scale = measure_scale(env, episodes=EPISODES, seed=SELECTION_SEED)
@@ -77,19 +77,19 @@ def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[
 def draw(
     path: Path, points: list[CurvePoint], known: dict[int, float], scores: dict[int, float]
 ) -> None:
-    """Plot both scores over the transitions recorded or known at that time."""
+    """Plot both scores over the number of transitions that were recorded or read."""
     figure, (left, right) = new_figure((9, 3.6), 1, 2)
     left.plot([p.step for p in points], [p.score for p in points], color=COLORS[0], label="online")
     x = [known[updates] for updates in scores]
-    left.plot(x, list(scores.values()), "o-", ms=4, color=COLORS[1], label="offline, beside it")
+    left.plot(x, list(scores.values()), "o-", ms=4, color=COLORS[1], label="offline")
     left.axhline(1, color=INK, lw=1, ls="--", zorder=0)
-    left.set_xlabel("transitions recorded, or known")
+    left.set_xlabel("transitions recorded or read")
     left.set_ylabel("score: random 0, pilot 1")
     left.legend()
     right.step(list(known), list(known.values()), where="post", color=COLORS[1])
     right.axhline(points[-1].step, color=INK, lw=1, ls="--", zorder=0)
     right.set_xlabel("updates of the offline learner")
-    right.set_ylabel("transitions that it knows")
+    right.set_ylabel("transitions that it has read")
     save_png(figure, path)
 
 
@@ -110,10 +110,10 @@ def main() -> None:
     known = dict(zip(metrics["update"].astype(int).tolist(), metrics["transitions"], strict=True))
     whole = np.cumsum(mcaprl.open(log).episode_lengths)
     if not set(known.values()) <= set(whole.tolist()):
-        raise SystemExit("the offline learner knew a part of an episode, or one twice")
+        raise SystemExit("the offline learner read a part of an episode, or an episode twice")
     grown = len(set(known.values()))
     print(f"the log grew to {whole[-1]} transitions in {len(whole)} episodes; the offline learner")
-    print(f"met it at {grown} sizes, each time with whole episodes only, and none twice")
+    print(f"read it at {grown} sizes, each time whole episodes only, and none twice")
     draw(out / "beside.png", read_online_curve(online / "seed-0" / "curve.csv"), known, scores)
     print(out / "beside.png")
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env sh
-# What the published rewards lead to, beside ours: the same learner and settings, four seeds each, judged
-# by how far along its path the vehicle comes. Some ten minutes on one core.
+# Compare the published rewards with the default ones: the same learner and settings, four seeds each,
+# measured by the distance along the path. About ten minutes on one core.
 #
-#   sh examples/classic_reward.sh FOLDER       writes below FOLDER, which must not exist
+#   sh examples/classic_reward.sh FOLDER       creates FOLDER, which must not exist
 set -eu
 out=${1:-classic-reward}
 mkdir "$out"
@@ -25,6 +25,6 @@ for rules in default classic; do
 done
 for sim in powerline lane; do
   python "$(dirname "$0")/compare_curves.py" "$out/$sim/default" "$out/$sim/classic" \
-    --value mean_progress_m --title "$sim: what the default and the classic reward lead to" \
+    --value mean_progress_m --title "$sim: the default and the classic reward" \
     --out "$out/$sim.png"
 done

@@ -1,4 +1,4 @@
-"""Plot the curves of online runs in one figure.
+"""Plot the learning curves of online runs in one image.
 
 python examples/compare_curves.py RUN... --out curves.png [--value mean_progress_m]
 """

@@ -1,7 +1,7 @@
 #!/usr/bin/env sh
-# Learning to drive by a depth camera: a pilot's log of pictures in, a policy out.
+# Train a policy that drives by a depth camera, from a log of a pilot.
 #
-#   sh examples/depth.sh FOLDER       writes below FOLDER, over what an earlier run left
+#   sh examples/depth.sh FOLDER       writes into FOLDER, and replaces the output of an earlier run
 set -eu
 out=${1:-depth}
 mkdir -p "$out"
@@ -17,7 +17,7 @@ for mix in "0.05 25" "0.1 50" "0.2 200" "0.3 200"; do
   number=$((number + 1))
 done
 
-# What all pictures have in common says nothing, so it is taken off; half of the usual channels take
+# --normalize subtracts the mean image, which carries no information. Half of the default channels take
 # less than half the time.
 mcaprl train-offline "$out/data" --algo cql --seeds 4 --normalize --hidden 256,256 --channels 16,32,32 \
   --batch-size 32 --target-interval 100 --updates 8000 --out "$out/runs/cql"

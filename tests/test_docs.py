@@ -15,7 +15,9 @@ from mcaprl.cli import cli, run
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
-# Sizes at which the README's commands take seconds; what they do stays the same.
+PAGES = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+PAGES += sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))
+# Sizes at which each of the README's commands takes seconds.
 SMALLER = {"--episodes": "2", "--steps": "200"}
 
 
@@ -74,22 +76,18 @@ def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert run(arguments) == 0, line
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "README.md",
-        "CONTRIBUTING.md",
-        "docs/architecture.md",
-        "docs/evaluation.md",
-        "docs/replay.md",
-        "docs/sims.md",
-    ],
-)
+@pytest.mark.parametrize("name", PAGES)
 def test_links_and_files_exist(name: str) -> None:
     page = ROOT / name
-    for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
-        if not target.startswith("http"):
-            assert (page.parent / target).exists(), f"{name} links to {target}"
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", page.read_text()):
+        if target.startswith("http"):
+            continue
+        linked = page.parent / target if target else page
+        assert linked.exists(), f"{name} links to {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", linked.read_text(), re.MULTILINE)
+            anchors = [re.sub(r"[^\w\- ]", "", text).lower().replace(" ", "-") for text in headings]
+            assert anchor in anchors, f"{name} links to {target}#{anchor}"
     for path in re.findall(
         r"`((?:recorder|sims|offline|online|cli|tests|docs)/[\w./]+\.\w+)`", page.read_text()
     ):

@@ -69,7 +69,7 @@ def test_all_is_what_can_be_used() -> None:
         _ = mcaprl.nothing
 
 
-def test_version_is_told_once() -> None:
+def test_command_and_changelog_name_the_version() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mcaprl.cli", "--version"],
         capture_output=True,
@@ -77,7 +77,7 @@ def test_version_is_told_once() -> None:
         check=True,
     )
     assert done.stdout.strip() == f"mcaprl {mcaprl.__version__}"
-    assert f"## {mcaprl.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"## [{mcaprl.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
 @pytest.mark.parametrize("name", modules())
@@ -128,6 +128,23 @@ def test_the_project_pins_what_it_was_tested_with() -> None:
         name = re.split(r"[<>=\[]", requirement)[0].lower()
         # An extra may take another of ours along.
         assert name in {*pinned, "mcaprl"}, f"{name} is not in constraints.txt"
+
+
+def test_pre_commit_runs_the_commands_of_make_check() -> None:
+    (recipe,) = re.findall(
+        r"^check:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), re.MULTILINE
+    )
+    hooks = (ROOT / ".pre-commit-config.yaml").read_text()
+    commands = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
+    assert re.findall(r"entry: (.*)", hooks) == commands
+
+
+def test_the_word_check_finds_each_entry_of_its_list() -> None:
+    """A phrase that the pattern does not match as a whole would never be looked up."""
+    pattern = re.compile(SETTINGS["tool"]["codespell"]["regex"])
+    for line in (ROOT / ".ci" / "words.txt").read_text().splitlines():
+        entry = line.split("->")[0]
+        assert pattern.findall(f"It is {entry}.")[-1] == entry
 
 
 def _imports(path: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""Writes the results of `make faults` into docs/reliability.md as a table.
+"""Write the results of `make faults` into docs/reliability.md, as a table.
 
 python -m tests.support.fault_table FIGURES PAGE
 """
@@ -12,13 +12,13 @@ BEGIN, END = "<!-- fault figures: begin -->\n", "<!-- fault figures: end -->\n"
 
 
 def with_table(page: str, figures: str) -> str:
-    """Replace the page's table by these results, one `fault: result` per line."""
+    """Return the page with these figures, one `fault: result` per line, in its table."""
     before, _, rest = page.partition(BEGIN)
-    _, _, behind = rest.partition(END)
+    _, _, after = rest.partition(END)
     assert rest, "the page has no place for figures"
     pairs = [line.split(": ", 1) for line in figures.splitlines()]
     rows = "".join(f"| {fault} | {seen} |\n" for fault, seen in pairs)
-    return f"{before}{BEGIN}\n| fault | what was seen |\n|---|---|\n{rows}\n{END}{behind}"
+    return f"{before}{BEGIN}\n| fault | result |\n|---|---|\n{rows}\n{END}{after}"
 
 
 def main() -> None:
