@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.lint import Finding
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.viewer.tracks import Track, tracks_of
 
@@ -53,7 +53,7 @@ def dataset_page(
     dataset: Dataset,
     title: str,
     facts: Sequence[tuple[str, str]],
-    findings: Sequence[Finding],
+    findings: Sequence[Problem],
 ) -> None:
     """Write a page that shows a dataset: facts, findings, plots, its best and worst episodes.
 
@@ -85,11 +85,11 @@ def dataset_page(
     write_page(path, title, lead, sections)
 
 
-def _findings_section(findings: Sequence[Finding]) -> Section:
+def _findings_section(findings: Sequence[Problem]) -> Section:
     if not findings:
-        return Section("Findings", text="Nothing was found that would spoil learning.")
+        return Section("Findings", text="Nothing was found that would harm learning.")
     rows = [(one.severity, one.what, one.where, one.effect) for one in findings]
-    return Section("Findings", table=Table(("", "what", "where", "what it does"), rows))
+    return Section("Findings", table=Table(("", "what", "where", "effect"), rows))
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:

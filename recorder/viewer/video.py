@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
+from mcaprl.files import replacing
 
 Picture = NDArray[np.uint8]
 
@@ -53,30 +54,24 @@ def write_film(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -
         UsageError: there are no pictures.
         ReportError: it cannot be written.
     """
-    unfinished = path.with_stem(f"{path.stem}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        count = _write(unfinished, pictures, pictures_per_s)
+    with replacing(path, ReportError) as unfinished:
+        count = _write(unfinished, path.suffix, pictures, pictures_per_s)
         if count == 0:
             raise UsageError(f"{path}: there is nothing to show")
-        unfinished.replace(path)
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
     return count
 
 
-def _write(path: Path, pictures: Iterable[Picture], pictures_per_s: float) -> int:
+def _write(path: Path, kind: str, pictures: Iterable[Picture], pictures_per_s: float) -> int:
     imageio = import_extra("imageio.v3", "video")
-    if path.suffix == ".gif":
+    if kind == ".gif":
         stills = list(pictures)
         if stills:
             milliseconds = round(1000 / pictures_per_s)
-            imageio.imwrite(path, stills, plugin="pillow", duration=milliseconds, loop=0)
+            options = {"extension": kind, "plugin": "pillow", "loop": 0}
+            imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    with imageio.imopen(path, "w", plugin="pyav") as film:
+    with imageio.imopen(path, "w", plugin="pyav", extension=kind) as film:
         film.init_video_stream("libx264", fps=float(pictures_per_s))
         for picture in pictures:
             film.write_frame(picture)
@@ -91,11 +86,8 @@ def write_sheet(path: Path, pictures: Sequence[Picture]) -> None:
         ReportError: it cannot be written.
     """
     imageio = import_extra("imageio.v3", "video")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        imageio.imwrite(path, contact_sheet(pictures))
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
+    with replacing(path, ReportError) as unfinished:
+        imageio.imwrite(unfinished, contact_sheet(pictures), extension=".png")
 
 
 def contact_sheet(pictures: Sequence[Picture]) -> Picture:

@@ -61,7 +61,7 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
     )
     problems = [finding for finding in lint(data) if "behavior_prob" in finding.what]
     assert [finding.severity for finding in problems] == ["problem"]
-    assert "it speaks of 4.00 +- 0.00 of 2 actions: too many" in problems[0].what
+    assert "it implies 4.00 +- 0.00 of 2 actions: too many" in problems[0].what
 
 
 def test_what_cannot_be_examined_is_not() -> None:
