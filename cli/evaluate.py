@@ -16,8 +16,9 @@ from mcaprl.cli.curves import learning_curves
 from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
 from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
-from mcaprl.cli.show import counted, print_json, print_table, progress, write_json
-from mcaprl.errors import UsageError, import_extra
+from mcaprl.cli.show import counted, print_json, print_table, progress
+from mcaprl.errors import ReportError, UsageError, import_extra
+from mcaprl.files import write_json
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
@@ -108,7 +109,7 @@ def _evaluate_in_sim(
         if report is not None:
             import_extra("matplotlib", "report")
             import_extra("jinja2", "report")
-            write_json(report / RESULT_NAME, {})
+            write_json(report / RESULT_NAME, {}, ReportError)
         world = list(getattr(env.unwrapped, "static_scene", list)())
         envs = None
         if env.spec is not None and env.spec.vector_entry_point and record_path is None:
@@ -231,7 +232,7 @@ def _write_report(
 ) -> None:
     from mcaprl.sims.evaluation.report import evaluation_page
 
-    write_json(folder / RESULT_NAME, result)
+    write_json(folder / RESULT_NAME, result, ReportError)
     logged = result["behavior"]
     band = None if logged is None else (logged["mean_return"], *logged["interval"])
     curves = learning_curves([name for name in names if name not in SCRIPTED])

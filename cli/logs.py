@@ -11,16 +11,18 @@ from typing import Any
 
 import click
 
-from mcaprl.cli.show import counted, print_facts, print_json, size, write_json
-from mcaprl.errors import LogError, OutputExistsError, UsageError, import_extra
+from mcaprl.cli.show import counted, print_facts, print_json, print_problems, size
+from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
+from mcaprl.files import write_json
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.lint import Finding, lint
+from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.recorder.repair.check import Problem, check_log
+from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.surprises import moments_of
@@ -69,7 +71,7 @@ def info(
         from mcaprl.recorder.viewer.report import dataset_page, dataset_picture
 
         title = _title(dataset.sources)
-        write_json(report / "dataset.json", facts)
+        write_json(report / "dataset.json", facts, ReportError)
         dataset_picture(report / "dataset.png", dataset, title)
         rows = _fact_rows(facts, len(paths))
         dataset_page(report / "index.html", dataset, title, rows, findings)
@@ -100,18 +102,16 @@ def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
             found = find_logs(name)
         except LogError as error:
             # The other files are worth checking all the same.
-            problems.append(Problem(name, str(error), "looking for it", "check the path"))
+            problems.append(Problem(str(error), "looking for it", next="check the path", file=name))
             if not as_json:
                 click.echo(f"mcaprl: {error}", err=True)
             continue
         paths += found
         problems += [problem for path in found for problem in check_log(path, threads=threads)]
     if as_json:
-        print_json({"ok": not problems, "problems": [asdict(problem) for problem in problems]})
+        print_json({"ok": not problems, "problems": [problem.to_json() for problem in problems]})
     else:
-        for problem in problems:
-            if problem.file in map(str, paths):
-                click.echo(str(problem))
+        print_problems(problem for problem in problems if problem.file in map(str, paths))
         if not problems:
             click.echo(f"{len(paths)} file{'s' * (len(paths) > 1)} checked, nothing wrong")
     return int(bool(problems))
@@ -133,17 +133,13 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     Exits with 0 if nothing is lost, with 3 if something is, with 1 if nothing can be kept.
     """
     found = recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
-    losses = [*map(str, found.damages), *map(str, found.dropped)]
-    if found.strays:
-        losses.append(f"{counted(found.strays, 'message')} of episodes that are not kept")
     if as_json:
         print_json({"ok": not found.has_losses, **asdict(found)})
     else:
         ended = f", {found.ended} of them without their end" if found.ended else ""
         episodes = counted(found.episodes, "episode")
         click.echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
-        for loss in losses:
-            click.echo(f"lost: {loss}")
+        print_problems(found.problems)
     return _WITH_LOSSES if found.has_losses else 0
 
 
@@ -159,7 +155,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
         raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
     is_file = source not in SIMS and (Path(source).is_file() or source.endswith(".mcap"))
     found = attached_layout(McapReader(Path(source))) if is_file else _layout_of_sim(source)
-    write_json(out, found)
+    write_json(out, found, ReportError)
     click.echo(f"{out}: in Foxglove, open the layout menu and import this file")
 
 
@@ -188,7 +184,7 @@ def describe_dataset(dataset: Dataset) -> dict[str, Any]:
 
 
 def _print_facts(
-    facts: dict[str, Any], findings: list[Finding], dataset: Dataset, files: int
+    facts: dict[str, Any], findings: list[Problem], dataset: Dataset, files: int
 ) -> None:
     rows = _fact_rows(facts, files)
     rows.append(("problems", "\n".join(facts["problems"]) or "none"))
@@ -222,7 +218,7 @@ def _title(sources: Sequence[Path]) -> str:
 
 
 def _calibration(found: dict[str, Any] | None) -> str:
-    return "unknown" if found is None else f"speaks of {found['text']}"
+    return "unknown" if found is None else f"implies {found['text']}"
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import threading
 from collections.abc import Sequence
@@ -13,8 +12,9 @@ from typing import Any
 import click
 import gymnasium as gym
 
-from mcaprl.cli.show import counted, progress
+from mcaprl.cli.show import counted, print_problems, progress
 from mcaprl.errors import UsageError
+from mcaprl.files import write_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
@@ -141,7 +141,7 @@ def _play(
     )
     with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
         layout_path = Path(folder) / "foxglove-layout.json"
-        layout_path.write_text(json.dumps(layout))
+        write_json(layout_path, layout)
         click.echo(f"open {server.app_url}")
         click.echo(f"or connect any viewer of the Foxglove protocol to {server.url}")
         click.echo(f"layout to import: {layout_path}")
@@ -158,15 +158,8 @@ def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
     check_episode(dataset, episode, path)
     with closing(sim_of(dataset, path, sim)) as env, progress("stepping", len(dataset)) as advance:
         found = verify(dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1)))
-    if found.unseeded:
-        shown = ", ".join(map(str, found.unseeded[:10])) + ", ..." * (len(found.unseeded) > 10)
-        click.echo(
-            f"{path}: the log has no seed of {counted(len(found.unseeded), 'episode')}, so not"
-            f" compared: {shown}"
-        )
-    if found.difference is not None:
-        click.echo(f"{path}: {found.difference}")
-    elif found.episodes:
+    print_problems(found.problems(str(path)))
+    if found.difference is None and found.episodes:
         click.echo(
             f"{path}: {counted(found.episodes, 'episode')} and {counted(found.steps, 'step')}"
             " compared: every observation, reward and end is the same, bit for bit"

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import math
-import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import click
@@ -17,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from mcaprl.errors import LogError
+from mcaprl.files import json_text
+from mcaprl.problem import Problem
 
 _PIPE_WIDTH = 120
 
@@ -28,23 +25,14 @@ def counted(number: int, noun: str) -> str:
 
 
 def print_json(value: Any) -> None:
-    """One JSON object on stdout; NaN and infinities, which JSON lacks, as null."""
-    click.echo(json.dumps(_finite(value), indent=2))
+    """Print one JSON object to stdout; NaN and infinities become null."""
+    click.echo(json_text(value))
 
 
-def write_json(path: Path, value: Any, *, indent: int | None = 2) -> None:
-    """The same to a file.
-
-    Raises:
-        LogError: it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(f"{path.name}.part")
-        unfinished.write_text(json.dumps(_finite(value), indent=indent) + "\n")
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise LogError(f"cannot write {path}: {error.strerror}") from error
+def print_problems(problems: Iterable[Problem]) -> None:
+    """Print one line for each problem to stdout."""
+    for problem in problems:
+        click.echo(problem)
 
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
@@ -102,11 +90,3 @@ def _print(table: Table) -> None:
     # A file or a pipe has no width of its own; the usual guess of 80 breaks lines for nothing.
     is_terminal = sys.stdout is not None and sys.stdout.isatty()
     Console(width=None if is_terminal else _PIPE_WIDTH).print(table)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

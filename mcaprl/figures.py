@@ -1,4 +1,4 @@
-"""Drawing without a display: figures with one look, as PNG or as SVG that follows a page's colors.
+"""Figures in one style, drawn without a display: as PNG, or as SVG in the colors of its page.
 
 Extra: `report`.
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import ReportError, import_extra
+from mcaprl.files import replacing
 
 INK: Final = "#1d2733"
 PALE: Final = "#b9c2cc"
@@ -35,16 +36,16 @@ _SVG_STYLE: Final = {"svg.fonttype": "none", "svg.hashsalt": "mcaprl"}
 def new_figure(
     size: tuple[float, float], rows: int = 1, columns: int = 1, *, grid: bool = False
 ) -> tuple[Any, Any]:
-    """A figure that needs no display and leaves no global state, and its axes.
+    """Create a figure and its axes, without a display and without global state.
 
     Args:
-        size: width and height, inches.
-        rows: of axes.
-        columns: of axes.
-        grid: give the axes as an array (rows, columns), whatever their number.
+        size: Width and height, inches.
+        rows: Number of rows of axes.
+        columns: Number of columns of axes.
+        grid: Whether the axes are always an array (rows, columns), even if there is only one.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
+        MissingExtraError: Matplotlib is not installed.
     """
     matplotlib = import_extra("matplotlib", "report")
     figure_type = import_extra("matplotlib.figure", "report").Figure
@@ -54,20 +55,17 @@ def new_figure(
 
 
 def save_png(figure: Any, path: Path) -> None:
-    """Write a figure on white; folders above it are made.
+    """Write a figure on a white background; create the folder if needed.
 
     Raises:
-        ReportError: the file cannot be written.
+        ReportError: The file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, bbox_inches="tight", facecolor="white")
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror}") from error
+    with replacing(path, ReportError) as unfinished:
+        figure.savefig(unfinished, format="png", bbox_inches="tight", facecolor="white")
 
 
 def to_svg(figure: Any) -> str:
-    """A figure as an SVG element to stand in a page: ink has the text's color, pale is `--pale`."""
+    """Return an SVG element for a page: `INK` becomes the text color, `PALE` the page's `--pale`."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     with matplotlib.rc_context(_SVG_STYLE):

@@ -1,6 +1,6 @@
-"""Reports as one HTML page that needs no network: sections of text, figures, tables and cards.
+"""Reports as one HTML page without network access: sections of text, figures, tables and cards.
 
-It is readable on a phone, and light or dark as the reader's system is. Extra: `report`.
+The page is readable on a phone and follows the system's light or dark mode. Extra: `report`.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ from typing import Any
 
 from mcaprl.errors import ReportError, import_extra
 from mcaprl.figures import to_svg
+from mcaprl.files import write_atomically
 
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?( [%a-zA-Z]{1,3})?")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture in a page.
+    """A figure in a page.
 
     Attributes:
-        caption: over it.
-        svg: an SVG element.
+        caption: Text above the figure.
+        svg: SVG element.
     """
 
     caption: str
@@ -32,7 +33,7 @@ class Figure:
 
     @classmethod
     def of(cls, caption: str, figure: Any) -> Figure:
-        """Of a matplotlib figure."""
+        """Convert a Matplotlib figure."""
         return cls(caption, to_svg(figure))
 
 
@@ -41,8 +42,8 @@ class Table:
     """Rows of text.
 
     Attributes:
-        columns: their names; all empty for none.
-        rows: as many cells each.
+        columns: Names of the columns; all empty for a table without a header.
+        rows: One cell for each column.
     """
 
     columns: Sequence[str]
@@ -50,20 +51,20 @@ class Table:
 
     @property
     def kinds(self) -> list[str]:
-        """`number` for each column of numbers, which go to the right; else `text`."""
+        """Return `number` for each column of numbers (aligned right), else `text`."""
         cells = [[row[k] for row in self.rows if row[k]] for k in range(len(self.columns))]
         return ["number" if column and all(map(_is_number, column)) else "text" for column in cells]
 
 
 @dataclass(frozen=True)
 class Card:
-    """Something small that stands beside others of its kind.
+    """A small block with a thumbnail, one of several in a grid.
 
     Attributes:
-        title: of the card.
-        text: below.
-        svg: a thumbnail, an SVG element.
-        command: to type into a terminal; empty if there is none.
+        title: Title of the card.
+        text: Text below the title.
+        svg: Thumbnail, an SVG element.
+        command: Shell command to show; empty if there is none.
     """
 
     title: str
@@ -74,7 +75,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, with whatever of these it has, in this order."""
+    """A section of a page; the parts it has appear in this order."""
 
     title: str
     text: str = ""
@@ -84,21 +85,17 @@ class Section:
 
 
 def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
-    """Write a page; folders above it are made.
+    """Write a page; create the folder if needed.
 
     Raises:
-        MissingExtraError: jinja2 is not installed.
-        ReportError: the file cannot be written.
+        MissingExtraError: Jinja2 is not installed.
+        ReportError: The file cannot be written.
     """
     jinja2 = import_extra("jinja2", "report")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("mcaprl").joinpath("page.html").read_text())
     text = template.render(title=title, lead=lead, sections=sections)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror}") from error
+    write_atomically(path, text.encode(), ReportError)
 
 
 def _is_number(text: str) -> bool:

@@ -14,7 +14,6 @@ RUN/foxglove-layout.json                for who watches, if it is shown while it
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
@@ -212,19 +211,14 @@ class _Run:
             summary.folder.name: {
                 "best_step": summary.best_step,
                 "mean_return": summary.mean_return,
-                "score": _number(summary.score),
+                "score": summary.score,
                 "ends": summary.ends,
             }
             for summary in summaries
         }
-        scale = {"random": fresh.random, "pilot": _number(fresh.pilot)}
+        scale = {"random": fresh.random, "pilot": fresh.pilot}
         written = {"episodes": self.task.config.final_episodes, "scale": scale, "seeds": seeds}
         write_json(self.folder / SCORES_NAME, written)
         if find_spec("matplotlib") is not None:
             title = f"{self.task.algo} in {self.task.sim}"
             curve_picture(self.folder / PICTURE_NAME, [read_run(self.folder)], title)
-
-
-def _number(value: float) -> float | None:
-    """JSON has no NaN."""
-    return None if math.isnan(value) else value

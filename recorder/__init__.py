@@ -5,7 +5,7 @@
     dataset      -> save                            -> log_writer -> mcap_writer -> file
     file -> mcap_reader -> reader -> dataset -> statistics, tables
                         -> check
-    damaged file -> salvage -> sound_copy -> whole_episodes -> file   (recover)
+    damaged file -> salvage -> valid_copy -> whole_episodes -> file   (recover)
 
 `chunks`, `message_records`, `schema` and `messages` are the codec of both directions, `spaces` and
 `metadata` say what is in a log, `scene` and `layout` what a viewer makes of it.

@@ -13,6 +13,7 @@ from mcap.records import ChunkIndex, Statistics
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.problem import Problem
 from mcaprl.recorder.columns.chunks import CHUNK_HEAD, Scratch, chunk_header
 from mcaprl.recorder.columns.joined import side_by_side
 from mcaprl.recorder.columns.message_rows import (
@@ -32,19 +33,6 @@ from mcaprl.recorder.columns.records import contents_of, parse_record
 
 # What the header of a chunk and the summary both tell.
 _TOLD = ("start_time", "end_time", "raw_bytes")
-
-
-@dataclass(frozen=True)
-class Contradiction:
-    """Two things in a file that cannot both be right.
-
-    Attributes:
-        what: is wrong.
-        where: in the file.
-    """
-
-    what: str
-    where: str
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ def place(reader: McapReader, chunk: ChunkIndex) -> str:
     return f"chunk at byte {chunk.chunk_start_offset}, {topics}, {times}"
 
 
-def check_piece(reader: McapReader, piece: Piece) -> list[Contradiction]:
+def check_piece(reader: McapReader, piece: Piece) -> list[Problem]:
     """Compare chunks with their own headers, message indexes, and what the summary tells of them.
 
     Raises:
@@ -187,7 +175,7 @@ def _are_told(records: memoryview, index: _JointIndex, sizes: NDArray[np.uint64]
     )
 
 
-def _check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Contradiction]:
+def _check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Problem]:
     """Likewise, of one chunk, record by record."""
     found, view = [], reader.view
     header = chunk_header(view, chunk.chunk_start_offset)
@@ -204,10 +192,10 @@ def _check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> 
         first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
         if (first, last) != (header.start_time, header.end_time):
             found.append("the times of the chunk are not those in it")
-    return [Contradiction(what, place(reader, chunk)) for what in found]
+    return [Problem(what, place(reader, chunk)) for what in found]
 
 
-def check_statistics(reader: McapReader) -> list[Contradiction]:
+def check_statistics(reader: McapReader) -> list[Problem]:
     """Compare the summary's counts with what is there."""
     found = []
     if not reader.summary_start:
@@ -231,7 +219,7 @@ def check_statistics(reader: McapReader) -> list[Contradiction]:
             if id_ in counts
         ]
         found += [
-            Contradiction(f"the summary tells of {told_} {name}, there are {count}", "the summary")
+            Problem(f"the summary tells of {told_} {name}, there are {count}", "the summary")
             for name, told_, count in pairs
             if told_ != count
         ]

@@ -24,7 +24,7 @@ from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.records import RECORD_HEADER, parse_record, records_of
 
-SoundRecord = tuple[int, int, memoryview]
+ValidRecord = tuple[int, int, memoryview]
 """Offset, opcode and content."""
 
 # Records that carry something; what the rest say can be found out again.
@@ -51,12 +51,8 @@ class Damage:
     bytes: int
     what: str
 
-    def __str__(self) -> str:
-        """One phrase."""
-        return f"{self.what} at byte {self.offset} ({self.bytes} bytes)"
 
-
-def sound_records(view: memoryview, damages: list[Damage]) -> Iterator[SoundRecord]:
+def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidRecord]:
     """Yield offset, opcode and content of each sound record of the data section.
 
     Args:
@@ -67,7 +63,7 @@ def sound_records(view: memoryview, damages: list[Damage]) -> Iterator[SoundReco
     if bytes(view[:offset]) != MCAP0_MAGIC:
         damages.append(Damage(0, min(offset, len(view)), "no magic"))
     while offset < len(view):
-        content = _sound_record(view, offset)
+        content = _valid_record(view, offset)
         if content is None:
             following = _next_record(view, offset)
             what = "the rest of the file is cut off or damaged"
@@ -99,7 +95,7 @@ def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
     return _next_chunk(view, offset, len(view)) == len(view)
 
 
-def _sound_record(view: memoryview, offset: int) -> memoryview | None:
+def _valid_record(view: memoryview, offset: int) -> memoryview | None:
     """The content of the record at `offset`, if it is as a writer would have written it."""
     if offset + RECORD_HEADER_BYTES > len(view):
         return None
@@ -159,13 +155,13 @@ def _next_record(view: memoryview, damaged: int) -> int:
     if damaged + RECORD_HEADER_BYTES <= len(view):
         _, length = RECORD_HEADER.unpack_from(view, damaged)
         behind = int(damaged + RECORD_HEADER_BYTES + length)
-        leads_on = behind < len(view) and view[behind] in _KNOWN and _sound_record(view, behind)
+        leads_on = behind < len(view) and view[behind] in _KNOWN and _valid_record(view, behind)
         # A wrong length may lead to a message within another chunk, past whole ones.
         if leads_on and _next_chunk(view, damaged + 1, behind) == behind:
             return behind
     near = min(damaged + _NEAR_BYTES, len(view))
     for offset in range(damaged + 1, near):
-        if view[offset] in _SEARCHED and _sound_record(view, offset) is not None:
+        if view[offset] in _SEARCHED and _valid_record(view, offset) is not None:
             return offset
     return _next_chunk(view, near, len(view))
 
@@ -175,7 +171,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
     bytes_ = np.frombuffer(view, np.uint8)
     for block in range(start, stop, _BLOCK_BYTES):
         for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, stop)):
-            if _sound_record(view, offset) is not None:
+            if _valid_record(view, offset) is not None:
                 return offset
     return stop
 

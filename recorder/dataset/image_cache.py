@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
+from mcaprl.files import replacing
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.reading import McapReader, Topic, chunk_header
 from mcaprl.recorder.format.schema import fill_image_constants, image_dtype
@@ -67,18 +68,16 @@ def image_cache(
         except LogError:
             # The file is not a copy of these images: replace it.
             pass
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.part")
     from mcaprl.recorder.format.writing import McapWriter
 
-    writer = McapWriter(unfinished, compression="none", overwrite=True)
-    try:
-        writer.add_metadata(CACHE_METADATA, description)
-        _write_blocks(writer, topic.name, blocks)
-        writer.close()
-        os.replace(unfinished, path)
-    finally:
-        writer.abandon()
-        unfinished.unlink(missing_ok=True)
+    with replacing(path, LogError, concurrent=True) as unfinished:
+        writer = McapWriter(unfinished, compression="none", overwrite=True)
+        try:
+            writer.add_metadata(CACHE_METADATA, description)
+            _write_blocks(writer, topic.name, blocks)
+            writer.close()
+        finally:
+            writer.abandon()
     return McapReader(path)
 
 

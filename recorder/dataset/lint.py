@@ -1,72 +1,50 @@
-"""What in a dataset will spoil learning, or may: each finding with its place and its effect."""
+"""Checks of a dataset for what harms or may harm learning, each with its place and effect."""
 
 from __future__ import annotations
 
 import functools
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 
-Severity = Literal["problem", "note"]
-
 GAP: Final = 1.5
-"""A pause between two steps that is longer than so many usual ones is a gap."""
+"""Shortest gap between two steps, as a multiple of the median time between steps."""
 _SHOWN = 3
+_note = functools.partial(Problem, severity="note")
 
 
-@dataclass(frozen=True)
-class Finding:
-    """Something a learner should know of its data.
-
-    Attributes:
-        severity: `problem` for what is wrong, `note` for what may well be meant.
-        what: is the matter.
-        where: in the data.
-        effect: on learning.
-    """
-
-    severity: Severity
-    what: str
-    where: str
-    effect: str
-
-    def __str__(self) -> str:
-        """On one line."""
-        return f"{self.what} ({self.where}): {self.effect}"
-
-
-def lint(dataset: Dataset) -> list[Finding]:
-    """Look for everything that this module knows; problems come first."""
-    found = [finding for look in _LOOKS for finding in look(dataset)]
+def lint(dataset: Dataset) -> list[Problem]:
+    """Run all checks of this module; problems come before notes."""
+    found = [finding for check in _CHECKS for finding in check(dataset)]
     return sorted(found, key=lambda finding: finding.severity != "problem")
 
 
-def _not_finite(dataset: Dataset) -> Iterator[Finding]:
-    effect = "one such number in a batch makes every weight NaN; training refuses it"
+def _not_finite(dataset: Dataset) -> Iterator[Problem]:
+    effect = "one such number in a batch makes every weight NaN; training refuses the dataset"
     counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
     for leaf in _leaves(dataset):
         if counts[leaf.name]:
             places = _places(dataset, functools.partial(_frames, leaf))
             what = f"{counts[leaf.name]} values of {leaf.name} are NaN or infinite"
-            yield Finding("problem", what, places, effect)
+            yield Problem(what, places, effect)
     bad = int((~np.isfinite(dataset.rewards)).sum())
     if bad:
         places = _places(dataset, lambda episode: episode.rewards)
-        yield Finding("problem", f"{bad} rewards are NaN or infinite", places, effect)
+        yield Problem(f"{bad} rewards are NaN or infinite", places, effect)
 
 
-def _out_of_range(dataset: Dataset) -> Iterator[Finding]:
+def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
     for leaf in _leaves(dataset):
         space: Any = dataset.observation_space
         for key in leaf.path:
@@ -78,16 +56,15 @@ def _out_of_range(dataset: Dataset) -> Iterator[Finding]:
         wrong = np.flatnonzero((column.low < low) | (column.high > high))
         if len(wrong):
             first = int(wrong[0])
-            yield Finding(
-                "problem",
+            yield Problem(
                 f"{_count(len(wrong), 'number')} of {leaf.name} leave their space",
                 f"{_name(dataset, leaf, first)} is {column.low[first]:.4g} to"
                 f" {column.high[first]:.4g}, its space {low[first]:.4g} to {high[first]:.4g}",
-                "what scales observations by their space gets numbers that it was not made for",
+                "code that scales observations by the bounds of the space gets values out of range",
             )
 
 
-def _constant(dataset: Dataset) -> Iterator[Finding]:
+def _constant(dataset: Dataset) -> Iterator[Problem]:
     if len(dataset) < 2:
         return
     for leaf in _leaves(dataset):
@@ -95,15 +72,14 @@ def _constant(dataset: Dataset) -> Iterator[Finding]:
         same = np.flatnonzero(column.low == column.high)
         if len(same):
             names = ", ".join(_name(dataset, leaf, int(index)) for index in same[:_SHOWN])
-            yield Finding(
-                "note",
+            yield _note(
                 f"{_count(len(same), 'number')} of {leaf.name} never change",
                 names + (", ..." if len(same) > _SHOWN else ""),
-                "they say nothing here, and a network has not learned to ignore other values",
+                "they carry no information, and a network does not learn to ignore other values",
             )
 
 
-def _duplicates(dataset: Dataset) -> Iterator[Finding]:
+def _duplicates(dataset: Dataset) -> Iterator[Problem]:
     alike: dict[bytes, list[int]] = defaultdict(list)
     for episode in dataset.episodes:
         digest = sha256()
@@ -113,15 +89,14 @@ def _duplicates(dataset: Dataset) -> Iterator[Finding]:
     copies = [indexes for indexes in alike.values() if len(indexes) > 1]
     if copies:
         extra = sum(len(indexes) - 1 for indexes in copies)
-        yield Finding(
-            "problem",
+        yield Problem(
             f"{_count(extra, 'episode')} repeat others, step by step",
             "; ".join(_listed(indexes) for indexes in copies[:_SHOWN]),
-            "they count twice, and held-out episodes are not held out",
+            "they are weighted twice, and held-out episodes can also be in the training data",
         )
 
 
-def _actions_never_taken(dataset: Dataset) -> Iterator[Finding]:
+def _actions_never_taken(dataset: Dataset) -> Iterator[Problem]:
     space = dataset.action_space
     if not isinstance(space, spaces.Discrete) or not dataset.statistics.action_counts:
         return
@@ -129,45 +104,41 @@ def _actions_never_taken(dataset: Dataset) -> Iterator[Finding]:
     missing = [action for action in every if action not in dataset.statistics.action_counts]
     if missing:
         names = [dataset.action_names.get(action, str(action)) for action in missing[:_SHOWN]]
-        yield Finding(
-            "note",
+        yield _note(
             f"{_count(len(missing), 'action')} of {int(space.n)} were never taken",
             ", ".join(names) + (", ..." if len(missing) > _SHOWN else ""),
-            "their values are guesses: choose an algorithm that keeps to the data (cql, bcq, bc)",
+            "their Q-values are extrapolated: choose an algorithm that stays close to the data"
+            " (cql, bcq, bc)",
         )
 
 
-def _rewards(dataset: Dataset) -> Iterator[Finding]:
+def _rewards(dataset: Dataset) -> Iterator[Problem]:
     rewards = dataset.rewards
     if len(rewards) and not rewards.any():
-        yield Finding(
-            "problem", "no reward differs from 0", "all steps", "there is nothing to learn from"
-        )
+        yield Problem("every reward is 0", "all steps", "there is nothing to learn from")
         return
     last = np.zeros(len(rewards), dtype=bool)
     last[np.cumsum(dataset.statistics.lengths) - 1] = True
     if not rewards[~last].any():
-        yield Finding(
-            "note",
-            "rewards are paid on the last steps of episodes only",
+        yield _note(
+            "only the last steps of episodes have a reward",
             f"{int((rewards != 0).sum())} of {len(dataset.episodes)} episodes",
-            "it takes many updates until the first steps hear of them: n-step returns help",
+            "values of early steps need many updates to reflect them: n-step returns help",
         )
         return
     cut, others = rewards[dataset.truncated], rewards[~last]
     if len(cut) and len(others):
         beyond = (cut < others.min()) | (cut > others.max())
         if beyond.any():
-            yield Finding(
-                "problem",
+            yield Problem(
                 f"{_count(int(beyond.sum()), 'truncated episode')} end with a reward that no"
                 " other step has",
                 f"{cut[beyond][0]:.4g}, elsewhere {others.min():.4g} to {others.max():.4g}",
-                "truncated episodes count as going on: this reward belongs to a terminal state",
+                "learners bootstrap after a truncation: this reward belongs to a terminal state",
             )
 
 
-def _time_gaps(dataset: Dataset) -> Iterator[Finding]:
+def _time_gaps(dataset: Dataset) -> Iterator[Problem]:
     pauses = [np.diff(episode.log_time_ns) for episode in dataset.episodes]
     if not pauses:
         return
@@ -179,48 +150,44 @@ def _time_gaps(dataset: Dataset) -> Iterator[Finding]:
     ]
     if gaps:
         index, step, longest_ns = max(gaps, key=lambda gap: gap[2])
-        yield Finding(
-            "problem",
+        yield Problem(
             f"{_count(len(gaps), 'gap')} in time, where steps are {usual_ns / 1e9:.4g} s apart",
             f"the longest is {longest_ns / 1e9:.4g} s, episode {index} step {step}",
-            "steps are missing, or took longer: their rewards and next observations do not compare",
+            "steps are missing or took longer: their rewards and observations are not comparable",
         )
 
 
-def _mixed_policies(dataset: Dataset) -> Iterator[Finding]:
+def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
     policies = Counter(episode.policy or "unknown" for episode in dataset.episodes)
     if len(policies) > 1:
-        yield Finding(
-            "note",
+        yield _note(
             f"{len(policies)} policies acted",
             ", ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
-            "behavior cloning learns their average, and no single one of them",
+            "behavior cloning learns a mixture of them",
         )
 
 
-def _unknown_probabilities(dataset: Dataset) -> Iterator[Finding]:
+def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
     unknown = int(np.isnan(dataset.behavior_probs).sum())
     if unknown:
-        yield Finding(
-            "note",
+        yield _note(
             f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
             _places(dataset, lambda episode: episode.behavior_probs),
             "off-policy evaluation by importance sampling is not possible",
         )
 
 
-def _wrong_probabilities(dataset: Dataset) -> Iterator[Finding]:
+def _wrong_probabilities(dataset: Dataset) -> Iterator[Problem]:
     found = calibration(dataset.behavior_probs, dataset.action_space)
     if found is not None and not found.possible:
-        yield Finding(
-            "problem",
-            f"behavior_prob cannot be right: it speaks of {found}",
-            "over all steps",
-            "off-policy evaluation weighs steps by it, and its estimates are off",
+        yield Problem(
+            f"behavior_prob implies {found}",
+            "all steps",
+            "off-policy evaluation weights steps by it, so its estimates are biased",
         )
 
 
-_LOOKS: Final[tuple[Callable[[Dataset], Iterator[Finding]], ...]] = (
+_CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
     _not_finite,
     _out_of_range,
     _duplicates,
@@ -239,13 +206,13 @@ def _leaves(dataset: Dataset) -> tuple[Leaf, ...]:
 
 
 def _frames(leaf: Leaf, episode: Episode) -> NDArray[Any]:
-    """(T + 1, *shape) all observations of an episode."""
+    """Return all observations of an episode, (T + 1, *shape)."""
     last = leaf.of(episode.next_observations)[-1:]
     return np.concatenate([leaf.of(episode.observations), last])
 
 
 def _name(dataset: Dataset, leaf: Leaf, index: int) -> str:
-    """Of one number of a leaf."""
+    """Return the name of one number of a leaf."""
     names = dataset.observation_names
     return names[index] if len(names) == leaf.size else f"{leaf.name}[{index}]"
 
@@ -257,7 +224,7 @@ def _arrays(observations: Any) -> list[NDArray[Any]]:
 
 
 def _places(dataset: Dataset, column: Callable[[Episode], NDArray[Any]]) -> str:
-    """The first steps whose numbers are not finite."""
+    """List the first steps whose numbers are not finite."""
     found: list[str] = []
     for episode in dataset.episodes:
         values = column(episode)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, OutputExistsError
+from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.log_writer import LogWriter
@@ -45,23 +45,16 @@ def save_log(
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass overwrite=True")
     refuse_if_taken(path)
-    # Beside it first: the log that is replaced may be the one that is being saved.
-    unfinished = path.with_name(f"{path.name}.part")
-    log = LogWriter(unfinished, metadata, compression=compression, overwrite=True)
-    try:
-        _write_images(log, columns)
-        log.write_episodes(
-            [
-                episode if episode.episode == k else episode._replace(episode=k)
-                for k, episode in enumerate(columns.episodes)
-            ]
-        )
-        _write_steps(log, columns)
-        log.close()
-        os.replace(unfinished, path)
-    finally:
-        log.mcap.abandon()
-        unfinished.unlink(missing_ok=True)
+    # The log that is replaced may be the one that is being saved.
+    with replacing(path, LogError) as unfinished:
+        log = LogWriter(unfinished, metadata, compression=compression, overwrite=True)
+        try:
+            _write_images(log, columns)
+            log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
+            _write_steps(log, columns)
+            log.close()
+        finally:
+            log.mcap.abandon()
 
 
 def _write_images(log: LogWriter, columns: Transitions) -> None:

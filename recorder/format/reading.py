@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunk_check import (
-    Contradiction,
     Piece,
     check_piece,
     check_statistics,
@@ -23,7 +22,7 @@ from mcaprl.recorder.columns.records import (
     only,
     parse_record,
 )
-from mcaprl.recorder.columns.salvage import Damage, SoundRecord, intact_summary, sound_records
+from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
 from mcaprl.recorder.columns.topic import LOG_TIME, Topic
 
 __all__ = [
@@ -31,15 +30,14 @@ __all__ = [
     "MESSAGE_HEADER",
     "RECORD_HEADER_BYTES",
     "Columns",
-    "Contradiction",
     "Damage",
     "Decoder",
     "McapReader",
     "Piece",
     "Scratch",
-    "SoundRecord",
     "Span",
     "Topic",
+    "ValidRecord",
     "check_piece",
     "check_statistics",
     "chunk_header",
@@ -54,5 +52,5 @@ __all__ = [
     "packed",
     "parse_record",
     "place",
-    "sound_records",
+    "valid_records",
 ]

@@ -1,10 +1,10 @@
-"""Reads a log from end to end and tells everything that is wrong with it.
+"""Checks of a whole log.
 
-    the file     summary, CRC of all data                          (here)
-    its chunks   CRCs, indexes against contents, what the summary tells of them  (chunk_check)
-    the log      metadata against schema, episodes, steps in order, pictures     (episode_check)
+    file      summary, CRC of the data section                         (this module)
+    chunks    CRCs, message indexes, chunk indexes of the summary      (chunk_check)
+    log       metadata, schema, episodes, order of steps, images       (episode_check)
 
-Each chunk is decompressed once, and looked at as a whole; small ones together.
+Each chunk is decompressed once.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import struct
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
@@ -22,9 +22,9 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
+from mcaprl.problem import Problem
 from mcaprl.recorder.format.reading import (
     RECORD_HEADER_BYTES,
-    Contradiction,
     McapReader,
     Piece,
     Scratch,
@@ -35,58 +35,38 @@ from mcaprl.recorder.format.reading import (
     packed,
     place,
 )
+from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
 
 
-@dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong.
-
-    Attributes:
-        file: where.
-        what: is wrong.
-        where: in the file: a byte, a topic, an episode.
-        next: what to do about it.
-    """
-
-    file: str
-    what: str
-    where: str
-    next: str
-
-    def __str__(self) -> str:
-        """One line."""
-        return f"{self.file}: {self.what} ({self.where}); {self.next}"
-
-
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
-    """Check one log: structure, CRCs, indexes against contents, episodes, metadata.
+    """Check the structure, CRCs, indexes, episodes and metadata of one log.
 
     Args:
-        path: of the file.
-        threads: that decompress chunks at a time.
+        path: Path of the log.
+        threads: Number of threads that decompress chunks.
 
     Returns:
-        What is wrong with it, in the order of the file; empty if nothing is.
+        Problems in the order of the file; empty if there are none.
     """
     path = Path(path)
     try:
         reader = McapReader(path)
     except LogError as error:
-        is_damaged = isinstance(error, CorruptLogError)
-        what_next = _recover(path) if is_damaged else "restore it from a copy"
-        return [Problem(str(path), _without_path(error, path), "opening the file", what_next)]
+        action = _recover(path) if isinstance(error, CorruptLogError) else "restore it from a copy"
+        what = _without_path(error, path)
+        return [Problem(what, "opening the file", next=action, file=str(path))]
     found = [*_check_file(reader)]
     try:
         found += _check_contents(reader, whole=not found, threads=threads)
     except (LogError, SpaceError) as error:
-        found.append(Contradiction(_without_path(error, path), "/rl/step"))
-    return [Problem(str(path), told.what, told.where, _recover(path)) for told in found]
+        found.append(Problem(_without_path(error, path), STEP_TOPIC))
+    return [replace(problem, next=_recover(path), file=str(path)) for problem in found]
 
 
-def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Contradiction]:
-    """Chunk by chunk: what stands in each, and what the log says with all of them."""
-    found: list[Contradiction] = []
+def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Problem]:
+    """Check each chunk, then the log if all of them are valid."""
+    found: list[Problem] = []
     log = EpisodeCheck(reader) if whole else None
     for numbers, read in _decompressed(reader, threads):
         try:
@@ -102,8 +82,8 @@ def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Co
     return found
 
 
-def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Contradiction]:
-    """Chunks of which one is damaged, each by itself."""
+def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Problem]:
+    """Check chunks separately, of which at least one is damaged."""
     scratch = Scratch()
     for number in range(numbers.start, numbers.stop):
         try:
@@ -111,7 +91,7 @@ def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Contradiction]:
             yield from check_piece(reader, piece)
         except CorruptLogError as error:
             where = place(reader, reader.chunks[number])
-            yield Contradiction(_without_path(error, reader.path), where)
+            yield Problem(_without_path(error, reader.path), where)
 
 
 def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Callable[[], Piece]]]:
@@ -137,39 +117,39 @@ def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Cal
             yield numbers, future.result
 
 
-def _check_file(reader: McapReader) -> list[Contradiction]:
-    """The summary's presence, the CRC of all data, and those of attachments."""
+def _check_file(reader: McapReader) -> list[Problem]:
+    """Check that there is a summary, and the CRCs of the data section and of attachments."""
     found = []
     if not reader.complete:
         found.append(
-            Contradiction(
-                "the file has no summary: its writer was killed or is still at work",
+            Problem(
+                "the file has no summary: its writer was killed or is still running",
                 f"after byte {reader.data_end}",
             )
         )
     end = None
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
         if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):
-            found.append(Contradiction("an attachment does not match its CRC", f"byte {offset}"))
+            found.append(Problem("an attachment does not match its CRC", f"byte {offset}"))
         if opcode == Opcode.DATA_END:
             end = offset
             found += _check_data_end(reader, offset, content)
             break
     if reader.complete and end is None:
         where = "the records between header and summary"
-        found.append(Contradiction("the data section has no end", where))
+        found.append(Problem("the data section has no end", where))
     return found
 
 
-def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> list[Contradiction]:
+def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> list[Problem]:
     if len(content) != 4 or (
         reader.summary_start and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start
     ):
-        return [Contradiction("the data section's end is damaged", f"byte {offset}")]
+        return [Problem("the data section's end is damaged", f"byte {offset}")]
     (crc,) = struct.unpack("<I", content)
     if crc and crc32(reader.view[:offset]) != crc:
         where = f"bytes 0 to {offset}"
-        return [Contradiction("the data section does not match its CRC", where)]
+        return [Problem("the data section does not match its CRC", where)]
     return []
 
 

@@ -1,4 +1,4 @@
-"""Checks what a log says of itself: metadata against schema, steps in order, episodes, pictures."""
+"""Checks of a log's messages: schema and metadata, order of steps, episode summaries, images."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
@@ -25,7 +26,6 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.reading import (
     LOG_TIME,
     Columns,
-    Contradiction,
     Decoder,
     McapReader,
     Piece,
@@ -39,18 +39,18 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
-# Messages, what decodes them, and where they belong: rows of the steps' columns, or pictures.
+# A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
 _Place = tuple[Decoder, Span, slice | Leaf]
 
 
 class EpisodeCheck:
-    """Takes chunk after chunk, and judges them together at the end."""
+    """Check that reads the chunks of a log one after the other and validates them at the end."""
 
     def __init__(self, reader: McapReader) -> None:
         """Find the topics.
 
         Raises:
-            LogError: the file has no `/rl/step`, or its metadata is damaged.
+            LogError: The file has no `/rl/step`, or its metadata is damaged.
         """
         self._reader = reader
         self._steps = Topic(reader, STEP_TOPIC)
@@ -66,7 +66,7 @@ class EpisodeCheck:
             )
             if leaf.encoding is not None
         ]
-        # What is not of the form in which this library writes is read as any reader does.
+        # A log that this library did not write is read with the general reader.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
         self._places: dict[int, list[_Place]] = defaultdict(list)
@@ -74,7 +74,7 @@ class EpisodeCheck:
             self._prepare()
 
     def take(self, piece: Piece) -> None:
-        """Look at chunks of the log."""
+        """Read the fields to validate from chunks of the log."""
         records, starts = piece.records, piece.bounds[:-1]
         for decoder, places in self._places_in(piece).items():
             numbers, spans, wheres = zip(*places, strict=True)
@@ -88,18 +88,18 @@ class EpisodeCheck:
                 self._take_images(decoder.alike(records, index, _IMAGE_FIELDS), first)
 
     def _places_in(self, piece: Piece) -> dict[Decoder, list[tuple[int, Span, slice | Leaf]]]:
-        """Messages by what decodes them: in which of its chunks, and where they belong."""
+        """Return message ranges by decoder, with their chunk number and their destination."""
         found: dict[Decoder, list[tuple[int, Span, slice | Leaf]]] = defaultdict(list)
         for number, chunk in enumerate(piece.chunks):
             for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
                 found[decoder].append((number, span, where))
         return found
 
-    def finish(self) -> Iterator[Contradiction]:
-        """Tell what contradicts each other.
+    def finish(self) -> Iterator[Problem]:
+        """Yield what is wrong with the log.
 
         Raises:
-            LogError, SpaceError: so much that the log cannot be read.
+            LogError, SpaceError: The log cannot be read.
         """
         if not self._has_our_form:
             with warnings.catch_warnings():
@@ -111,8 +111,8 @@ class EpisodeCheck:
         lengths = episode_lengths(columns, path)
         frames = int(lengths.sum()) + len(lengths)
         if frames < len(self._steps):
-            yield Contradiction(
-                f"{len(self._steps) - frames} records of an episode that was not finished",
+            yield Problem(
+                f"{len(self._steps) - frames} records of an unfinished episode",
                 f"the end of {STEP_TOPIC}",
             )
         if not len(lengths):
@@ -120,18 +120,18 @@ class EpisodeCheck:
         times = columns[LOG_TIME]
         if (np.diff(times) <= 0).any():
             row = int(np.argmax(np.diff(times) <= 0)) + 1
-            yield Contradiction("log_times do not rise", f"record {row} of {STEP_TOPIC}")
-        yield from self._check_told(lengths)
+            yield Problem("log_times do not increase", f"record {row} of {STEP_TOPIC}")
+        yield from self._check_summaries(lengths)
         for leaf, topic in self._images:
             missing = int((~np.isin(times[:frames], topic.times)).sum())
             if missing or len(topic) != len(self._steps):
-                yield Contradiction(
-                    f"{len(topic)} pictures for {len(self._steps)} records, {missing} have none",
+                yield Problem(
+                    f"{len(topic)} images for {len(self._steps)} records, {missing} have none",
                     leaf.topic,
                 )
 
     def _schema_fits(self) -> bool:
-        """Whether `/rl/step` is one channel of what this library writes for such spaces."""
+        """Return whether `/rl/step` is one channel with the schema of the metadata's spaces."""
         channels = self._reader.channels_of(STEP_TOPIC)
         assert self._metadata is not None
         name, text = step_schema(self._metadata.observation_space, self._metadata.action_space)
@@ -142,7 +142,7 @@ class EpisodeCheck:
         return fits and len(channels) == 1
 
     def _prepare(self) -> None:
-        """Note which messages of which chunk belong to what."""
+        """Find the destination of each message range, by chunk."""
         start = 0
         for decoder, span in self._steps.parts:
             stop = start + len(span)
@@ -163,48 +163,50 @@ class EpisodeCheck:
 
     def _take_steps(self, found: NDArray[Any] | None, rows: slice) -> None:
         if found is None:
-            raise CorruptLogError(f"messages of {STEP_TOPIC} have not the form of their schema")
+            raise CorruptLogError(f"messages of {STEP_TOPIC} do not match their schema")
         for name in _FIELDS:
             self._columns[name][rows] = found[name]
 
     def _take_images(self, found: NDArray[Any] | None, leaf: Leaf) -> None:
         if found is None or not _is_image(found, leaf):
-            raise CorruptLogError(f"pictures on {leaf.topic} are not as the metadata's space says")
+            raise CorruptLogError(f"images on {leaf.topic} do not match the metadata's space")
 
-    def _check_told(self, lengths: NDArray[np.int64]) -> Iterator[Contradiction]:
-        """What `/rl/episode` tells, against the records."""
+    def _check_summaries(self, lengths: NDArray[np.int64]) -> Iterator[Problem]:
+        """Compare `/rl/episode` with the records."""
         columns = self._columns
         finals = np.cumsum(lengths + 1) - 1
-        told = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC)).summaries(columns[LOG_TIME][finals])
-        if len(told) not in (0, len(lengths)):
-            yield Contradiction(f"{len(told)} episodes are told of {len(lengths)}", EPISODE_TOPIC)
-        whole = summaries(self._reader.path, columns, lengths, told)
+        topic = Topic(self._reader, EPISODE_TOPIC)
+        listed = EpisodeTopic(topic).summaries(columns[LOG_TIME][finals])
+        if len(listed) not in (0, len(lengths)):
+            what = f"{len(listed)} of {len(lengths)} episodes have a summary"
+            yield Problem(what, EPISODE_TOPIC)
+        whole = summaries(self._reader.path, columns, lengths, listed)
         actual = summaries_of_records(columns, finals, lengths)
         for number, summary_and_actual in enumerate(zip(whole, actual, strict=True)):
             yield from _check_summary(number, *summary_and_actual)
 
 
 def _check_summary(
-    number: int, told: EpisodeSummary, actual: EpisodeSummary
-) -> Iterator[Contradiction]:
+    number: int, listed: EpisodeSummary, actual: EpisodeSummary
+) -> Iterator[Problem]:
     pairs = [
-        ("a return", told.total_reward, actual.total_reward),
-        ("a start", told.start_time_ns, actual.start_time_ns),
-        ("terminated", told.terminated, actual.terminated),
-        ("truncated", told.truncated, actual.truncated),
+        ("return", listed.total_reward, actual.total_reward),
+        ("start", listed.start_time_ns, actual.start_time_ns),
+        ("terminated", listed.terminated, actual.terminated),
+        ("truncated", listed.truncated, actual.truncated),
     ]
     for name, claim, fact in pairs:
         if claim != fact and not math.isnan(fact):
-            yield Contradiction(
-                f"{EPISODE_TOPIC} tells {name} of {claim}, its records {fact}", f"episode {number}"
+            yield Problem(
+                f"{EPISODE_TOPIC} reports {name} {claim}, its records {fact}", f"episode {number}"
             )
 
 
-def _check_return(episode: Episode) -> Iterator[Contradiction]:
+def _check_return(episode: Episode) -> Iterator[Problem]:
     total = add_up(episode.rewards)
     if total != episode.total_reward and not np.isnan(total):
-        yield Contradiction(
-            f"{EPISODE_TOPIC} tells a return of {episode.total_reward}, its rewards give {total}",
+        yield Problem(
+            f"{EPISODE_TOPIC} reports return {episode.total_reward}, its records {total}",
             f"episode {episode.index}",
         )
 

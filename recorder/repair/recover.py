@@ -1,11 +1,11 @@
-"""Writes a whole log from what is left of one that was cut off or damaged.
+"""Recovery of the valid part of a log that was cut off or damaged.
 
-    sound records -> a file that is whole      -> episodes that are whole -> OUT
-    (salvage)        (sound_copy: chunks,         (whole_episodes)
-                      indexes, CRCs anew)
+    valid records -> valid MCAP file        -> complete episodes -> OUT
+    (salvage)        (valid_copy: chunks,      (whole_episodes)
+                      new indexes and CRCs)
 
-Metadata, attachments and all topics are kept; only the topics of `/rl/` follow the episodes, so
-that none of them is there in part. What cannot be kept is told, never left out in silence.
+Metadata, attachments and all topics are kept; only messages of `/rl/` topics that belong to a
+dropped episode are left out. Whatever is left out is reported.
 """
 
 from __future__ import annotations
@@ -18,18 +18,20 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from mcaprl.errors import LogError, NoEpisodesError, OutputExistsError, UsageError
+from mcaprl.files import replacing
+from mcaprl.problem import Problem
 from mcaprl.recorder.format.reading import (
     Damage,
     McapReader,
-    SoundRecord,
+    ValidRecord,
     chunk_header,
     map_file,
     parse_record,
-    sound_records,
+    valid_records,
 )
 from mcaprl.recorder.format.writing import McapWriter, refuse_if_taken
 from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.sound_copy import copy_records
+from mcaprl.recorder.repair.valid_copy import copy_records
 from mcaprl.recorder.repair.whole_episodes import (
     DroppedEpisode,
     EpisodePlan,
@@ -40,17 +42,19 @@ from mcaprl.recorder.repair.whole_episodes import (
 
 @dataclass
 class Recovery:
-    """What became of a log.
+    """Result of a recovery.
 
     Attributes:
-        messages: that are in the new file.
-        episodes: likewise; 0 if it has no `/rl/step`.
-        damages: places that could not be read.
-        dropped: episodes that are not in the new file, as far as any of them was read.
-        ended: episodes that were not finished, and were kept up to their last whole transition.
-        strays: messages of `/rl/` topics that belonged to none of the kept episodes.
+        source: Path of the damaged file.
+        messages: Number of messages in the new file.
+        episodes: Number of episodes in the new file; 0 if it has no `/rl/step`.
+        damages: Places that could not be read.
+        dropped: Episodes that are not in the new file, if any of their records was read.
+        ended: Number of unfinished episodes that were kept up to their last whole transition.
+        strays: Number of messages on `/rl/` topics that belong to no kept episode.
     """
 
+    source: str
     messages: int = 0
     episodes: int = 0
     damages: list[Damage] = field(default_factory=list)
@@ -60,8 +64,23 @@ class Recovery:
 
     @property
     def has_losses(self) -> bool:
-        """Whether anything of the old file is missing in the new one."""
+        """Whether the new file lacks anything of the old one."""
         return bool(self.damages or self.dropped or self.ended or self.strays)
+
+    @property
+    def problems(self) -> list[Problem]:
+        """Losses of messages, in the order of the attributes."""
+        found = [(one.what, f"byte {one.offset}, {one.bytes} bytes", "") for one in self.damages]
+        found += [
+            (f"episode {one.number}", f"{one.records} records of it were read", one.why)
+            for one in self.dropped
+        ]
+        if self.strays:
+            found.append((f"{self.strays} messages", "/rl/ topics", "they are of dropped episodes"))
+        return [
+            Problem(f"lost: {what}", where, effect, file=self.source)
+            for what, where, effect in found
+        ]
 
 
 def recover_log(
@@ -71,62 +90,62 @@ def recover_log(
     keep_unfinished: bool = False,
     overwrite: bool = False,
 ) -> Recovery:
-    """Write what is left of `source` to `target`, which is whole then.
+    """Write the valid part of `source` to `target`, which is then a valid log.
 
     Args:
-        source: an MCAP file, damaged or not. It is not changed.
-        target: where to.
-        keep_unfinished: keep episodes whose end is missing, marked truncated, up to the last
-            transition that is there. By default they are dropped.
-        overwrite: replace a file that is there.
+        source: MCAP file, damaged or not. It is not changed.
+        target: Path of the new file.
+        keep_unfinished: Whether episodes without an end are kept, marked truncated, up to their
+            last whole transition. By default they are dropped.
+        overwrite: Whether an existing file is replaced.
 
     Raises:
-        OutputExistsError, UsageError: the target is taken, or is the source.
-        LogError: nothing can be kept, or the target cannot be written.
+        OutputExistsError, UsageError: The target exists, or is the source.
+        LogError: Nothing can be kept, or the target cannot be written.
     """
     source, target = Path(source), Path(target)
     _check_paths(source, target, overwrite)
-    stages = [target.with_name(f"{target.name}.{part}.part") for part in ("records", "whole")]
-    recovery = Recovery()
-    try:
-        view = map_file(source)
-        records = list(sound_records(view, recovery.damages))
-        how = _Manner.of(view, records)
-        how.write(stages[0], lambda writer: copy_records(view, records, writer, recovery.damages))
-        reader = McapReader(stages[0])
-        recovery.messages = _count_messages(reader)
-        if recovery.messages == 0:
-            raise LogError(f"{source} cannot be recovered: no message in it can be read")
-        plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
-        result = stages[0]
-        if plan is not None:
-            _note(plan, source, recovery)
-            if plan.changes_anything:
-                result = stages[1]
-                how.write(result, lambda writer: write_planned(reader, writer, plan))
+    recovery = Recovery(str(source))
+    with replacing(target, LogError) as result:
+        copied = result.with_name(f"{result.name}.records")
+        try:
+            view = map_file(source)
+            records = list(valid_records(view, recovery.damages))
+            style = _Style.of(view, records)
+            style.write(copied, lambda new: copy_records(view, records, new, recovery.damages))
+            reader = McapReader(copied)
+            recovery.messages = _count_messages(reader)
+            if recovery.messages == 0:
+                raise LogError(f"{source} cannot be recovered: no message in it can be read")
+            plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
+            if plan is not None:
+                _add_plan(recovery, plan)
+            if plan is not None and plan.changes_anything:
+                style.write(result, lambda writer: write_planned(reader, writer, plan))
                 recovery.messages = _count_messages(McapReader(result))
-            _make_sure(source, result)
-        os.replace(result, target)
-    finally:
-        for path in stages:
-            path.unlink(missing_ok=True)
+            else:
+                os.replace(copied, result)
+            if plan is not None:
+                _require_valid(source, result)
+        finally:
+            copied.unlink(missing_ok=True)
     return recovery
 
 
 @dataclass(frozen=True)
-class _Manner:
-    """How the damaged file was written, and the new one is to be.
+class _Style:
+    """Compression and profile of the damaged file, which the new one has as well.
 
     Attributes:
-        compression: of its first chunk.
-        profile: of its header.
+        compression: Compression of the first chunk.
+        profile: Profile in the header.
     """
 
     compression: str
     profile: str
 
     @classmethod
-    def of(cls, view: memoryview, records: list[SoundRecord]) -> _Manner:
+    def of(cls, view: memoryview, records: list[ValidRecord]) -> _Style:
         first = next((offset for offset, opcode, _ in records if opcode == Opcode.CHUNK), None)
         name = "zstd" if first is None else chunk_header(view, first).compression or "none"
         headers = [parse_record(opcode, c) for _, opcode, c in records if opcode == Opcode.HEADER]
@@ -134,7 +153,7 @@ class _Manner:
         return cls(name if name in ("zstd", "lz4", "none") else "zstd", profile)
 
     def write(self, path: Path, write: Callable[[McapWriter], None]) -> None:
-        """Write a whole file."""
+        """Write a file from the first to the last record."""
         writer = McapWriter(
             path, compression=self.compression, overwrite=True, profile=self.profile
         )
@@ -159,26 +178,26 @@ def _count_messages(reader: McapReader) -> int:
     return sum(len(span) for span in spans)
 
 
-def _note(plan: EpisodePlan, source: Path, recovery: Recovery) -> None:
-    """Tell what becomes of the episodes.
+def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
+    """Add the episodes of a plan to the result.
 
     Raises:
-        NoEpisodesError: none can be kept.
+        NoEpisodesError: No episode can be kept.
     """
     recovery.episodes, recovery.dropped = plan.episodes, plan.dropped
     recovery.ended, recovery.strays = plan.ended, plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""
-        raise NoEpisodesError(f"{source} has no whole episode{hint}")
+        raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")
 
 
-def _make_sure(source: Path, result: Path) -> None:
-    """Read the new log before it takes its place.
+def _require_valid(source: Path, result: Path) -> None:
+    """Check the new log before it is moved into place.
 
     Raises:
-        LogError: something in it contradicts itself, so that it cannot be made whole.
+        LogError: The check finds a problem.
     """
     problems = check_log(result)
     if problems:
-        raise LogError(f"{source} cannot be made whole: {problems[0].what} ({problems[0].where})")
+        raise LogError(f"{source} cannot be recovered: {problems[0].what} ({problems[0].where})")

@@ -124,7 +124,9 @@ class AnnotatedCopy:
 
         found = verify(dataset, env, on_frame=show)
         if found.difference is not None:
-            raise LogError(f"no scene was added, for the sim is another now: {found.difference}")
+            raise LogError(
+                f"no scene was added, for the sim is another now: {found.difference.to_problem()}"
+            )
         if found.unseeded:
             raise LogError(
                 f"no scene was added, for the log has no seed of {len(found.unseeded)} episodes"

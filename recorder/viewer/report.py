@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.lint import Finding
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.viewer.tracks import Track, tracks_of
 
@@ -53,7 +53,7 @@ def dataset_page(
     dataset: Dataset,
     title: str,
     facts: Sequence[tuple[str, str]],
-    findings: Sequence[Finding],
+    findings: Sequence[Problem],
 ) -> None:
     """Write an HTML page about a dataset: facts, findings, plots, best and worst episodes.
 
@@ -85,7 +85,7 @@ def dataset_page(
     write_page(path, title, lead, sections)
 
 
-def _findings_section(findings: Sequence[Finding]) -> Section:
+def _findings_section(findings: Sequence[Problem]) -> Section:
     if not findings:
         return Section("Findings", text="No problems were found.")
     rows = [(one.severity, one.what, one.where, one.effect) for one in findings]

@@ -1,8 +1,8 @@
-"""Steps a simulator through a log again, and compares what it gives with what was logged.
+"""Comparison of a log with an environment that repeats it.
 
 A deterministic environment that is reset with the logged seed and stepped with the logged actions
-gives the same observations, rewards and ends, bit for bit. An episode that was reset without a seed
-goes on with the random numbers that the one before left behind, so it is stepped in its wake.
+returns the same observations, rewards and flags, bit for bit. An episode that was reset without a
+seed continues the random state of the episode before it, so it is stepped directly after that one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError
+from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
@@ -25,37 +26,34 @@ from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.record.step_rows import as_declared
 
 _MOST_FIELDS = 8
+_MOST_EPISODES = 10
 
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """One number that is not what it was.
+    """One number that is different.
 
     Attributes:
-        name: `reward`, `terminated`, `truncated`, or the observation's own name for it.
-        logged: what the log has.
-        now: what the environment gave.
+        name: `reward`, `terminated`, `truncated`, or the name of the number in the observation.
+        logged: Value in the log.
+        now: Value that the environment returned.
     """
 
     name: str
     logged: str
     now: str
 
-    def __str__(self) -> str:
-        """For people."""
-        return f"{self.name} logged {self.logged}, now {self.now}"
-
 
 @dataclass(frozen=True)
 class Difference:
-    """The first record that differs.
+    """The first record that is different.
 
     Attributes:
-        episode: its index in the dataset.
-        step: of the observation; 0 is the one that reset() gave.
+        episode: Index of the episode in the dataset.
+        step: Step of the observation; 0 is the one that `reset` returned.
         time_ns: log_time of the observation.
-        time_s: the same in seconds since the episode's start.
-        fields: what differs in it; of very many the first.
+        time_s: Time of the observation since the start of the episode.
+        fields: Numbers that are different; only the first ones if there are many.
     """
 
     episode: int
@@ -64,29 +62,42 @@ class Difference:
     time_s: float
     fields: tuple[FieldDifference, ...]
 
-    def __str__(self) -> str:
-        """For people."""
-        return (
-            f"episode {self.episode} differs first at step {self.step} ({self.time_s:.3f} s in,"
-            f" log_time {self.time_ns} ns): {'; '.join(map(str, self.fields))}"
+    def to_problem(self, file: str = "") -> Problem:
+        """Describe the difference."""
+        fields = [f"{one.name} logged {one.logged}, now {one.now}" for one in self.fields]
+        return Problem(
+            f"episode {self.episode} differs first at step {self.step}",
+            f"{self.time_s:.3f} s in, log_time {self.time_ns} ns",
+            "; ".join(fields),
+            file=file,
         )
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What a comparison found.
+    """Result of a comparison.
 
     Attributes:
-        episodes: that were compared.
-        steps: in them.
-        unseeded: indexes of episodes that cannot be stepped again, since their start is not known.
-        difference: the first one; None if all is the same.
+        episodes: Number of episodes that were compared.
+        steps: Number of their steps that were compared.
+        unseeded: Indexes of episodes that cannot be repeated, since their start is unknown.
+        difference: The first difference; None if there is none.
     """
 
     episodes: int
     steps: int
     unseeded: tuple[int, ...]
     difference: Difference | None
+
+    def problems(self, file: str = "") -> list[Problem]:
+        """List the difference, and a note on the episodes that were not compared."""
+        found = [] if self.difference is None else [self.difference.to_problem(file)]
+        if self.unseeded:
+            more = ", ..." if len(self.unseeded) > _MOST_EPISODES else ""
+            where = f"episodes {', '.join(map(str, self.unseeded[:_MOST_EPISODES]))}{more}"
+            what = f"{len(self.unseeded)} not compared, since the log has no seed for them"
+            found.insert(0, Problem(what, where, file=file, severity="note"))
+        return found
 
 
 def verify(
@@ -99,29 +110,29 @@ def verify(
     """Step `env` through the log up to the first difference.
 
     Args:
-        dataset: the log.
-        env: a new environment of the same kind; it is reset and stepped here.
-        only: index of the one episode that matters; those before it are stepped as far as its
-            start depends on them.
-        on_frame: called with the episode and the step after each observation that is the same,
-            while the environment stands there.
+        dataset: Dataset of one log.
+        env: New environment of the same kind; it is reset and stepped here.
+        only: Index of the only episode to compare; earlier episodes are stepped only if its
+            random state depends on them. Default: all episodes.
+        on_frame: Callback with the episode and the step after each observation that is the same,
+            while the environment is in that state.
 
     Raises:
-        SpaceError: the environment has other spaces than the log.
-        LogError: the environment fails on a logged action.
+        SpaceError: The spaces of the environment are not those of the log.
+        LogError: The environment fails on a logged action.
     """
     _check_spaces(dataset, env)
     compared = steps = 0
     unseeded: list[int] = []
-    known_start = False
+    is_start_known = False
     for episode in _needed(dataset.episodes, only):
-        goes_on = known_start and _follows(dataset.episodes, episode.index)
-        known_start = episode.seed is not None or goes_on
-        difference = _compare(dataset, env, episode, on_frame) if known_start else None
+        continues = is_start_known and _follows(dataset.episodes, episode.index)
+        is_start_known = episode.seed is not None or continues
+        difference = _compare(dataset, env, episode, on_frame) if is_start_known else None
         if difference is not None and episode.seed is None and difference.step == 0:
-            # It went on from somewhere else: nothing is known of its start, so nothing is wrong.
-            known_start, difference = False, None
-        if not known_start:
+            # It started from another state, which is unknown, so nothing is wrong.
+            is_start_known, difference = False, None
+        if not is_start_known:
             unseeded.append(episode.index)
             continue
         compared += 1
@@ -132,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """The episode that matters and those that its start depends on; all if none is named."""
+    """Return one episode and those that its start depends on; all if `only` is None."""
     if only is None:
         return episodes
     first = only
@@ -142,7 +153,7 @@ def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, .
 
 
 def _follows(episodes: tuple[Episode, ...], index: int) -> bool:
-    """Whether an episode came next in the same recording as the one before it."""
+    """Return whether an episode directly follows the one before it in the same recording."""
     number = episodes[index].summary.episode
     return index > 0 and number > 0 and episodes[index - 1].summary.episode == number - 1
 
@@ -153,7 +164,7 @@ def _compare(
     episode: Episode,
     on_frame: Callable[[Episode, int], None],
 ) -> Difference | None:
-    """Step one episode; its first difference."""
+    """Step one episode and return its first difference."""
     leaves = observation_leaves(dataset.observation_space)
     for step, now in enumerate(_stepped(env, episode, dataset.action_space)):
         fields = []
@@ -176,7 +187,7 @@ _Frame = tuple[Any, float, bool, bool]
 def _stepped(
     env: gym.Env[Any, Any], episode: Episode, action_space: spaces.Space[Any]
 ) -> Iterator[_Frame]:
-    """Yield observation, reward, terminated and truncated at each step; the first has no reward."""
+    """Yield observation, reward, terminated and truncated: of `reset` first, then of each step."""
     options = json.loads(episode.summary.options) if episode.summary.options else None
     step = 0
     try:
@@ -187,11 +198,11 @@ def _stepped(
             action = int(logged) if isinstance(action_space, spaces.Discrete) else logged.copy()
             observation, reward, terminated, truncated, _ = env.step(action)
             yield observation, float(reward), bool(terminated), bool(truncated)
-    # An environment raises whatever it likes.
+    # An environment can raise any exception.
     except Exception as error:
         raise LogError(
-            f"the environment fails at step {step} of episode {episode.index}, to which the log"
-            f" went on: {type(error).__name__}: {error}"
+            f"the environment fails at step {step} of episode {episode.index}, which the log"
+            f" contains: {type(error).__name__}: {error}"
         ) from error
 
 
@@ -231,12 +242,12 @@ def _leaf_differences(
 
 
 def _bits(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array as integers: NaN equals itself then, and 0.0 is not -0.0."""
+    """View an array as integers, so that NaN equals itself and 0.0 does not equal -0.0."""
     return np.ascontiguousarray(array).view(f"u{array.dtype.itemsize}").reshape(array.shape)
 
 
 def _at(episode: Episode, step: int) -> Any:
-    """The logged observation at a step, the last one included."""
+    """Return the logged observation at a step, from 0 to the length of the episode."""
     source = episode.observations if step < episode.length else episode.next_observations
     return _row(source, min(step, episode.length - 1))
 

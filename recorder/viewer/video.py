@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, ReportError, UnknownNameError, UsageError, import_extra
+from mcaprl.files import replacing
 
 Image = NDArray[np.uint8]
 
@@ -58,30 +59,24 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
         UsageError: There are no frames.
         ReportError: The file cannot be written.
     """
-    unfinished = path.with_stem(f"{path.stem}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        count = _write(unfinished, images, fps)
+    with replacing(path, ReportError) as unfinished:
+        count = _write(unfinished, path.suffix, images, fps)
         if count == 0:
             raise UsageError(f"{path}: there is nothing to show")
-        unfinished.replace(path)
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        unfinished.unlink(missing_ok=True)
     return count
 
 
-def _write(path: Path, images: Iterable[Image], fps: float) -> int:
+def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
     imageio = import_extra("imageio.v3", "video")
-    if path.suffix == ".gif":
+    if kind == ".gif":
         stills = list(images)
         if stills:
             milliseconds = round(1000 / fps)
-            imageio.imwrite(path, stills, plugin="pillow", duration=milliseconds, loop=0)
+            options = {"extension": kind, "plugin": "pillow", "loop": 0}
+            imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    with imageio.imopen(path, "w", plugin="pyav") as video:
+    with imageio.imopen(path, "w", plugin="pyav", extension=kind) as video:
         video.init_video_stream("libx264", fps=float(fps))
         for image in images:
             video.write_frame(image)
@@ -96,11 +91,8 @@ def write_sheet(path: Path, images: Sequence[Image]) -> None:
         ReportError: The file cannot be written.
     """
     imageio = import_extra("imageio.v3", "video")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        imageio.imwrite(path, contact_sheet(images))
-    except OSError as error:
-        raise ReportError(f"cannot write {path}: {error.strerror or error}") from error
+    with replacing(path, ReportError) as unfinished:
+        imageio.imwrite(unfinished, contact_sheet(images), extension=".png")
 
 
 def contact_sheet(images: Sequence[Image]) -> Image:

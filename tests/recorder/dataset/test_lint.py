@@ -70,11 +70,11 @@ def test_a_sound_dataset_has_no_findings() -> None:
             "1 number of observation leave their space (observation[1] is 0.07143 to 1.5, its"
             " space 0 to 1)",
         ),
-        ({"rewards": np.zeros(6)}, "problem", "no reward differs from 0 (all steps)"),
+        ({"rewards": np.zeros(6)}, "problem", "every reward is 0 (all steps)"),
         (
             {"rewards": np.array([0, 0, 1.0, 0, 0, 0])},
             "note",
-            "rewards are paid on the last steps of episodes only (1 of 2 episodes)",
+            "only the last steps of episodes have a reward (1 of 2 episodes)",
         ),
         (
             changed("rewards", 5, -10.0),

@@ -93,7 +93,7 @@ def test_the_copy_is_made_once(log: Path) -> None:
     made = [path.stat().st_ino for path in copies]
     assert mcaprl.open(log, images="mapped", episodes=[1, 2]).storage == mapped.storage
     assert [path.stat().st_ino for path in copies] == made
-    assert not list(log.parent.glob("*.part"))
+    assert not list(log.parent.glob("*.tmp"))
 
 
 @pytest.mark.parametrize("log", ["zstd"], indirect=True)

@@ -113,9 +113,9 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 1, episode=7), "out of order"),
         (at(1, 3, final=False), "out of order"),
         (at(1, 1, terminated=True), "goes on after its end"),
-        (at(2, 5, final=False), "6 records of an episode that was not finished"),
-        (at(0, 3, terminated=False), "tells terminated of True, its records False"),
-        (at(1, 2, truncated=False), "tells truncated of True, its records False"),
+        (at(2, 5, final=False), "6 records of an unfinished episode"),
+        (at(0, 3, terminated=False), "reports terminated True, its records False"),
+        (at(1, 2, truncated=False), "reports truncated True, its records False"),
     ],
 )
 def test_episodes_that_contradict_themselves(good: Path, change: Change, told: str) -> None:
@@ -131,7 +131,7 @@ def test_nothing_is_changed_by_rewriting(good: Path) -> None:
 def test_return_that_is_not_the_rewards_sum(log_path: Path) -> None:
     write_log(log_path, 2)
     problems = check_log(rewritten(log_path, at(1, 1, reward=1e6)))
-    assert ["tells a return of" in problem.what for problem in problems] == [True]
+    assert ["reports return" in problem.what for problem in problems] == [True]
     assert problems[0].where == "episode 1"
 
 
@@ -183,11 +183,11 @@ def test_metadata_of_other_spaces(good: Path) -> None:
 def test_pictures_that_are_missing(good: Path) -> None:
     """Or are of another size than the metadata says."""
     (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
-    assert problem.what == "11 pictures for 15 records, 4 have none"
+    assert problem.what == "11 images for 15 records, 4 have none"
     other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
     strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
     (problem,) = check_log(rewritten(good, strings=strings))
-    assert problem.what == "pictures on /rl/observation/eye are not as the metadata's space says"
+    assert problem.what == "images on /rl/observation/eye do not match the metadata's space"
 
 
 def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) -> None:
@@ -197,10 +197,8 @@ def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) ->
     assert data.count(b"string encoding") >= 2
     log_path.write_bytes(data.replace(b"string encoding", b"string encodinx"))
     (problem,) = check_log(log_path)
-    assert (
-        "pictures on /rl/observation/picture are not as the metadata's space says" in problem.what
-    )
-    with pytest.raises(LogError, match="cannot be made whole"):
+    assert "images on /rl/observation/picture do not match the metadata's space" in problem.what
+    with pytest.raises(LogError, match="cannot be recovered: images on"):
         recover_log(log_path, tmp_path / "out.mcap")
 
 

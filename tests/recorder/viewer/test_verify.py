@@ -129,7 +129,7 @@ def test_the_first_difference_is_told_with_its_place(
     assert [field.name for field in difference.fields] == names
     for field in difference.fields:
         assert field.logged != field.now
-    assert "episode 1 differs first at step 4 (0.400 s in" in str(difference)
+    assert "episode 1 differs first at step 4 (0.400 s in" in str(difference.to_problem())
 
 
 def test_an_episode_without_a_seed_goes_on_from_the_one_before(log_path: Path) -> None:

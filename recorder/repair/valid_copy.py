@@ -1,4 +1,4 @@
-"""Copies sound records of a damaged MCAP file into a new one that is whole."""
+"""Copy of the valid records of a damaged MCAP file into a new, valid one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcaprl.recorder.format.reading import (
     RECORD_HEADER_BYTES,
     Damage,
     Scratch,
-    SoundRecord,
+    ValidRecord,
     chunk_records,
     contents_of,
     crc32,
@@ -26,20 +26,20 @@ from mcaprl.recorder.format.reading import (
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.format.writing import McapWriter
 
-# Messages that stand outside of chunks are brought together in chunks of this size.
-_LOOSE_BYTES = 2**20
+# Unchunked messages are written in chunks of this size.
+_UNCHUNKED_BYTES = 2**20
 
 
 def copy_records(
-    view: memoryview, records: Sequence[SoundRecord], writer: McapWriter, damages: list[Damage]
+    view: memoryview, records: Sequence[ValidRecord], writer: McapWriter, damages: list[Damage]
 ) -> None:
-    """Write the records anew, in chunks with indexes and CRCs.
+    """Write the records in chunks with new indexes and CRCs.
 
     Args:
-        view: the damaged file.
-        records: of it.
-        writer: of the new one.
-        damages: what cannot be copied is added here.
+        view: Content of the damaged file.
+        records: Valid records of that file.
+        writer: Writer of the new file.
+        damages: List to which records that cannot be copied are added.
     """
     topics = _Topics(view, records, damages)
     copy = _Copy(view, writer, topics, damages)
@@ -52,18 +52,18 @@ def copy_records(
 
 
 class _Topics:
-    """Schemas, channels and metadata, from wherever they can be believed most."""
+    """Schemas, channels and metadata of the damaged file, each from its most reliable copy."""
 
     def __init__(
         self,
         view: memoryview,
-        records: Sequence[SoundRecord],
+        records: Sequence[ValidRecord],
         damages: list[Damage],
     ) -> None:
         self._damages = damages
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        # The summary has a CRC; what stands in front of it has none but the whole file's.
+        # Records of the summary have a CRC; those of the data section share one with all others.
         for record in intact_summary(view):
             self.take(record, 0)
         self.metadata: list[Metadata] = []
@@ -75,14 +75,14 @@ class _Topics:
         self._restore_description()
 
     def take(self, record: Schema | Channel, offset: int) -> None:
-        """Note a topic; of two that contradict each other, the first is kept."""
+        """Add a schema or channel; of two with one id, the first is kept."""
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         if known.setdefault(record.id, record) != record:
-            what = f"{type(record).__name__.lower()} {record.id} is told in two ways"
+            what = f"{type(record).__name__.lower()} {record.id} has two definitions"
             self._damages.append(Damage(offset, 0, what))
 
     def announce(self, channel_id: int, writer: McapWriter) -> bool:
-        """Write a channel and its schema, unless they are written; whether they are known."""
+        """Write a channel and its schema unless they are written; return whether they are known."""
         channel = self.channels.get(channel_id)
         if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
             return False
@@ -93,12 +93,12 @@ class _Topics:
         return True
 
     def announce_rest(self, writer: McapWriter) -> None:
-        """Write the channels that have no messages."""
+        """Write the channels without messages."""
         for channel_id in self.channels:
             self.announce(channel_id, writer)
 
     def _restore_description(self) -> None:
-        """Let the metadata record be what the channel of `/rl/step` repeats."""
+        """Replace the metadata record with its copy in the channel of `/rl/step`."""
         copies = [
             channel.metadata
             for channel in self.channels.values()
@@ -114,32 +114,32 @@ class _Topics:
 
 
 class _Copy:
-    """Writes sound records, one after the other."""
+    """Writer of valid records that leaves out repeated chunks and unknown channels."""
 
     def __init__(
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
         self._seen: set[tuple[int, int]] = set()
-        self._loose, self._scratch = bytearray(), Scratch()
+        self._unchunked, self._scratch = bytearray(), Scratch()
 
     def take(self, offset: int, opcode: int, content: memoryview) -> None:
-        """Write what a record carries."""
+        """Write the content of a record."""
         if opcode == Opcode.CHUNK:
             self.flush()
             self._take_chunk(offset, len(content))
         elif opcode == Opcode.MESSAGE:
-            self._loose += self._view[offset : offset + RECORD_HEADER_BYTES + len(content)]
-            if len(self._loose) > _LOOSE_BYTES:
+            self._unchunked += self._view[offset : offset + RECORD_HEADER_BYTES + len(content)]
+            if len(self._unchunked) > _UNCHUNKED_BYTES:
                 self.flush()
         elif opcode == Opcode.ATTACHMENT:
             self._writer.announce(parse_record(opcode, content))
 
     def flush(self) -> None:
-        """Write messages that stood outside of chunks as a chunk."""
-        if self._loose:
-            self._write(memoryview(bytes(self._loose)), 0, len(self._loose))
-            self._loose = bytearray()
+        """Write the unchunked messages so far as a chunk."""
+        if self._unchunked:
+            self._write(memoryview(bytes(self._unchunked)), 0, len(self._unchunked))
+            self._unchunked = bytearray()
 
     def _take_chunk(self, offset: int, size: int) -> None:
         try:
@@ -149,7 +149,7 @@ class _Copy:
             return
         key = (crc32(records), len(records))
         if key in self._seen:
-            self._damages.append(Damage(offset, size, "a chunk for the second time"))
+            self._damages.append(Damage(offset, size, "a chunk that is in the file twice"))
             return
         self._seen.add(key)
         self._write(records, offset, size)
@@ -167,7 +167,7 @@ class _Copy:
             if self._topics.announce(channel_id, self._writer):
                 known[channel_id] = index
             else:
-                what = f"{len(index)} messages of channel {channel_id}, which nothing tells of,"
+                what = f"{len(index)} messages of channel {channel_id}, which has no definition"
                 self._damages.append(Damage(offset, 0, what))
         if len(known) < len(contents.indexes):
             records, known = only(records, known)
