@@ -32,7 +32,7 @@ from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.estimate.ranking import rank_correlation, regret_at_1
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
-from mcaprl.online.policy import OnlinePolicy, describe_run, load_policy, save_policy
+from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
 from mcaprl.online.task import Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import make_sims
@@ -102,7 +102,7 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
     evaluator = OffPolicyEvaluator(dataset, config)
     found = []
     for number, path in enumerate(kept):
-        policy = load_policy(path)
+        policy = read_policy(path)
         discounted, plain = true_values(sim, policy)
         estimates = evaluator.evaluate(policy, path.stem).estimates
         values = {estimate.estimator: estimate.value for estimate in estimates}

@@ -26,7 +26,7 @@ import gymnasium as gym
 import numpy as np
 
 import mcaprl
-from mcaprl.online.policy import load_policies
+from mcaprl.api.policies import load_policies
 from mcaprl.online.task import Task
 from mcaprl.online.train import train as train_online
 from mcaprl.progress import TrainingProgress

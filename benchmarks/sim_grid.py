@@ -25,11 +25,11 @@ import torch
 import mcaprl
 from benchmarks.page import write_section
 from benchmarks.sim_data import NAMES, make_logs
+from mcaprl.api.policies import load_policies
 from mcaprl.files import write_json
 from mcaprl.offline.algorithms.config import BootstrapConfig
 from mcaprl.offline.algorithms.dqn import DQNConfig
 from mcaprl.offline.algorithms.registry import ALGORITHMS
-from mcaprl.offline.policy import load_policies
 from mcaprl.offline.training.train import train
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize

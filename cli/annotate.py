@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from mcaprl.cli.policies import policy_names, trained_policy
+from mcaprl.api.policies import policy_names, trained_policies
 from mcaprl.cli.replay import sim_of
 from mcaprl.cli.show import counted, progress
 from mcaprl.errors import UsageError
@@ -56,7 +56,7 @@ def _values(dataset: Dataset, name: str, gamma: float | None) -> list[tuple[Any,
     """Each episode with what the first policy of a run thinks of it."""
     from mcaprl.offline.estimate.values import gamma_of_run, value_columns
 
-    policy: Any = trained_policy(name, dataset)
+    policy: Any = trained_policies(name, dataset)[0]
     discount = gamma_of_run(Path(name)) if gamma is None else gamma
     found = []
     with progress(f"asking {name}", len(dataset.episodes)) as advance:

@@ -12,10 +12,10 @@ from typing import Any
 import click
 import gymnasium as gym
 
+from mcaprl.api.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.curves import learning_curves
 from mcaprl.cli.off_policy import evaluate_from_log, print_estimates
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.policies import SCRIPTED, policies_of, policy_names
 from mcaprl.cli.show import counted, print_json, print_table, progress
 from mcaprl.errors import ReportError, UsageError, import_extra
 from mcaprl.files import write_json

@@ -19,8 +19,8 @@ def export(run: str, out: Path, overwrite: bool) -> None:
     Inputs are the parts of the observation by their names in the log; outputs are action and
     scores. ONNX Runtime runs it without this package.
     """
+    from mcaprl.api.policies import load_policy
     from mcaprl.offline.export import export_onnx
-    from mcaprl.offline.policy import load_policy
 
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: choose another name, or --overwrite")

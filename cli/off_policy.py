@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mcaprl.cli.policies import policy_names, trained_policies
+from mcaprl.api.policies import policy_names, trained_policies
 from mcaprl.cli.show import counted, print_table, progress
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.open import open_logs

@@ -16,8 +16,8 @@ from typing import Any
 import click
 import numpy as np
 
+from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.policies import policies_of, policy_names
 from mcaprl.cli.show import counted, progress, size
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.recorder.format.writing import COMPRESSIONS

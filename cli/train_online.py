@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mcaprl.api.policies import TrainedPolicy, is_policy, load_policies
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.policies import is_policy, load_trained
 from mcaprl.cli.settings import setting_options
 from mcaprl.cli.show import print_table
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
-from mcaprl.sims.evaluation.rollout import Policy
 
 if TYPE_CHECKING:
     from mcaprl.online.live import LiveTraining
@@ -158,11 +157,11 @@ def _shown(task: Task, out: Path, port: int) -> Iterator[LiveTraining]:
         yield live
 
 
-def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, list[Policy] | None]:
+def _experience(sources: tuple[str, ...]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
     """The logs, and the policies of a run's seeds, among what is to be begun with."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"an agent begins with one policy, not with {' and '.join(policies)}")
     logs = [source for source in sources if source not in policies]
     data = open_logs(logs) if logs else None
-    return data, load_trained(Path(policies[0])) if policies else None
+    return data, load_policies(policies[0]) if policies else None

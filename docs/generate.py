@@ -19,8 +19,8 @@ import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
+from mcaprl.api.policies import SCRIPTED
 from mcaprl.cli import cli
-from mcaprl.cli.policies import SCRIPTED
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
 

@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import open_logs as open
 
 if TYPE_CHECKING:
-    from mcaprl.offline.policy import load_policy
+    from mcaprl.api.policies import load_policy
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 _LAZY = {
     "RecordMcap": "mcaprl.recorder.record.wrapper",
     "RecordVecMcap": "mcaprl.recorder.record.vector_wrapper",
-    "load_policy": "mcaprl.offline.policy",
+    "load_policy": "mcaprl.api.policies",
 }
 
 __all__ = [

@@ -1,19 +1,19 @@
 """Every error a user can meet. A message says what is wrong, where, and what to do.
 
-    McaprlError
-    ├── UsageError            the request itself cannot be meant           (exit code 2)
-    │   ├── UnknownNameError    no sim, policy, observation... of that name
-    │   ├── OutputExistsError   the output path is taken
-    │   └── MissingExtraError   an optional dependency is not installed
-    ├── LogError              a log cannot be read or written as asked     (exit code 1)
-    │   ├── NotMcapError        the file is no MCAP file
-    │   ├── NoStepsError        the file has no `/rl/step` topic, or no finished episode
-    │   │   └── NoEpisodesError   it has the topic, but no finished episode (yet)
-    │   └── CorruptLogError     the file's bytes contradict each other
-    ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
-    ├── PolicyError           a saved policy cannot be used                (exit code 1)
-    ├── TrainingError         learning cannot go on                        (exit code 1)
-    └── ReportError           a picture or report cannot be written        (exit code 1)
+McaprlError
+├── UsageError            the request itself cannot be meant           (exit code 2)
+│   ├── UnknownNameError    no sim, policy, observation... of that name
+│   ├── OutputExistsError   the output path is taken
+│   └── MissingExtraError   an optional dependency is not installed
+├── LogError              a log cannot be read or written as asked     (exit code 1)
+│   ├── NotMcapError        the file is no MCAP file
+│   ├── NoStepsError        the file has no `/rl/step` topic, or no finished episode
+│   │   └── NoEpisodesError   it has the topic, but no finished episode (yet)
+│   └── CorruptLogError     the file's bytes contradict each other
+├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
+├── PolicyError           a saved policy cannot be used                (exit code 1)
+├── TrainingError         learning cannot go on                        (exit code 1)
+└── ReportError           a picture or report cannot be written        (exit code 1)
 """
 
 from __future__ import annotations

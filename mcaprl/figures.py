@@ -65,7 +65,7 @@ def save_png(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Return an SVG element for a page: `INK` becomes the text color, `PALE` the page's `--pale`."""
+    """Return an SVG element: `INK` becomes the text color, `PALE` the page's `--pale`."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     with matplotlib.rc_context(_SVG_STYLE):

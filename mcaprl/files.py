@@ -1,4 +1,4 @@
-"""Atomic replacement of files: after a kill at any moment, `path` has its old or its new content."""
+"""Atomic replacement of files: after a kill, `path` has either its old or its new content."""
 
 from __future__ import annotations
 

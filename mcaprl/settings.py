@@ -1,7 +1,7 @@
 """Settings of whatever trains: frozen dataclasses, checked when made, each field with its help.
 
-A string under a field, as `TrainingConfig` in `offline/algorithms/config.py` has them, says what the field is
-for; the command line prints it as the help of the field's option.
+The string under a field, as in `offline/algorithms/config.py`, describes it; the command line
+prints that string as the help of the field's option.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Importing this package loads no torch; its modules do.
 
     from mcaprl.offline.training.train import train
-    from mcaprl.offline.policy import load_policy
+    from mcaprl import load_policy
 
     train(dataset, "cql", Path("runs/lane"))
     policy = load_policy("runs/lane")

@@ -85,13 +85,15 @@ class ExportedPolicy(nn.Module):
         return Observations((vector - self.shift) / self.scale, images, mask)
 
 
-def export_onnx(policy: Policy, path: Path) -> None:
-    """Write a policy as an ONNX file, for a batch of any size.
+def export_onnx(policy: object, path: Path) -> None:
+    """Write the policy of an offline run as an ONNX file, for a batch of any size.
 
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.
-        PolicyError: the file cannot be written.
+        PolicyError: The policy is not from an offline run, or the file cannot be written.
     """
+    if not isinstance(policy, Policy):
+        raise PolicyError(f"{getattr(policy, 'name', policy)} is not the policy of an offline run")
     for package in ("onnx", "onnxscript"):
         import_extra(package, "export")
     module = ExportedPolicy(policy).eval()

@@ -31,10 +31,10 @@ from mcaprl.offline.algorithms.networks import Architecture, Network
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
 from mcaprl.recorder.format.spaces import space_from_json, space_to_json
+from mcaprl.runs import POLICY_NAME
 from mcaprl.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = 2
-POLICY_NAME = "policy.json"
 _WEIGHTS_NAME = "policy.safetensors"
 _IMAGE_SHIFT = "observation.image_{}.shift"
 _IMAGE_SCALE = "observation.image_{}.scale"
@@ -234,38 +234,12 @@ def save_policy(
     write_json(folder / POLICY_NAME, description)
 
 
-def load_policy(path: str | Path) -> Policy:
-    """Load the policy of a run's first seed (`RUN`), or of one seed (`RUN/seed-2`).
+def read_policy(folder: Path) -> Policy:
+    """Read the policy of one seed's folder.
 
     Raises:
-        PolicyError: there is none, or its files are broken.
+        PolicyError: A file is missing or broken.
     """
-    return _load_seed(_seed_folders(Path(path))[0])
-
-
-def load_policies(path: str | Path) -> list[Policy]:
-    """Load the policies of all seeds of a run, in their order.
-
-    Raises:
-        PolicyError: there are none, or a file is broken.
-    """
-    return [_load_seed(folder) for folder in _seed_folders(Path(path))]
-
-
-def _seed_folders(path: Path) -> list[Path]:
-    if (path / POLICY_NAME).exists():
-        return [path]
-    numbered = {
-        int(number): folder
-        for folder in path.glob("seed-*")
-        if (number := folder.name.removeprefix("seed-")).isdigit()
-    }
-    if not numbered:
-        raise PolicyError(f"{path} has no policy: neither {POLICY_NAME} nor a seed-K folder")
-    return [numbered[number] for number in sorted(numbered)]
-
-
-def _load_seed(folder: Path) -> Policy:
     try:
         description = json.loads((folder / POLICY_NAME).read_text())
         if description["format_version"] != FORMAT_VERSION:

@@ -25,13 +25,14 @@ from mcaprl.online.evaluation import Evaluation, Scale
 from mcaprl.online.first_episodes import FirstEpisodes
 from mcaprl.online.frames import StackedVecEnv
 from mcaprl.online.live import LiveTraining
-from mcaprl.online.policy import BEST_NAME, describe_run, save_policy
+from mcaprl.online.policy import describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.runs import BEST_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
 
 LOG_INTERVAL = 1_000

@@ -28,8 +28,8 @@ from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
 from mcaprl.online.sb3_data import description_of
 from mcaprl.online.zip_file import read_model, write_model
 from mcaprl.recorder.format.spaces import space_from_json, space_to_json
+from mcaprl.runs import BEST_NAME
 
-BEST_NAME = "best_model.zip"
 FORMAT_VERSION = 1
 _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
@@ -185,31 +185,8 @@ def describe_run(
     }
 
 
-def load_policies(path: Path) -> list[OnlinePolicy]:
-    """Load one policy from a `.zip`, or those of all seeds from a run's folder.
-
-    Raises:
-        PolicyError: there are none, or a file is broken.
-    """
-    return [load_policy(found) for found in policy_files(path)]
-
-
-def policy_files(path: Path) -> list[Path]:
-    """The best models of a run in the order of its seeds, or of one seed; a file is itself."""
-    if path.is_file():
-        return [path]
-    if (path / BEST_NAME).exists():
-        return [path / BEST_NAME]
-    numbered = {
-        int(number): folder / BEST_NAME
-        for folder in path.glob("seed-*")
-        if (number := folder.name.removeprefix("seed-")).isdigit() and (folder / BEST_NAME).exists()
-    }
-    return [numbered[number] for number in sorted(numbered)]
-
-
-def load_policy(path: Path) -> OnlinePolicy:
-    """Load the policy in a `.zip` of this package or of plain SB3.
+def read_policy(path: Path) -> OnlinePolicy:
+    """Read the policy in a `.zip` of this package or of plain SB3.
 
     Raises:
         PolicyError: there is none, or it is broken.

@@ -31,12 +31,13 @@ from mcaprl.online.algorithms import check_spaces
 from mcaprl.online.curve_picture import PICTURE_NAME, SCORES_NAME, curve_picture, read_run
 from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
 from mcaprl.online.live import LiveTraining
-from mcaprl.online.policy import BEST_NAME, load_policy
+from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import log_paths
 from mcaprl.online.task import CONFIG_NAME, Task, read_config
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.runs import BEST_NAME
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import evaluate
 
@@ -183,7 +184,7 @@ class _Run:
             agent.learn(report)
         score = evaluate(
             self.env,
-            [load_policy(folder / BEST_NAME)],
+            [read_policy(folder / BEST_NAME)],
             name=self.task.algo,
             episodes=self.task.config.final_episodes,
             seed=FRESH_SEED,

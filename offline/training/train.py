@@ -29,7 +29,7 @@ from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
-from mcaprl.offline.policy import POLICY_NAME, load_policy, save_policy
+from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import (
     CHECKPOINT_NAME,
     Checkpoint,
@@ -49,6 +49,7 @@ from mcaprl.offline.training.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
+from mcaprl.runs import POLICY_NAME
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -274,7 +275,7 @@ def _starts(folder: RunFolder, seeds: range) -> list[dict[int, Checkpoint | None
 def _earlier_encoder(folder: RunFolder) -> ObservationEncoder | None:
     """The normalisation that the weights in a folder are used to."""
     policies = sorted(folder.path.glob(f"seed-*/{POLICY_NAME}"))
-    return load_policy(policies[0].parent).encoder if policies else None
+    return read_policy(policies[0].parent).encoder if policies else None
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:

@@ -17,7 +17,7 @@ from mcaprl.offline.algorithms.dqn import DQNConfig
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.export import ExportedPolicy, export_onnx
-from mcaprl.offline.policy import Policy, load_policy, save_policy
+from mcaprl.offline.policy import Policy, read_policy, save_policy
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.conftest import need
 
@@ -71,7 +71,7 @@ def policy_of(config: TrainingConfig, space: spaces.Space[Any], folder: Path) ->
     learner_type = next(each for each in ALGORITHMS.values() if type(config) is each.config_type)
     learner = learner_type(config, TransitionBuffer.from_dataset(data, config.packing), [0])
     save_policy(folder, learner, 0, "", {})
-    return load_policy(folder)
+    return read_policy(folder)
 
 
 @pytest.mark.parametrize(("config", "space"), CASES)

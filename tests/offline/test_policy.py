@@ -13,6 +13,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.api.policies import load_policies, load_policy
 from mcaprl.errors import PolicyError
 from mcaprl.offline.algorithms.bc import BC, BCConfig
 from mcaprl.offline.algorithms.bcq import BCQ
@@ -25,7 +26,7 @@ from mcaprl.offline.algorithms.networks import NatureConvolutions
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
-from mcaprl.offline.policy import Policy, load_policies, load_policy, save_policy
+from mcaprl.offline.policy import Policy, read_policy, save_policy
 from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import ACTION_SPACE, N_CELLS, corridor, inner_observations
@@ -58,7 +59,7 @@ def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> 
 
 def saved_and_loaded(folder: Path, learner: Learner) -> Policy:
     save_policy(folder, learner, 0, "Corridor-v0", {"length": 5})
-    return load_policy(folder)
+    return read_policy(folder)
 
 
 def test_a_loaded_policy_gives_the_values_of_the_network_that_was_saved(tmp_path: Path) -> None:

@@ -16,12 +16,10 @@ import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError
 from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.policy import load_policy as load_offline
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.frames import FrameMemory, StackedVecEnv, joined, stacked_space
-from mcaprl.online.policy import load_policy
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.vec_env import BatchedVecEnv
@@ -105,7 +103,7 @@ def test_a_stacking_policy_acts_outside_as_it_does_in_training(tmp_path: Path) -
     task = Task.for_sim("lane", **SHORT)
     (summary,) = train(task, tmp_path / "run", record=tmp_path / "log.mcap", progress=silent)
     path = summary.folder / "best_model.zip"
-    policy = load_policy(path)
+    policy = mcaprl.load_policy(path)
     assert policy.frame_stack == 3
     log = mcaprl.open(summary.folder / "evaluations" / f"step-{summary.best_step:09d}.mcap")
     for episode in log.episodes:
@@ -123,7 +121,7 @@ def test_the_commands_take_a_stacking_policy(tmp_path: Path) -> None:
     assert run(["record", "lane", "--policy", path, "--episodes", "2", "--out", log]) == 0
     out = tmp_path / "annotated.mcap"
     assert run(["annotate", log, "--policy", path, "--out", str(out)]) == 0
-    dataset, policy = mcaprl.open(log), load_policy(Path(path))
+    dataset, policy = mcaprl.open(log), mcaprl.load_policy(path)
     episode = dataset.episodes[0]
     rows = np.maximum(np.arange(episode.length)[:, None] - [2, 1, 0], 0)
     values = policy.q_values(episode.observations[rows])
@@ -136,7 +134,7 @@ def test_an_offline_policy_that_stacks_is_taken_over(tmp_path: Path) -> None:
     env.close()
     config = CQLConfig(updates=20, hidden=(8,), frame_stack=3, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(tmp_path / "log.mcap"), config, tmp_path / "cql", progress=silent)
-    policy = load_offline(tmp_path / "cql")
+    policy = mcaprl.load_policy(tmp_path / "cql")
     stacks = np.random.default_rng(0).normal(size=(5, 3, 12)).astype(np.float32)
     with closing(agent(tmp_path)) as begun:
         begun.start_from(mcaprl.open(tmp_path / "log.mcap"), policy)

@@ -22,17 +22,12 @@ from gymnasium import spaces
 from stable_baselines3 import A2C, DQN, PPO, SAC
 from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 
+from mcaprl.api.policies import load_policies
 from mcaprl.errors import PolicyError
 from mcaprl.online.centering import center_images
-from mcaprl.online.policy import (
-    BEST_NAME,
-    describe_run,
-    load_policies,
-    load_policy,
-    policy_files,
-    save_policy,
-)
+from mcaprl.online.policy import describe_run, read_policy, save_policy
 from mcaprl.online.zip_file import OWN_NAME
+from mcaprl.runs import BEST_NAME, policy_files
 
 
 def small(**kwargs: Any) -> dict[str, Any]:
@@ -82,7 +77,7 @@ def test_it_acts_as_sb3_does(tmp_path: Path, kind: Any, written_by: str) -> None
         ours(path, model, env)
     else:
         model.save(path)
-    policy = load_policy(path)
+    policy = read_policy(path)
     observations = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
     expected = model.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(policy.act(observations), expected)
@@ -103,23 +98,23 @@ def test_pictures_are_turned_as_the_network_has_them(tmp_path: Path, channel_fir
     model = DQN("CnnPolicy", env, buffer_size=10, **small())
     observations = observations_of(env.observation_space)
     expected = model.predict(observations, deterministic=True)[0]
-    exact = load_policy(ours(tmp_path / "ours.zip", model, env))
+    exact = read_policy(ours(tmp_path / "ours.zip", model, env))
     np.testing.assert_array_equal(exact.act(observations), expected)
     assert exact.observation_space == env.observation_space
     model.save(tmp_path / "sb3.zip")
-    np.testing.assert_array_equal(load_policy(tmp_path / "sb3.zip").act(observations), expected)
+    np.testing.assert_array_equal(read_policy(tmp_path / "sb3.zip").act(observations), expected)
 
 
 def test_dicts_are_understood(tmp_path: Path) -> None:
     env = SimpleMultiObsEnv(random_start=False)
     model = DQN("MultiInputPolicy", env, buffer_size=10, **small())
-    policy = load_policy(ours(tmp_path / "model.zip", model, env))
+    policy = read_policy(ours(tmp_path / "model.zip", model, env))
     observations = observations_of(env.observation_space)
     expected = model.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(policy.act(observations), expected)
     model.save(tmp_path / "sb3.zip")
     with pytest.raises(PolicyError, match="observation space is no Box"):
-        load_policy(tmp_path / "sb3.zip")
+        read_policy(tmp_path / "sb3.zip")
 
 
 @pytest.mark.parametrize("multi", [False, True])
@@ -139,7 +134,7 @@ def test_centered_pictures_are_saved_as_plain_weights(tmp_path: Path, multi: boo
         found = plain.q_net(plain.policy.obs_to_tensor(observations)[0])
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(
-        load_policy(path).q_values(observations), expected, rtol=1e-4, atol=1e-5
+        read_policy(path).q_values(observations), expected, rtol=1e-4, atol=1e-5
     )
 
 
@@ -149,7 +144,7 @@ def test_networks_of_other_shapes_are_built_as_their_file_says(tmp_path: Path) -
     model.save(tmp_path / "model.zip")
     observations = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
     np.testing.assert_array_equal(
-        load_policy(tmp_path / "model.zip").act(observations),
+        read_policy(tmp_path / "model.zip").act(observations),
         model.predict(observations, deterministic=True)[0],
     )
 
@@ -171,12 +166,12 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
         for key, value in data.items()
     }
     text = json.dumps(bombed).encode()
-    load_policy(rewrite(path, tmp_path / "data.zip", data=text))
-    load_policy(rewrite(path, tmp_path / "bare.zip", data=text, mcaprl_json=None))
+    read_policy(rewrite(path, tmp_path / "data.zip", data=text))
+    read_policy(rewrite(path, tmp_path / "bare.zip", data=text, mcaprl_json=None))
     weights = io.BytesIO()
     torch.save({"q_net.q_net.0.weight": Bomb()}, weights)
     with pytest.raises(PolicyError, match="no plain tensors"):
-        load_policy(rewrite(path, tmp_path / "weights.zip", policy_pth=weights.getvalue()))
+        read_policy(rewrite(path, tmp_path / "weights.zip", policy_pth=weights.getvalue()))
     assert not ran.exists()
 
 
@@ -199,7 +194,7 @@ def test_broken_files_are_told_in_one_line(
     path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
     broken = rewrite(path, tmp_path / "broken.zip", **members)
     with pytest.raises(PolicyError, match=message) as caught:
-        load_policy(broken)
+        read_policy(broken)
     assert "broken.zip" in str(caught.value)
 
 
@@ -209,32 +204,32 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
         own = json.loads(archive.read(OWN_NAME))
     text = json.dumps({**own, "net_arch": [9]}).encode()
     with pytest.raises(PolicyError, match="size mismatch"):
-        load_policy(rewrite(path, tmp_path / "other.zip", mcaprl_json=text))
+        read_policy(rewrite(path, tmp_path / "other.zip", mcaprl_json=text))
 
 
 def test_files_that_are_no_zip_are_refused(tmp_path: Path) -> None:
     (tmp_path / "model.zip").write_bytes(b"no zip")
     with pytest.raises(PolicyError, match="cannot read the model"):
-        load_policy(tmp_path / "model.zip")
+        read_policy(tmp_path / "model.zip")
     with pytest.raises(PolicyError, match="does not exist"):
-        load_policy(tmp_path / "none.zip")
+        read_policy(tmp_path / "none.zip")
 
 
 def test_other_algorithms_are_refused(tmp_path: Path) -> None:
     SAC("MlpPolicy", gym.make("Pendulum-v1"), buffer_size=10, **small()).save(tmp_path / "sac.zip")
     with pytest.raises(PolicyError, match="none of DQN, PPO and A2C"):
-        load_policy(tmp_path / "sac.zip")
+        read_policy(tmp_path / "sac.zip")
 
 
 def test_unknown_networks_are_refused(tmp_path: Path) -> None:
     kwargs = {"net_arch": [8], "features_extractor_kwargs": {}}
     dqn(policy_kwargs=kwargs).save(tmp_path / "model.zip")
     with pytest.raises(PolicyError, match="policy_kwargs features_extractor_kwargs"):
-        load_policy(tmp_path / "model.zip")
+        read_policy(tmp_path / "model.zip")
 
 
 def test_observations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    policy = load_policy(ours(tmp_path / "model.zip", dqn(), gym.make("CartPole-v1")))
+    policy = read_policy(ours(tmp_path / "model.zip", dqn(), gym.make("CartPole-v1")))
     with pytest.raises(PolicyError, match="does not take these observations"):
         policy.act(np.zeros((1, 5), dtype=np.float32))
 

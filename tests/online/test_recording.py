@@ -22,7 +22,7 @@ from mcaprl.online.agent import Agent
 from mcaprl.online.curve import read_curve
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.first_episodes import FirstEpisodes
-from mcaprl.online.policy import load_policy
+from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import behavior_probabilities, log_paths
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
@@ -140,7 +140,7 @@ def test_probabilities_are_right_whatever_was_asked_in_between(tmp_path: Path) -
         steps=300,
     )
     epsilon = read_learner(tmp_path / "run" / "log.mcap").epsilon
-    greedy = load_policy(tmp_path / "run" / "best_model.zip").act(log.observations)
+    greedy = read_policy(tmp_path / "run" / "best_model.zip").act(log.observations)
     expected = epsilon / LANE_ACTIONS + (1 - epsilon) * (log.actions == greedy)
     np.testing.assert_allclose(log.behavior_probs, expected, rtol=1e-6)
     assert 0.3 < (log.actions == greedy)[epsilon < 1].mean() < 0.9

@@ -12,10 +12,10 @@ import pytest
 from stable_baselines3 import DQN
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from mcaprl.api.policies import load_policies
 from mcaprl.cli import run
 from mcaprl.errors import OutputExistsError, SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.online.curve import read_curve
-from mcaprl.online.policy import load_policies
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress

@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 from stable_baselines3 import DQN
 
 import mcaprl
+from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError, SpaceError, UsageError
 from mcaprl.offline.algorithms.cql import CQLConfig
-from mcaprl.offline.policy import load_policy as load_offline
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
-from mcaprl.online.policy import load_policy
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.warm_start import fill_buffer
@@ -175,7 +174,7 @@ def test_pictures_are_turned_for_the_buffer(tmp_path: Path) -> None:
 def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path: Path) -> None:
     config = CQLConfig(updates=30, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
-    policy = load_offline(tmp_path / "cql")
+    policy = load_policy(tmp_path / "cql")
     observations = mcaprl.open(logs).observations
     with closing(agent(tmp_path, learning_starts=100)) as begun:
         begun.start_from(None, policy)
@@ -229,7 +228,7 @@ def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> Non
         closing(agent(tmp_path, hidden=(16, 8))) as begun,
         pytest.raises(PolicyError, match="has layers 12-8-6, the agent 12-16-8-6: pass --hidden"),
     ):
-        begun.start_from(None, load_offline(tmp_path / "cql"))
+        begun.start_from(None, load_policy(tmp_path / "cql"))
 
 
 def test_weights_that_mean_other_values_are_refused(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from mcaprl.offline.algorithms.iql import IQLConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.policy import load_policy
+from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import corridor, inner_observations
@@ -254,7 +254,7 @@ def test_a_run_on_the_gpu_is_a_run(tmp_path: Path) -> None:
     assert torch.cuda.max_memory_allocated() > 0
     train(corridor(), config, tmp_path / "cpu", seeds=2, progress=lambda _: None)
     values = [
-        load_policy(tmp_path / name / "seed-1").q_values(inner_observations())
+        read_policy(tmp_path / name / "seed-1").q_values(inner_observations())
         for name in ("gpu", "cpu")
     ]
     np.testing.assert_allclose(values[0], values[1], atol=1e-2)

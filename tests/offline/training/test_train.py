@@ -25,7 +25,7 @@ from mcaprl.offline.algorithms.bcq import BCQConfig
 from mcaprl.offline.algorithms.cql import CQLConfig
 from mcaprl.offline.algorithms.dqn import DoubleDQNConfig, DQNConfig
 from mcaprl.offline.algorithms.iql import IQLConfig
-from mcaprl.offline.policy import load_policy
+from mcaprl.offline.policy import read_policy
 from mcaprl.offline.training.curves import draw_curves, read_curve
 from mcaprl.offline.training.summary import describe_seeds
 from mcaprl.offline.training.train import train
@@ -402,7 +402,7 @@ def test_other_data_are_taken_if_asked_for(tmp_path: Path) -> None:
     config = replace(SHORT_CQL, normalize=True)
     with pytest.raises(Stopped):
         train(corridor(), config, tmp_path / "run", progress=StopAt(50))
-    before = load_policy(tmp_path / "run").encoder
+    before = read_policy(tmp_path / "run" / "seed-0").encoder
     other = corridor({(1, 0): 3, (2, 1): 1, (3, 1): 2})
     with pytest.raises(TrainingError, match=r"other data;.*--other-data"):
         train(other, config, tmp_path / "run", resume=True, progress=silent)
@@ -412,7 +412,7 @@ def test_other_data_are_taken_if_asked_for(tmp_path: Path) -> None:
     assert summary.resumed_at == 40
     assert json.loads((tmp_path / "run" / "config.json").read_text())["data"] == other.fingerprint
     # The weights are used to the old normalisation.
-    after = load_policy(tmp_path / "run").encoder
+    after = read_policy(tmp_path / "run" / "seed-0").encoder
     assert np.array_equal(before.shift, after.shift)
     train(other, config, tmp_path / "run", resume=True, progress=silent)
 

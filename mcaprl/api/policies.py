@@ -1,0 +1,186 @@
+"""Policies by name: `pilot`, `random`, or the path of a trained one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium as gym
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
+from mcaprl.sims.evaluation.rollout import Policy, check_fit
+
+SCRIPTED = ("pilot", "random")
+
+
+class TrainedPolicy(Policy, Protocol):
+    """A loaded policy; NumPy in, NumPy out. B is the number of observations, A of actions.
+
+    A policy that stacks k > 1 frames remembers the observations of its last k calls of `act` since
+    `begin`; its other methods accept (B, k, *shape), oldest frame first.
+    """
+
+    @property
+    def algo(self) -> str:
+        """Name of the algorithm that trained it."""
+
+    @property
+    def observation_space(self) -> spaces.Space[Any] | None:
+        """Space of one observation; None where the file has no bounds."""
+
+    @property
+    def action_space(self) -> spaces.Space[Any]:
+        """Space of one action."""
+
+    @property
+    def env_id(self) -> str:
+        """Gymnasium id of the environment it was trained for; empty if unknown."""
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Arguments of that environment."""
+
+    @property
+    def frame_stack(self) -> int:
+        """Number of successive observations that its networks receive."""
+
+    def begin(self) -> None:
+        """Drop the remembered observations, because an episode begins."""
+
+    def q_values(self, observations: Any) -> NDArray[Any]:
+        """Return Q-values (B, A), in the order of the action space.
+
+        Raises:
+            PolicyError: The policy has no Q-values, or the observations have another shape.
+        """
+
+    def action_probabilities(self, observations: Any) -> NDArray[Any]:
+        """Return the probabilities (B, A) of all actions; a greedy policy's are 0 and 1.
+
+        Raises:
+            PolicyError: The observations have another shape.
+        """
+
+
+def load_policy(path: str | Path) -> TrainedPolicy:
+    """Load a trained policy; nothing in its files is unpickled or executed.
+
+    Args:
+        path: Run folder of `train-offline` or `train-online`, which stands for its first seed; the
+            folder of one seed (`RUN/seed-2`); or a `.zip` file of Stable-Baselines3.
+
+    Raises:
+        PolicyError: The path contains no policy, or a file is broken.
+        MissingExtraError: The packages of the `offline` or `online` extra are not installed.
+    """
+    return _load(_found_files(Path(path))[0])
+
+
+def load_policies(path: str | Path) -> list[TrainedPolicy]:
+    """Load the policies of all seeds of a run, by rising seed; see `load_policy`."""
+    return [_load(file) for file in _found_files(Path(path))]
+
+
+def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
+    """Return the policies of a name in an environment: one, or one per training seed of a run.
+
+    Args:
+        name: `pilot`; `random`, which is [None]; or a path.
+        env: Environment in which the policies will act.
+
+    Raises:
+        UnknownNameError: There is no such policy.
+        UsageError: The sim has no pilot.
+        PolicyError: The path contains no policy, or one of other spaces.
+    """
+    if name == "random":
+        return [None]
+    if name == "pilot":
+        from mcaprl.sims.evaluation.pilots import make_pilot
+
+        try:
+            return [make_pilot(env)]
+        except UnknownNameError as error:
+            sim = env.spec.id if env.spec else "the environment"
+            raise UsageError(
+                f"{sim} has no pilot: pass --policy random, or the path of a trained run"
+            ) from error
+    loaded: list[Policy | None] = []
+    for policy in load_policies(_existing(name, SCRIPTED)):
+        check_fit(policy, env)
+        loaded.append(policy)
+    return loaded
+
+
+def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
+    """Return the policies of all seeds of a run, to evaluate them on a log.
+
+    Raises:
+        UsageError: The name is that of a scripted policy.
+        UnknownNameError: There is no such path.
+        PolicyError: The path contains no policy, or one trained on other spaces than the log's.
+    """
+    if name in SCRIPTED:
+        raise UsageError(
+            f"{name} has no network to evaluate on a log: pass the path of a trained run, or --sim"
+        )
+    policies = load_policies(_existing(name, ["the path of a trained run"]))
+    for policy in policies:
+        for role in ("observation_space", "action_space"):
+            trained, logged = getattr(policy, role), getattr(dataset, role)
+            if trained not in (None, logged):
+                raise PolicyError(f"{name} was trained on {role} {trained}; the log has {logged}")
+    return policies
+
+
+def policy_names(names: Sequence[str]) -> dict[str, str]:
+    """Return the short names for tables: a path's last part, or the path where that is not unique.
+
+    >>> policy_names(["random", "a/run", "b/run", "b/other"])
+    {'random': 'random', 'a/run': 'a/run', 'b/run': 'b/run', 'b/other': 'other'}
+    """
+    short = {name: name if name in SCRIPTED else Path(name).name for name in names}
+    return {
+        name: last if list(short.values()).count(last) == 1 else name
+        for name, last in short.items()
+    }
+
+
+def is_policy(path: Path) -> bool:
+    """Return whether a path is a trained policy rather than a log."""
+    return path.suffix == ".zip" or (path.is_dir() and bool(policy_files(path)))
+
+
+def _existing(name: str, others: Sequence[str]) -> Path:
+    """Return a name as a path; runs beside a path that does not exist may have been meant."""
+    path = Path(name)
+    if path.exists():
+        return path
+    folders = sorted(path.parent.iterdir()) if path.parent.is_dir() else []
+    runs = [str(folder) for folder in folders if (folder / CONFIG_NAME).exists()]
+    raise UnknownNameError("policy", name, [*others, *runs])
+
+
+def _found_files(path: Path) -> list[Path]:
+    files = policy_files(path)
+    if not files:
+        raise PolicyError(
+            f"{path} has no policy: neither {POLICY_NAME} nor {BEST_NAME}, nor a seed-K folder with"
+            " one; training writes them with its first checkpoint"
+        )
+    return files
+
+
+def _load(file: Path) -> TrainedPolicy:
+    if file.name == POLICY_NAME:
+        from mcaprl.offline.policy import read_policy
+
+        return read_policy(file.parent)
+    from mcaprl.online.policy import read_policy as read_model
+
+    return read_model(file)
