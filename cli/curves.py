@@ -20,7 +20,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
     online = [folder for folder in folders if any(folder.glob("seed-*/curve.csv"))]
     figures = []
     if online:
-        from mcaprl.online.curve_picture import curve_figure, read_run
+        from mcaprl.online.curves import curve_figure, read_run
 
         runs = [read_run(folder) for folder in online]
         figures.append(Figure.of("Evaluations while learning", curve_figure(runs, "")))

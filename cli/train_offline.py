@@ -10,7 +10,8 @@ import click
 from mcaprl.cli.settings import setting_options
 from mcaprl.cli.show import counted
 from mcaprl.errors import MissingExtraError
-from mcaprl.settings import check_settings, plain_settings
+from mcaprl.runs import CONFIG_NAME, read_config
+from mcaprl.settings import check_settings, settings_from_json
 
 
 class _TrainCommand(click.Command):
@@ -80,16 +81,15 @@ def train_offline(
     from mcaprl.offline.batches.sources import open_weighted
     from mcaprl.offline.training.curves import draw_curves
     from mcaprl.offline.training.follow import GrowingLogs
-    from mcaprl.offline.training.run_folder import CONFIG_NAME, read_config
-    from mcaprl.offline.training.summary import describe_seeds
+    from mcaprl.offline.training.metrics import describe_seeds
     from mcaprl.offline.training.train import train
 
     torch.set_num_threads(threads)
     given = {name: value for name, value in settings.items() if value is not None}
     if resume and (out / CONFIG_NAME).exists():
-        earlier = read_config(out / CONFIG_NAME)
+        earlier = read_config(out)
         algo = algo or earlier.get("algo")
-        given = {**plain_settings(earlier.get("config")), **given}
+        given = {**settings_from_json(earlier.get("config")), **given}
     algo = algo or "cql"
     _, defaults = choose_algorithm(algo)
     check_settings(algo, defaults, given)

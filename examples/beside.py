@@ -22,10 +22,8 @@ import numpy as np
 import mcaprl
 from mcaprl.errors import PolicyError
 from mcaprl.figures import COLORS, INK, new_figure, save_png
-from mcaprl.offline.training.curves import read_curve
-from mcaprl.online.curve import CurvePoint
-from mcaprl.online.curve import read_curve as read_online_curve
 from mcaprl.online.evaluation import SELECTION_SEED, measure_scale
+from mcaprl.runs import Curve, read_curve
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import evaluate
 
@@ -74,12 +72,10 @@ def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[
     return found
 
 
-def draw(
-    path: Path, points: list[CurvePoint], known: dict[int, float], scores: dict[int, float]
-) -> None:
+def draw(path: Path, curve: Curve, known: dict[int, float], scores: dict[int, float]) -> None:
     """Plot both scores over the number of transitions that were recorded or read."""
     figure, (left, right) = new_figure((9, 3.6), 1, 2)
-    left.plot([p.step for p in points], [p.score for p in points], color=COLORS[0], label="online")
+    left.plot(curve["step"], curve["score"], color=COLORS[0], label="online")
     x = [known[updates] for updates in scores]
     left.plot(x, list(scores.values()), "o-", ms=4, color=COLORS[1], label="offline")
     left.axhline(1, color=INK, lw=1, ls="--", zorder=0)
@@ -87,7 +83,7 @@ def draw(
     left.set_ylabel("score: random 0, pilot 1")
     left.legend()
     right.step(list(known), list(known.values()), where="post", color=COLORS[1])
-    right.axhline(points[-1].step, color=INK, lw=1, ls="--", zorder=0)
+    right.axhline(curve["step"][-1], color=INK, lw=1, ls="--", zorder=0)
     right.set_xlabel("updates of the offline learner")
     right.set_ylabel("transitions that it has read")
     save_png(figure, path)
@@ -114,7 +110,7 @@ def main() -> None:
     grown = len(set(known.values()))
     print(f"the log grew to {whole[-1]} transitions in {len(whole)} episodes; the offline learner")
     print(f"read it at {grown} sizes, each time whole episodes only, and none twice")
-    draw(out / "beside.png", read_online_curve(online / "seed-0" / "curve.csv"), known, scores)
+    draw(out / "beside.png", read_curve(online / "seed-0" / "curve.csv"), known, scores)
     print(out / "beside.png")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mcaprl.online.curve_picture import VALUES, curve_picture, read_run
+from mcaprl.online.curves import VALUES, draw_curves, read_run
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("--value", choices=VALUES, help="value to plot; default: the score")
     arguments = parser.parse_args()
     runs = [read_run(folder) for folder in arguments.runs]
-    curve_picture(arguments.out, runs, arguments.title, arguments.value)
+    draw_curves(arguments.out, runs, arguments.title, arguments.value)
     print(arguments.out)
 
 

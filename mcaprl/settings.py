@@ -1,4 +1,4 @@
-"""Settings of whatever trains: frozen dataclasses, checked when made, each field with its help.
+"""Settings of learners: frozen dataclasses that are checked when created, with help for each field.
 
 The string under a field, as in `offline/algorithms/config.py`, describes it; the command line
 prints that string as the help of the field's option.
@@ -10,7 +10,7 @@ import ast
 import inspect
 import textwrap
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
 
 from mcaprl.errors import UsageError
@@ -18,28 +18,62 @@ from mcaprl.errors import UsageError
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of all settings: it has none itself."""
+    """Settings of all learners, offline and online; subclasses choose their own defaults.
+
+    Raises:
+        UsageError: A setting is outside its range.
+    """
+
+    learning_rate: float = 1e-3
+    """step size of Adam at the first update"""
+    final_learning_rate_fraction: float = 1.0
+    """learning rate at the end as a fraction of the first one, to which it falls linearly"""
+    hidden: tuple[int, ...] = (256, 256)
+    """widths of the hidden layers; for images, of those after the convolutions"""
+    frame_stack: int = 1
+    """number of successive observations that the network receives"""
+    checkpoint_interval: int = 1_000
+    """updates (offline) or environment steps (online) between two checkpoints"""
+
+    def __post_init__(self) -> None:
+        """Refuse settings outside their ranges."""
+        self._require_positive("frame_stack", "checkpoint_interval")
+        self._require("learning_rate", self.learning_rate > 0, "above 0")
+        self._require_fraction("final_learning_rate_fraction")
+        self._require("hidden", all(width >= 1 for width in self.hidden), "widths of at least 1")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON types; `settings_from_json` is the inverse."""
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
-        """Refuse a setting that cannot be meant.
+        """Refuse a setting.
 
         Raises:
-            UsageError: it does not hold.
+            UsageError: The condition does not hold.
         """
         if not holds:
             raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
+
+    def _require_positive(self, *names: str) -> None:
+        for name in names:
+            self._require(name, getattr(self, name) >= 1, "at least 1")
+
+    def _require_fraction(self, *names: str) -> None:
+        for name in names:
+            self._require(name, 0 <= getattr(self, name) <= 1, "within [0, 1]")
 
 
 def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:
     """Refuse settings that an algorithm does not have.
 
     Args:
-        algo: the algorithm's name.
-        config: its settings, or their type.
-        given: names of those that were asked for.
+        algo: Name of the algorithm.
+        config: Settings of the algorithm, or their type.
+        given: Names of the settings that the user chose.
 
     Raises:
-        UsageError: there is such a one.
+        UsageError: The algorithm has no such setting.
     """
     known = [field.name for field in fields(config)]
     for name in given:
@@ -48,14 +82,14 @@ def check_settings(algo: str, config: Settings | type[Settings], given: Iterable
             raise UsageError(f"{algo} has no setting {flag(name)}; it has {options}")
 
 
-def plain_settings(found: object) -> dict[str, Any]:
-    """The settings of an earlier session, as JSON has them: lists are tuples again."""
+def settings_from_json(found: object) -> dict[str, Any]:
+    """Return the settings in a `config.json`, with lists as tuples again."""
     settings = found if isinstance(found, dict) else {}
     return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
 
 
 def flag(name: str) -> str:
-    """What the command line calls a setting.
+    """Return the command line option of a setting.
 
     >>> flag("batch_size")
     '--batch-size'
@@ -64,13 +98,13 @@ def flag(name: str) -> str:
 
 
 def field_help(config_type: type) -> dict[str, str]:
-    """The doc line under each field of a config dataclass, inherited fields first.
+    """Return the help of each field of a config dataclass, inherited fields first.
 
     Args:
-        config_type: a dataclass whose source can be read.
+        config_type: Dataclass whose source can be read.
 
     Returns:
-        Field name -> its line, in the order of the fields.
+        Line under each field by the field's name.
     """
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
@@ -81,7 +115,7 @@ def field_help(config_type: type) -> dict[str, str]:
 
 
 def _lines_under_fields(config_type: type) -> dict[str, str]:
-    """Python keeps no docstring of a field, so it is read from the source."""
+    # Python stores no docstring of a field, so the source is parsed.
     tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
     assert isinstance(tree, ast.ClassDef)
     lines = {}

@@ -1,4 +1,4 @@
-"""Online learning that records what it does: SB3's DQN and Double DQN, PPO and A2C.
+"""Online learning with recording: DQN, Double DQN, PPO and A2C of Stable-Baselines3.
 
 Importing this package loads no torch; its modules do.
 
@@ -8,7 +8,7 @@ Importing this package loads no torch; its modules do.
     train(Task.for_sim("lane", "double-dqn"), "runs/lane", seeds=4)
 
 Raises:
-    MissingExtraError: the packages of the `online` extra are not installed.
+    MissingExtraError: The packages of the `online` extra are not installed.
 """
 
 from importlib.util import find_spec

@@ -1,15 +1,18 @@
-"""One agent at work: it acts, learns, is evaluated, recorded, and kept."""
+"""One agent: it acts, learns, is evaluated and recorded, and writes checkpoints."""
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
@@ -17,12 +20,10 @@ from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.online.algorithms import make_model
-from mcaprl.online.callbacks import BetweenRollouts, CopyTargetByEpisodes, EveryInterval
-from mcaprl.online.checkpoint import CHECKPOINT_NAME, load_checkpoint, save_checkpoint
+from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
-from mcaprl.online.curve import CURVE_NAME, CurvePoint, write_curve
-from mcaprl.online.evaluation import Evaluation, Scale
-from mcaprl.online.first_episodes import FirstEpisodes
+from mcaprl.online.curves import CurvePoint, write_curve
+from mcaprl.online.evaluation import Evaluation, FirstEpisodes, Scale
 from mcaprl.online.frames import StackedVecEnv
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import describe_run, save_policy
@@ -32,11 +33,11 @@ from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import BEST_NAME
+from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME
 from mcaprl.sims.evaluation.rollout import episode_seed
 
 LOG_INTERVAL = 1_000
-"""Environment steps between two rows of scalars, and two signs of life."""
+"""Environment steps between two rows of scalars, and two calls of the progress callback."""
 EVALUATIONS_NAME = "evaluations"
 
 
@@ -44,9 +45,9 @@ class Agent:
     """An agent of a run, with its environments.
 
     Attributes:
-        model: of SB3.
-        resumed_at: steps that an earlier session had done.
-        points: all evaluations, those of earlier sessions included.
+        model: Model of SB3.
+        resumed_at: Number of steps done by earlier sessions.
+        points: All evaluations, including those of earlier sessions.
     """
 
     def __init__(
@@ -61,25 +62,25 @@ class Agent:
         resume: bool = False,
         live: LiveTraining | None = None,
     ) -> None:
-        """Make an agent with fresh weights, its environments, and its log.
+        """Create an agent with new weights, its environments, and its log.
 
         Args:
-            task: what is to be learnt, and how.
-            env_id: Gymnasium's id of the environment.
-            folder: of this seed, RUN/seed-K; it exists.
-            seed: of the agent.
-            scale: of scores.
-            record: log to write; None records nothing, neither training nor evaluations.
-            resume: go on from the folder's checkpoint and behind the log's last episode, where
-                there are such.
-            live: shows what happens, to whoever connects.
+            task: Algorithm, settings and environment.
+            env_id: Gymnasium id of the environment.
+            folder: Existing folder of this seed, RUN/seed-K.
+            seed: Seed of the agent.
+            scale: Scale of scores.
+            record: Log to write; None records neither training nor evaluations.
+            resume: Whether to resume from the folder's checkpoint and append to the log, where they
+                exist.
+            live: Live view of the training.
 
         Raises:
-            SpaceError, OutputExistsError, LogError: the log cannot be written.
+            SpaceError, OutputExistsError, LogError: The log cannot be written.
         """
         self.points: list[CurvePoint] = []
         self.resumed_at = 0
-        self._began_with_policy = False
+        self._has_pretrained_weights = False
         self._task, self._folder, self._seed, self._scale = task, folder, seed, scale
         self._resumes = resume
         with ExitStack() as stack:
@@ -93,15 +94,15 @@ class Agent:
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
             self._eval_env = _stacked(eval_env, task.config.frame_stack)
-            seen = _stacked(env, task.config.frame_stack)
-            self.model: BaseAlgorithm = make_model(task.algo, task.config, seen, seed)
+            stacked = _stacked(env, task.config.frame_stack)
+            self.model: BaseAlgorithm = make_model(task.algo, task.config, stacked, seed)
             self._describer = None
             if recorder is not None:
                 self._describer = env.before_step = ActionDescriber(recorder, self.model)
             if self._watched is not None:
                 self._watched.model = self.model
                 if self._describer is not None:
-                    self._watched.after_asking = self._describer.forget
+                    self._watched.after_forward = self._describer.reset
             self._envs = stack.pop_all()
         self._description = describe_run(
             task.algo,
@@ -114,20 +115,19 @@ class Agent:
         )
 
     def start_from(self, data: Dataset | None, policy: Any) -> None:
-        """Begin with experience: logged transitions in the replay buffer, a policy's weights.
+        """Start with logged transitions in the replay buffer, with a policy's weights, or both.
 
-        Data make the random steps at the beginning needless. A policy's agent explores as it
-        would at the end of its training, and learns once it has acted for as many steps as others
-        act at random.
+        With data, the random steps at the start are omitted. With a policy, the agent explores as
+        at the end of training, and acts for `learning_starts` steps before it learns.
 
         Args:
-            data: None has none.
-            policy: with Q-values; None has none.
+            data: Logged transitions, if any.
+            policy: Policy with Q-values, if any.
 
         Raises:
-            UsageError: the algorithm cannot.
-            SpaceError: the spaces differ.
-            PolicyError: the policy's network is another.
+            UsageError: The algorithm supports neither.
+            SpaceError: The spaces differ.
+            PolicyError: The policy's network differs from the agent's.
         """
         model: Any = self.model
         if data is not None:
@@ -137,20 +137,20 @@ class Agent:
             take_weights(model, policy, self._evaluated.single_observation_space)
             model.learning_starts = cast(DQNConfig, self._task.config).learning_starts
             model.exploration_rate = model.exploration_final_eps
-            self._explore_as_at_the_end()
+            self._use_final_exploration()
 
     def close(self) -> None:
-        """Close environments and log."""
+        """Close the environments and the log."""
         self._envs.close()
 
     def learn(self, report: ProgressCallback) -> None:
-        """Train to the end, evaluating on the way.
+        """Train until all steps are done, with evaluations.
 
         Args:
-            report: told how far it is, each `LOG_INTERVAL` steps.
+            report: Callback for progress, called every `LOG_INTERVAL` steps.
 
         Raises:
-            TrainingError: the checkpoint is of another task, or broken.
+            TrainingError: The checkpoint is of another task, or broken.
         """
         config = self._task.config
         evaluation = Evaluation(
@@ -168,11 +168,11 @@ class Agent:
             return
         callbacks: list[BaseCallback] = [
             evaluation,
-            EveryInterval(LOG_INTERVAL, partial(self._report, report)),
-            BetweenRollouts(config.checkpoint_interval, self._save),
+            _EveryInterval(LOG_INTERVAL, partial(self._report, report)),
+            _BetweenRollouts(config.checkpoint_interval, self._save),
         ]
         if isinstance(config, DQNConfig) and config.target_update_episodes:
-            callbacks.append(CopyTargetByEpisodes(config.target_update_episodes))
+            callbacks.append(_TargetUpdateByEpisodes(config.target_update_episodes))
         self.model.set_logger(_logger(self._folder, done))
         try:
             self.model.learn(
@@ -191,24 +191,24 @@ class Agent:
 
     def _save(self) -> None:
         points = [asdict(point) for point in self.points]
-        extra = {"points": points, "began_with_policy": self._began_with_policy}
+        extra = {"points": points, "began_with_policy": self._has_pretrained_weights}
         save_checkpoint(self._checkpoint, self.model, self._task, extra)
 
     def _load(self, evaluation: Evaluation) -> None:
         extra = load_checkpoint(self._checkpoint, self.model, self._task)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:
-            self._explore_as_at_the_end()
+            self._use_final_exploration()
         done, envs = self.model.num_timesteps, self._task.config.envs
         evaluation.resume(done // envs, max(p.mean_return for p in self.points))
-        # The environments cannot go on where they were, but must not begin as they first did.
+        # Environments have no state to restore; another seed avoids repeating the first episodes.
         assert self.model.env is not None
         self.model.env.seed(episode_seed(self._seed, done))
 
-    def _explore_as_at_the_end(self) -> None:
-        self._began_with_policy = True
+    def _use_final_exploration(self) -> None:
+        self._has_pretrained_weights = True
         model: Any = self.model
-        model.acts_at_once = True
+        model.skips_random_steps = True
         model.exploration_schedule = ConstantSchedule(model.exploration_final_eps)
 
     def _keep_best(self) -> None:
@@ -222,7 +222,7 @@ class Agent:
         self.model.logger.record("eval/score", point.score)
         self.model.logger.dump(point.step)
         if self._describer is not None:
-            self._describer.forget()
+            self._describer.reset()
             folder = self._folder / EVALUATIONS_NAME
             folder.mkdir(exist_ok=True)
             path = folder / f"step-{point.step:09d}.mcap"
@@ -236,12 +236,79 @@ class Agent:
         report(TrainingProgress(self._seed, model.num_timesteps, steps, {"score": score}))
 
 
+class _EveryInterval(BaseCallback):
+    """A callback that calls a function every `interval` environment steps, and at the end."""
+
+    def __init__(self, interval: int, function: Callable[[], None]) -> None:
+        """Call `function` when a step of the batch reaches or crosses a multiple of `interval`."""
+        super().__init__()
+        self._interval = interval
+        self._function = function
+        self._called_at = -1
+
+    def _on_training_start(self) -> None:
+        self._called_at = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps // self._interval > self._called_at // self._interval:
+            self._call()
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.num_timesteps > self._called_at:
+            self._call()
+
+    def _call(self) -> None:
+        self._called_at = self.num_timesteps
+        self._function()
+
+
+class _TargetUpdateByEpisodes(BaseCallback):
+    """A callback that updates a DQN's target network every `episodes` finished episodes."""
+
+    def __init__(self, episodes: int) -> None:
+        """Update the target network every `episodes` finished episodes."""
+        super().__init__()
+        self._episodes = episodes
+        self._finished = 0
+
+    def _on_step(self) -> bool:
+        before = self._finished
+        self._finished += int(np.sum(self.locals["dones"]))
+        if self._finished // self._episodes > before // self._episodes:
+            model = cast(DQN, self.model)
+            model.q_net_target.load_state_dict(model.q_net.state_dict())
+        return True
+
+
+class _BetweenRollouts(BaseCallback):
+    """A callback that calls a function between two rollouts, when all steps have been processed."""
+
+    def __init__(self, interval: int, function: Callable[[], None]) -> None:
+        """Call `function` when at least `interval` steps have passed since the last call."""
+        super().__init__()
+        self._interval = interval
+        self._function = function
+        self._called_at = 0
+
+    def _on_training_start(self) -> None:
+        self._called_at = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps - self._called_at >= self._interval:
+            self._called_at = self.model.num_timesteps
+            self._function()
+
+    def _on_step(self) -> bool:
+        return True
+
+
 def _stacked(env: VecEnv, count: int) -> VecEnv:
     return env if count == 1 else StackedVecEnv(env, count)
 
 
 def _logger(folder: Path, done: int) -> Logger:
-    """SB3's scalars as CSV and for TensorBoard; each session has a CSV of its own."""
+    """Return a logger of SB3's scalars to TensorBoard and to a separate CSV for each session."""
     suffix = f"-from-{done}" if done else ""
     formats = [make_output_format(name, str(folder), suffix) for name in ("csv", "tensorboard")]
     return Logger(folder=str(folder), output_formats=formats)

@@ -1,4 +1,4 @@
-"""The algorithms by name: their settings, and Stable-Baselines3's classes that do the work."""
+"""Algorithms by name: their settings, and the classes of Stable-Baselines3 that implement them."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from mcaprl.online.frames import parts_of_space
 
 @dataclass(frozen=True)
 class Algorithm:
-    """One of them.
+    """An algorithm.
 
     Attributes:
-        config_type: the dataclass of its settings.
-        model_type: SB3's class.
+        config_type: Dataclass of its settings.
+        model_type: Class of SB3.
     """
 
     config_type: type[OnlineConfig]
@@ -52,7 +52,7 @@ def find_algorithm(name: str) -> Algorithm:
     """Find an algorithm by its name.
 
     Raises:
-        UnknownNameError: no algorithm has that name.
+        UnknownNameError: No algorithm has that name.
     """
     if name not in ALGORITHMS:
         raise UnknownNameError("algorithm", name, ALGORITHMS)
@@ -62,11 +62,11 @@ def find_algorithm(name: str) -> Algorithm:
 def check_spaces(
     algo: str, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> None:
-    """Make sure that an algorithm can learn in an environment with these spaces.
+    """Check that an algorithm supports the spaces of an environment.
 
     Raises:
-        UnknownNameError: no algorithm has that name.
-        SpaceError: it cannot.
+        UnknownNameError: No algorithm has that name.
+        SpaceError: The algorithm does not support them.
     """
     find_algorithm(algo)
     if not isinstance(action_space, spaces.Discrete):
@@ -77,13 +77,13 @@ def check_spaces(
 
 
 def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
-    """Make the algorithm with fresh weights, and seed Python, NumPy and torch."""
+    """Create an algorithm with new weights, and seed Python, NumPy and torch."""
     algorithm = find_algorithm(algo)
     last_rate = config.learning_rate * config.final_learning_rate_fraction
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
     if algorithm.model_type is not A2C:
         policy_kwargs["optimizer_kwargs"] = {"fused": True}
-    # SB3's classes share no constructor, so their types cannot tell these arguments.
+    # SB3's classes have no common constructor, so their types do not cover these arguments.
     model_type: Any = algorithm.model_type
     model: BaseAlgorithm = model_type(
         _policy_name(env.observation_space),
@@ -95,7 +95,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         **_arguments(config, env.observation_space),
     )
     if _has_images(env.observation_space):
-        # A quarter less work for the same convolutions; files and results are the same.
+        # The same convolutions in three quarters of the time; files and results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
         if config.center_images:
             center_images(cast(Any, model.policy))
@@ -110,7 +110,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
 
 
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
-    """The settings; where frames would be stored repeatedly, with a buffer that keeps them once."""
+    """Return SB3's arguments, with a buffer that stores each frame once for images and stacks."""
     arguments = config.arguments()
     if isinstance(config, DQNConfig) and (config.frame_stack > 1 or _has_images(space)):
         extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
@@ -125,7 +125,7 @@ def _has_images(space: spaces.Space[Any]) -> bool:
 
 @dataclass(frozen=True)
 class ExponentialSchedule:
-    """Falls by a factor with each step, to a last value; called with what remains, from 1 to 0."""
+    """An exponential decay per step to a last value, as a function of the progress remaining."""
 
     first: float
     last: float
@@ -133,7 +133,7 @@ class ExponentialSchedule:
     steps: int
 
     def __call__(self, remaining: float) -> float:
-        """The value when that part of the steps is left."""
+        """Return the value when this fraction of the steps remains, from 1 to 0."""
         return max(self.last, self.first * float(self.factor ** ((1 - remaining) * self.steps)))
 
 

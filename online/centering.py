@@ -1,12 +1,12 @@
-"""Pictures around zero for SB3's convolutions, in files that are plain SB3's all the same.
+"""Images centered at zero for SB3's convolutions, in files that plain SB3 loads.
 
-SB3 hands the first convolution bytes / 255. A depth picture's bytes lie far from 0 and close
-together, so that every weight of a channel is pulled the same way, and what a picture shows is
-learned late. Here that layer gets 4 (x - 1/2) instead, -2 to 2. A convolution is linear:
+In SB3 the input x of the first convolution is bytes / 255. The bytes of a depth image are far from
+0 and close to each other, so the gradients of a channel's weights have the same sign, and learning
+is slow. Here the input of that layer is 4 (x - 1/2), from -2 to 2. A convolution is linear:
 
     V * 4 (x - 1/2) + c  =  W * x + b,    W = 4 V,  b = c - 2 sum(V)
 
-so a file is written with W and b, and whoever loads it needs to know nothing of this.
+so files contain W and b, and load in plain SB3 without any change.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ _MIDDLE = 0.5
 
 
 def center_images(policy: nn.Module) -> None:
-    """Let the first convolution of each picture see it around zero, from now on."""
+    """Center the input of the first convolution of each image from now on."""
     for convolution in _first_convolutions(policy):
         convolution.register_forward_pre_hook(_centered)
 
 
 def take_plain_weights(policy: nn.Module) -> None:
-    """Turn weights that were loaded from a plain policy into those for centered pictures."""
+    """Convert weights loaded from a plain policy into weights for centered images."""
     with torch.no_grad():
         for convolution in _centered_convolutions(policy):
             convolution.weight /= _FACTOR
@@ -39,9 +39,9 @@ def take_plain_weights(policy: nn.Module) -> None:
 
 @contextmanager
 def plain_weights(policy: nn.Module) -> Iterator[None]:
-    """Show the weights W and b for a while; those that learn are back afterwards, bit for bit."""
+    """Replace the weights by W and b inside a `with` block; restore them exactly afterwards."""
     changed = _centered_convolutions(policy)
-    kept = [(layer.weight.detach().clone(), layer.bias.detach().clone()) for layer in changed]
+    saved = [(layer.weight.detach().clone(), layer.bias.detach().clone()) for layer in changed]
     with torch.no_grad():
         for convolution in changed:
             convolution.bias -= _offset(convolution)
@@ -50,7 +50,7 @@ def plain_weights(policy: nn.Module) -> Iterator[None]:
         yield
     finally:
         with torch.no_grad():
-            for convolution, (weight, bias) in zip(changed, kept, strict=True):
+            for convolution, (weight, bias) in zip(changed, saved, strict=True):
                 convolution.weight.copy_(weight)
                 convolution.bias.copy_(bias)
 
@@ -60,7 +60,7 @@ def _centered(_: nn.Module, inputs: tuple[Tensor]) -> tuple[Tensor]:
 
 
 def _offset(convolution: Any) -> Tensor:
-    """What the middle of the range, taken off each pixel, changes in each output."""
+    """Return the change of each output when 1/2 is subtracted from each pixel."""
     total: Tensor = convolution.weight.sum((1, 2, 3)) * (_FACTOR * _MIDDLE)
     return total
 

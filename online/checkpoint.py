@@ -1,9 +1,9 @@
-"""Checkpoints: a killed run goes on from one.
+"""Checkpoints from which a killed run resumes.
 
-`checkpoint.safetensors` holds weights, target network, optimiser, replay buffer and generators, and
-in its header the counters, the curve so far and the task. They are one file because two could be
-torn apart by a kill between them. The environments begin new episodes: Gymnasium has no way to ask
-one for its state.
+`checkpoint.safetensors` contains weights, target network, optimizer, replay buffer and generators,
+and in its header the counters, the curve so far and the task. One file holds all of them, because a
+kill between two writes could separate them. The environments start new episodes, because Gymnasium
+has no interface for their state.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import Tensor
 
-from mcaprl.errors import TrainingError
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.task import Task
+from mcaprl.runs import broken_checkpoint
 from mcaprl.tensor_files import read_tensors, write_tensors
 
-# NumPy's stubs do not know of the generator that is shared by all, which SB3 draws from.
+# NumPy's stubs lack the global generator, from which SB3 draws.
 _NUMPY_RANDOM: Any = np.random
-CHECKPOINT_NAME = "checkpoint.safetensors"
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -42,13 +41,13 @@ _COUNTERS = (
 
 
 def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[str, Any]) -> None:
-    """Replace a checkpoint by the model's present state.
+    """Replace a checkpoint with the current state of a model.
 
     Args:
-        path: of the file.
-        model: between two rollouts.
-        task: that it works at.
-        extra: JSON, to be found again.
+        path: Path of the file.
+        model: Model between two rollouts.
+        task: Task of the run.
+        extra: JSON object that `load_checkpoint` returns again.
     """
     generators, states = _generators(model)
     tensors = {
@@ -63,13 +62,13 @@ def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[st
 
 
 def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, Any]:
-    """Bring a fresh model to the state of a checkpoint.
+    """Load the state of a checkpoint into a fresh model.
 
     Returns:
-        What `save_checkpoint` was given as `extra`.
+        The argument `extra` of `save_checkpoint`.
 
     Raises:
-        TrainingError: it is of another task, or broken.
+        TrainingError: The checkpoint is of another task, or broken.
     """
     try:
         tensors, description = read_tensors(path)
@@ -82,9 +81,7 @@ def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, A
         _load_generators(model, _below(tensors, "generator"), description["generators"])
         return cast(dict[str, Any], description["extra"])
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise TrainingError(
-            f"cannot resume: {path} is broken ({error}); delete it to start this seed anew"
-        ) from error
+        raise broken_checkpoint(path, error) from error
 
 
 def _optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -104,7 +101,7 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for number, parts in moments.items():
         for name, part in parts.items():
             if part.shape == weights[number].shape:
-                # In memory they must lie as the weights do (convolutions: channels last).
+                # The memory format has to be that of the weights (convolutions: channels last).
                 parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
@@ -115,7 +112,7 @@ def _buffer_of(model: BaseAlgorithm) -> Any:
 
 
 def _sb3_columns(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
-    """The filled rows of a buffer of SB3's; those of dict observations one by one."""
+    """Return the filled rows of a buffer of SB3 by name, with one entry per key of a dict."""
     columns: dict[str, NDArray[Any]] = {}
     for name, value in vars(buffer).items():
         parts = {f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {}
@@ -124,7 +121,7 @@ def _sb3_columns(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
 
 
 def _buffer_tensors(model: BaseAlgorithm) -> dict[str, Tensor]:
-    """What the replay buffer holds; nothing where the algorithm has none."""
+    """Return the contents of the replay buffer; empty if the algorithm has none."""
     buffer = _buffer_of(model)
     if buffer is None:
         return {}
@@ -149,7 +146,7 @@ def _load_buffer(model: BaseAlgorithm, tensors: dict[str, Tensor]) -> None:
 
 
 def _generators(model: BaseAlgorithm) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The generators' states: tensors, and what is plain JSON."""
+    """Return the states of the random generators: tensors, and plain JSON values."""
     state = _NUMPY_RANDOM.get_bit_generator().state
     version, words, next_gauss = random.getstate()
     tensors = {

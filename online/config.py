@@ -1,4 +1,4 @@
-"""Settings of the online algorithms. What is not said otherwise is Stable-Baselines3's default."""
+"""Settings of the online algorithms; defaults not mentioned here are Stable-Baselines3's."""
 
 from __future__ import annotations
 
@@ -11,52 +11,41 @@ from mcaprl.settings import Settings
 
 @dataclass(frozen=True)
 class OnlineConfig(Settings):
-    """Settings shared by all algorithms; each adds its own in a subclass.
+    """Settings of all online algorithms; each algorithm adds its own in a subclass.
 
     Raises:
-        UsageError: a setting is outside its range.
+        UsageError: A setting is outside its range.
     """
 
     steps: int = 100_000
-    """environment steps in all, over all environments together"""
+    """number of environment steps, summed over all environments"""
     envs: int = 8
-    """environments that are stepped at once, in this process"""
+    """number of environments stepped at once, in this process"""
     learning_rate: float = 1e-4
-    """Adam's step size at the first update"""
-    final_learning_rate_fraction: float = 1.0
-    """the learning rate falls linearly to this part of itself at the last step"""
     gamma: float = 0.99
     """discount of the reward one step later"""
     hidden: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers; for images, of those behind the convolutions"""
-    frame_stack: int = 1
-    """how many successive observations the network sees at once"""
     center_images: bool = False
-    """pictures reach the first convolution as -2 to 2, not as 0 to 1"""
+    """scale the input of the first convolution to [-2, 2] instead of [0, 1]"""
     max_grad_norm: float = 10.0
-    """longer gradients are scaled down to this length"""
+    """norm to which longer gradients are clipped"""
     eval_interval: int = 5_000
     """environment steps between two evaluations"""
     eval_episodes: int = 30
-    """episodes of one evaluation, on an environment of its own; always the same ones"""
+    """episodes of one evaluation, the same each time, in a separate environment"""
     checkpoint_interval: int = 20_000
-    """environment steps between two checkpoints to resume from"""
     final_episodes: int = 100
-    """episodes that score the best checkpoint at the end, none of which it was chosen by"""
+    """episodes of the final score of the best checkpoint, not used to select it"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
-        counts = ("steps", "envs", "frame_stack", "eval_interval", "eval_episodes")
-        for name in (*counts, "checkpoint_interval"):
-            self._require(name, getattr(self, name) >= 1, "at least 1")
-        for name in ("learning_rate", "max_grad_norm"):
-            self._require(name, getattr(self, name) > 0, "above 0")
-        for name in ("final_learning_rate_fraction", "gamma"):
-            self._require(name, 0 <= getattr(self, name) <= 1, "within [0, 1]")
-        self._require("hidden", all(width >= 1 for width in self.hidden), "widths of at least 1")
+        """Refuse settings outside their ranges."""
+        super().__post_init__()
+        self._require_positive("steps", "envs", "eval_interval", "eval_episodes")
+        self._require("max_grad_norm", self.max_grad_norm > 0, "above 0")
+        self._require_fraction("gamma")
 
     def arguments(self) -> dict[str, Any]:
-        """The same for the constructor of SB3's algorithm, all but learning rate and networks."""
+        """Return arguments of SB3's constructor, except learning rate and networks."""
         return {"gamma": self.gamma, "max_grad_norm": self.max_grad_norm}
 
 
@@ -67,42 +56,42 @@ class DQNConfig(OnlineConfig):
     batch_size: int = 32
     """transitions in one gradient step"""
     buffer_size: int = 1_000_000
-    """transitions that the replay buffer holds; never more than there are steps"""
+    """capacity of the replay buffer in transitions; never more than there are steps"""
     learning_starts: int = 100
     """random steps before the first gradient step"""
     steps_per_update: int = 4
     """environment steps for each gradient step"""
     target_update_interval: int = 10_000
-    """environment steps between two copies of the weights into the target network"""
+    """environment steps between two updates of the target network"""
     target_update_episodes: int = 0
-    """episodes between two copies, in place of steps; 0 counts steps"""
+    """episodes between two updates of the target network, instead of steps; 0 counts steps"""
     n_steps: int = 1
-    """rewards that are summed up before the target network's value of what follows"""
+    """number of rewards in a target before the value of the state that follows"""
     exploration_fraction: float = 0.1
-    """part of the training in which the probability of a random action falls to its last value"""
+    """fraction of the training during which epsilon falls linearly to its final value"""
     exploration_initial_eps: float = 1.0
-    """probability of a random action at first"""
+    """epsilon, the probability of a random action, at the start"""
     exploration_final_eps: float = 0.05
-    """probability of a random action at last"""
+    """epsilon at the end"""
     exploration_decay: float = 0.0
-    """factor on that probability at each step, in place of the linear fall; 0 has none"""
+    """factor on epsilon at each step, instead of the linear decay; 0 is the linear decay"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse settings outside their ranges."""
         super().__post_init__()
-        for name in ("batch_size", "steps_per_update", "target_update_interval", "n_steps"):
-            self._require(name, getattr(self, name) >= 1, "at least 1")
-        self._require("buffer_size", self.buffer_size >= self.envs, "at least one row an env")
+        self._require_positive(
+            "batch_size", "steps_per_update", "target_update_interval", "n_steps"
+        )
+        self._require("buffer_size", self.buffer_size >= self.envs, f"at least envs ({self.envs})")
         self._require("learning_starts", self.learning_starts >= 0, "at least 0")
         self._require("target_update_episodes", self.target_update_episodes >= 0, "at least 0")
-        for name in ("fraction", "initial_eps", "final_eps", "decay"):
-            value = getattr(self, f"exploration_{name}")
-            self._require(f"exploration_{name}", 0 <= value <= 1, "within [0, 1]")
+        self._require_fraction("exploration_fraction", "exploration_initial_eps")
+        self._require_fraction("exploration_final_eps", "exploration_decay")
         even = max(self.steps_per_update, self.envs) % min(self.steps_per_update, self.envs) == 0
         self._require("steps_per_update", even, f"a multiple or a divisor of envs ({self.envs})")
 
     def arguments(self) -> dict[str, Any]:
-        """The same for the constructor of SB3's algorithm, all but learning rate and networks."""
+        """Return arguments of SB3's constructor, except learning rate and networks."""
         same = (
             "batch_size",
             "learning_starts",
@@ -115,7 +104,7 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # Steps that never come: episodes are counted instead.
+            # Never reached: episodes are counted instead.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`, each of which is a step of every environment.
@@ -126,7 +115,7 @@ class DQNConfig(OnlineConfig):
 
 @dataclass(frozen=True)
 class DoubleDQNConfig(DQNConfig):
-    """Settings of Double DQN: those of DQN."""
+    """Settings of Double DQN, the same as those of DQN."""
 
 
 @dataclass(frozen=True)
@@ -136,30 +125,29 @@ class PPOConfig(OnlineConfig):
     learning_rate: float = 3e-4
     max_grad_norm: float = 0.5
     rollout_steps: int = 2_048
-    """environment steps, over all environments, between two rounds of updates"""
+    """environment steps, summed over all environments, between two rounds of updates"""
     batch_size: int = 64
     """transitions in one gradient step"""
     epochs: int = 10
     """passes over each rollout"""
     gae_lambda: float = 0.95
-    """between 0, advantages from one step, and 1, from whole returns"""
+    """lambda of the advantages: 0 uses one step, 1 the whole return"""
     clip_range: float = 0.2
-    """how far the probability of an action may move in one round"""
+    """largest relative change of an action's probability in one round"""
     entropy_coefficient: float = 0.0
     """weight of the policy's entropy in the loss"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse settings outside their ranges."""
         super().__post_init__()
-        for name in ("batch_size", "epochs"):
-            self._require(name, getattr(self, name) >= 1, "at least 1")
+        self._require_positive("batch_size", "epochs")
         whole = self.rollout_steps >= 2 * self.envs and self.rollout_steps % self.envs == 0
-        self._require("rollout_steps", whole, f"a multiple of envs ({self.envs}), and twice it")
+        self._require("rollout_steps", whole, f"a multiple of envs ({self.envs}), above envs")
         fits = self.rollout_steps % self.batch_size == 0
         self._require("batch_size", fits, f"a divisor of rollout_steps ({self.rollout_steps})")
 
     def arguments(self) -> dict[str, Any]:
-        """The same for the constructor of SB3's algorithm, all but learning rate and networks."""
+        """Return arguments of SB3's constructor, except learning rate and networks."""
         return {
             **super().arguments(),
             "n_steps": self.rollout_steps // self.envs,
@@ -173,25 +161,25 @@ class PPOConfig(OnlineConfig):
 
 @dataclass(frozen=True)
 class A2CConfig(OnlineConfig):
-    """Settings of A2C, with RMSProp as its authors had it."""
+    """Settings of A2C, with RMSProp as in the paper."""
 
     learning_rate: float = 7e-4
     max_grad_norm: float = 0.5
     rollout_steps: int = 40
-    """environment steps, over all environments, for each gradient step"""
+    """environment steps, summed over all environments, for each gradient step"""
     gae_lambda: float = 1.0
-    """between 0, advantages from one step, and 1, from whole returns"""
+    """lambda of the advantages: 0 uses one step, 1 the whole return"""
     entropy_coefficient: float = 0.0
     """weight of the policy's entropy in the loss"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse settings outside their ranges."""
         super().__post_init__()
         whole = self.rollout_steps >= self.envs and self.rollout_steps % self.envs == 0
         self._require("rollout_steps", whole, f"a multiple of envs ({self.envs})")
 
     def arguments(self) -> dict[str, Any]:
-        """The same for the constructor of SB3's algorithm, all but learning rate and networks."""
+        """Return arguments of SB3's constructor, except learning rate and networks."""
         return {
             **super().arguments(),
             "n_steps": self.rollout_steps // self.envs,

@@ -1,9 +1,9 @@
-"""Double DQN on SB3's DQN: the learning network chooses the action that the target one judges.
+"""Double DQN on SB3's DQN: the target network evaluates the online network's best action.
 
     https://arxiv.org/abs/1509.06461    target r + gamma Q'(s', argmax_a Q(s', a))
 
-With `n_steps` n the target is the sum of n discounted rewards and gamma^n times that value; SB3's
-replay buffer gives both, fewer steps where the episode ended sooner.
+With `n_steps` n the target is the sum of n discounted rewards plus gamma^n times that value; SB3's
+replay buffer returns both, with fewer steps where the episode ends earlier.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from torch.nn import functional
 
 
 class WarmDQN(DQN):
-    """SB3's DQN, which may begin with weights that are worth acting by.
+    """SB3's DQN with an option for pretrained weights.
 
     Attributes:
-        acts_at_once: whether the steps before learning starts are the policy's own, not random
-            ones. A policy that learns from its first few steps alone forgets what it knew
-            (https://arxiv.org/abs/2412.07762): it is to fill the buffer first.
+        skips_random_steps: Whether the policy, rather than random actions, takes the steps before
+            learning starts. A policy that learns from few steps unlearns its pretraining
+            (https://arxiv.org/abs/2412.07762), so it fills the buffer first.
     """
 
-    acts_at_once = False
+    skips_random_steps = False
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        starts = 0 if self.acts_at_once else learning_starts
+        starts = 0 if self.skips_random_steps else learning_starts
         return super()._sample_action(starts, action_noise, n_envs)
 
 
 class DoubleDQN(WarmDQN):
-    """SB3's DQN in all but the target; its `.zip` files load as `DQN`, too."""
+    """SB3's DQN with another target; its `.zip` files load as `DQN` as well."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Make gradient steps on batches from the replay buffer."""
+        """Run gradient steps on batches from the replay buffer."""
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -49,9 +49,9 @@ class DoubleDQN(WarmDQN):
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             discounts = self.gamma if batch.discounts is None else batch.discounts
             with torch.no_grad():
-                chosen = self.q_net(batch.next_observations).argmax(1, keepdim=True)
-                judged = self.q_net_target(batch.next_observations).gather(1, chosen)
-                targets = batch.rewards + (1 - batch.dones) * discounts * judged
+                best = self.q_net(batch.next_observations).argmax(1, keepdim=True)
+                values_t = self.q_net_target(batch.next_observations).gather(1, best)
+                targets = batch.rewards + (1 - batch.dones) * discounts * values_t
             values = self.q_net(batch.observations).gather(1, batch.actions.long())
             loss = functional.smooth_l1_loss(values, targets)
             self.policy.optimizer.zero_grad()

@@ -1,48 +1,50 @@
-"""Evaluation beside training, on an environment of its own, on the scale random = 0, pilot = 1."""
+"""Evaluation during training, in a separate environment, on the scale random = 0, pilot = 1."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import ConvertCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import UnknownNameError
-from mcaprl.online.curve import CurvePoint
+from mcaprl.online.curves import CurvePoint
+from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.sims.evaluation.evaluate import evaluate
 from mcaprl.sims.evaluation.pilots import make_pilot
 
 SELECTION_SEED: Final = 3_000_000
-"""Of the episodes that choose the best checkpoint and make the curve."""
+"""Seed of the episodes that select the best checkpoint and form the curve."""
 FRESH_SEED: Final = 1_000_000
-"""Of those that give the final score; `mcaprl evaluate` has the same ones."""
+"""Seed of the episodes of the final score; `mcaprl evaluate` uses the same ones."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What acting at random and the sim's pilot get, each on the same episodes.
+    """The mean returns of random actions and of the sim's pilot on the same episodes.
 
     Attributes:
-        random: mean return.
-        pilot: mean return; NaN where the sim has no pilot.
+        random: Mean return of random actions.
+        pilot: Mean return of the pilot; NaN where the sim has none.
     """
 
     random: float
     pilot: float
 
     def score(self, mean_return: float) -> float:
-        """0 as random, 1 as the pilot; NaN without one."""
+        """Return 0 for random, 1 for the pilot; NaN without a pilot."""
         span = self.pilot - self.random
         return (mean_return - self.random) / span if span else math.nan
 
 
 def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
-    """Run the random policy and the pilot through the episodes of a seed."""
+    """Evaluate random actions and the pilot on the episodes of a seed."""
 
     def mean_return(policy: Any) -> float:
         score = evaluate(env, [policy], name="", episodes=episodes, seed=seed)
@@ -56,10 +58,9 @@ def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
 
 
 class Evaluation(EvalCallback):
-    """SB3's EvalCallback on the same episodes each time, so that checkpoints can be compared.
+    """SB3's EvalCallback on the same episodes each time, so that checkpoints are comparable.
 
-    It runs them all at once, one in each environment of its own batch. The best model is handed to
-    a callback, and every evaluation to another.
+    All episodes run at once, one in each environment of a separate batch.
     """
 
     def __init__(
@@ -72,19 +73,24 @@ class Evaluation(EvalCallback):
         on_new_best: Callable[[], None],
         on_point: Callable[[CurvePoint], None],
     ) -> None:
-        """Prepare.
+        """Prepare the evaluations.
 
         Args:
-            env: with an environment for each episode.
-            interval: training steps between two evaluations.
-            training_envs: environments that are trained in at once.
-            scale: of the scores.
-            on_new_best: called when the mean return is higher than ever.
-            on_point: called with each evaluation, after `on_new_best`.
+            env: Batch with one environment for each episode.
+            interval: Training steps between two evaluations.
+            training_envs: Number of environments in the training batch.
+            scale: Scale of the scores.
+            on_new_best: Function called when the mean return is the highest so far.
+            on_point: Function called with each evaluation, after `on_new_best`.
         """
+
+        def new_best(*_: Any) -> bool:
+            on_new_best()
+            return True
+
         super().__init__(
             env,
-            callback_on_new_best=_Call(on_new_best),
+            callback_on_new_best=ConvertCallback(new_best),
             n_eval_episodes=env.num_envs,
             eval_freq=max(interval // training_envs, 1),
             verbose=0,
@@ -97,7 +103,7 @@ class Evaluation(EvalCallback):
         self._progress_m: list[float] = []
 
     def resume(self, calls: int, best_mean_return: float) -> None:
-        """Go on as after so many steps of all environments."""
+        """Continue after `calls` steps of the training batch."""
         self.n_calls, self.best_mean_reward = calls, best_mean_return
 
     def _on_step(self) -> bool:
@@ -121,7 +127,7 @@ class Evaluation(EvalCallback):
         return going_on
 
     def _log_success_callback(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
-        """Called by SB3 after each step of the evaluation."""
+        """Record the end of an episode; SB3 calls this after each step of the evaluation."""
         super()._log_success_callback(locals_, globals_)
         if locals_["done"]:
             episode = locals_["info"]["episode"]
@@ -130,13 +136,97 @@ class Evaluation(EvalCallback):
             self._progress_m.append(locals_["info"].get("progress_m", math.nan))
 
 
-class _Call(BaseCallback):
-    """A plain function as SB3's callback."""
+class _Step(NamedTuple):
+    """One step of the K environments whose first episode is unfinished."""
 
-    def __init__(self, function: Callable[[], None]) -> None:
-        super().__init__()
-        self._function = function
+    environments: NDArray[np.int64]
+    observations: Any
+    actions: NDArray[Any]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    next_observations: Any
 
-    def _on_step(self) -> bool:
-        self._function()
-        return True
+
+class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+    """A recorder of each environment's first episode since the last reset.
+
+    The environments reset themselves in the step that ends an episode. While the longest first
+    episode continues, others begin their second; those would overrepresent short episodes.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
+        """Wrap `env`; `env_id` is stored in the log."""
+        super().__init__(env)
+        self._env_id = env_id
+        self._open = np.ones(env.num_envs, dtype=np.bool_)
+        self._steps: list[_Step] = []
+        self._observations: Any = None
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Reset all environments and drop the recorded episodes."""
+        self._observations, infos = self.env.reset(seed=seed, options=options)
+        self._open[:] = True
+        self._steps = []
+        return self._observations, infos
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments and record those in their first episode."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        numbers = np.flatnonzero(self._open)
+        if len(numbers):
+            following = _rows(observations, numbers)
+            ended = terminated[numbers] | truncated[numbers]
+            for row in np.flatnonzero(ended).tolist():
+                _put_row(following, row, infos["final_obs"][numbers[row]])
+            step = _Step(
+                numbers,
+                _rows(self._observations, numbers),
+                np.asarray(actions)[numbers],
+                rewards[numbers],
+                terminated[numbers],
+                truncated[numbers],
+                following,
+            )
+            self._steps.append(step)
+            self._open[numbers[ended]] = False
+        self._observations = observations
+        return result
+
+    def dataset(self) -> Dataset:
+        """Return the episodes of a greedy policy, in the order of their environments."""
+        environments = np.concatenate([step.environments for step in self._steps])
+        order = np.argsort(environments, kind="stable")
+        columns = {
+            name: _rows(_joined([getattr(step, name) for step in self._steps]), order)
+            for name in _Step._fields[1:]
+        }
+        return Dataset.from_arrays(
+            **columns,
+            behavior_probs=np.ones(len(order)),
+            env_id=self._env_id,
+            observation_space=self.single_observation_space,
+            action_space=self.single_action_space,
+        )
+
+
+def _rows(values: Any, numbers: NDArray[np.int64]) -> Any:
+    """Return a copy of rows of an array, or of each array in a dict."""
+    if isinstance(values, dict):
+        return {key: _rows(part, numbers) for key, part in values.items()}
+    return values[numbers]
+
+
+def _put_row(values: Any, row: int, value: Any) -> None:
+    if isinstance(values, dict):
+        for key, part in values.items():
+            _put_row(part, row, value[key])
+    else:
+        values[row] = value
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    if isinstance(parts[0], dict):
+        return {key: _joined([part[key] for part in parts]) for key in parts[0]}
+    return np.concatenate(parts)

@@ -1,9 +1,9 @@
-"""A replay buffer that stores each picture once, and gives n-step returns of any observations.
+"""A replay buffer that stores each image once, with n-step returns for any observations.
 
-SB3's own keeps every observation twice, as one step's next and the following step's first: 500,000
-depth images of 84x84 then take 7 GB. Here the next observation is the following row's; only those
-that end an episode are kept beside. Where observations are several frames in a row, each frame is
-stored once all the same.
+SB3's buffers store every observation twice, as the next one of a step and as the first one of the
+step that follows: 7 GB for 500,000 depth images of 84x84. Here the next observation is that of the
+following row; only the last observation of an episode is stored separately. Each frame of stacked
+observations is stored once, too.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _COLUMNS = ("final_of", "ages", "actions", "rewards", "dones", "timeouts")
 
 
 class FrameReplayBuffer(BaseBuffer):
-    """As SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer`, in half the memory.
+    """SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer` in half the memory.
 
-    R rows of N environments; a row's step follows the step of the row before. *shape is that of a
-    single frame. If frames before an oldest step are overwritten, its own stands for them.
+    R rows of N environments; a row's step follows the step of the previous row. *shape is that of a
+    single frame. Overwritten frames before the oldest step are replaced by copies of its own frame.
 
     Attributes:
-        frames: by key, (R, N, *shape); observations that are no dict have the key "".
-        newest: by key, (N, *shape), what followed the last row.
-        finals: by key, (F, *shape), where episodes ended.
-        final_of: (R, N), which of `finals` followed; -1 where the episode went on.
-        ages: (R, N), frames of the episode before this one; not counted beyond what is looked at.
-        actions: (R, N, 1).
-        rewards: (R, N) float32.
-        dones: (R, N) float32, 1 where an episode ended, for whatever reason.
-        timeouts: (R, N) float32, 1 where it was cut off.
+        frames: Observations (R, N, *shape) by key; the key of observations without keys is "".
+        newest: Observations (N, *shape) by key after the last row.
+        finals: Last observations (F, *shape) of episodes by key.
+        final_of: (R, N) indices into `finals`; -1 where the episode continued.
+        ages: (R, N) numbers of earlier frames in the episode, at most `frame_stack`.
+        actions: (R, N, 1) actions.
+        rewards: (R, N) float32 rewards.
+        dones: (R, N) float32, 1 where an episode ended.
+        timeouts: (R, N) float32, 1 where an episode was truncated.
     """
 
     def __init__(
@@ -55,18 +55,18 @@ class FrameReplayBuffer(BaseBuffer):
         gamma: float = 1.0,
         frame_stack: int = 1,
     ) -> None:
-        """Reserve the memory; the system gives it as it is filled.
+        """Reserve the memory; the operating system allocates it as the buffer fills.
 
         Args:
-            buffer_size: transitions, over all environments.
-            observation_space: as the network takes it.
-            action_space: discrete.
-            device: of the batches.
+            buffer_size: Number of transitions, summed over all environments.
+            observation_space: Space of the network's observations.
+            action_space: Discrete action space.
+            device: Device of the batches.
             n_envs: N.
-            optimize_memory_usage: SB3 passes it; it changes nothing.
-            n_steps: rewards that are summed up.
-            gamma: discount of the reward one step later.
-            frame_stack: k, how many frames in a row an observation is.
+            optimize_memory_usage: Ignored; SB3 passes it.
+            n_steps: Number of rewards in a return.
+            gamma: Discount of the reward one step later.
+            frame_stack: k, the number of successive frames in an observation.
         """
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = rows = max(buffer_size // n_envs, 1)
@@ -96,13 +96,13 @@ class FrameReplayBuffer(BaseBuffer):
         """Append a step of each environment.
 
         Args:
-            obs: (N, *shape); where the step before ended no episode, its `next_obs`. Of stacks only
-                the newest frame is looked at.
-            next_obs: (N, *shape), at an episode's end its last observation.
-            action: (N,).
-            reward: (N,).
-            done: (N,).
-            infos: whose `TimeLimit.truncated` says that an episode was cut off.
+            obs: Observations (N, *shape), equal to `next_obs` of the previous step unless that step
+                ended an episode. Only the newest frame of a stack is read.
+            next_obs: Next observations (N, *shape), the last one of an ended episode.
+            action: Actions (N,).
+            reward: Rewards (N,).
+            done: (N,) flags of ended episodes.
+            infos: Dicts whose `TimeLimit.truncated` marks truncated episodes.
         """
         row, following = self.pos, self._newest_frames(next_obs)
         for key, part in self._newest_frames(obs).items():
@@ -123,7 +123,7 @@ class FrameReplayBuffer(BaseBuffer):
         self.full |= self.pos == 0
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All that is stored, to be kept and given to `restore`."""
+        """Return the contents of the buffer for `restore`."""
         rows = self.size()
         columns = {name: getattr(self, name)[:rows] for name in _COLUMNS}
         columns |= {f"frames.{key}": part[:rows] for key, part in self.frames.items()}
@@ -132,7 +132,7 @@ class FrameReplayBuffer(BaseBuffer):
         return columns
 
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
-        """Go back to what `columns` gave; `pos` and `full` are set already."""
+        """Restore the contents that `columns` returned, after `pos` and `full` are set."""
         rows = self.size()
         for name in _COLUMNS:
             getattr(self, name)[:rows] = columns[name]
@@ -144,7 +144,7 @@ class FrameReplayBuffer(BaseBuffer):
         self._free = sorted(set(range(slots)) - set(self.final_of[self.final_of >= 0].tolist()))
 
     def _free_slot(self) -> int:
-        """A place for the last observation of an episode; there are twice as many if none is."""
+        """Return a free index of `finals`, whose length doubles if there is none."""
         if not self._free:
             count = len(next(iter(self.finals.values())))
             self.finals = {
@@ -155,7 +155,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._free.pop()
 
     def _get_samples(self, batch_inds: NDArray[Any], env: VecNormalize | None = None) -> Any:
-        """Batches of the rows, each of an environment drawn at random; draws as SB3 does."""
+        """Return batches of rows, each of a random environment, with SB3's random draws."""
         assert env is None
         envs = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         rows, returns, discounts = self._look_ahead(batch_inds, envs)
@@ -175,10 +175,10 @@ class FrameReplayBuffer(BaseBuffer):
     def _look_ahead(
         self, rows: NDArray[Any], envs: NDArray[Any]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-        """Sum up rewards until n are, the episode ends, or what came next is not known yet.
+        """Sum n rewards, or fewer where the episode or the buffer ends earlier.
 
         Returns:
-            The last row of each sum, the sum, and gamma to the power of how many.
+            Last row of each sum, the sum, and gamma to the power of the number of rewards.
         """
         steps = np.arange(self.n_steps)
         ahead = (rows[:, None] + steps) % self.buffer_size
@@ -191,14 +191,14 @@ class FrameReplayBuffer(BaseBuffer):
         return ahead[np.arange(len(rows)), last], returns, discounts
 
     def _stacks(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """What was observed before the steps of rows."""
+        """Return the observations before the steps of rows."""
         if self.frame_stack == 1:
             return {key: part[rows, envs] for key, part in self.frames.items()}
         places = self._places(rows, envs, np.arange(self.frame_stack)[::-1])
         return self._joined({key: part[places, envs[:, None]] for key, part in self.frames.items()})
 
     def _following(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """What was observed after the steps of rows."""
+        """Return the observations after the steps of rows."""
         following = self._frames_after(rows, envs)
         if self.frame_stack == 1:
             return following
@@ -210,7 +210,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._joined(stacks)
 
     def _frames_after(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """The frames that were seen after the steps of rows."""
+        """Return the frames after the steps of rows."""
         slots = self.final_of[rows, envs]
         ended = slots >= 0
         newest = ~ended & (rows == (self.pos - 1) % self.buffer_size)
@@ -225,21 +225,21 @@ class FrameReplayBuffer(BaseBuffer):
     def _places(
         self, rows: NDArray[Any], envs: NDArray[Any], before: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Which rows have the frames so many steps before those of rows, in the same episode."""
+        """Return the rows of the frames `before` steps earlier, limited to the same episode."""
         oldest = self.pos if self.full else 0
-        kept = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
-        places: NDArray[np.int64] = rows[:, None] - np.minimum(before, kept[:, None])
+        stored = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
+        places: NDArray[np.int64] = rows[:, None] - np.minimum(before, stored[:, None])
         return places % self.buffer_size
 
     def _ages_after(self, row: int) -> NDArray[np.int64]:
-        """How many frames of the same episode were seen before the one that follows a row."""
+        """Return the numbers of earlier frames in the episode for the frame after a row."""
         if not self.size():
             return np.zeros(self.n_envs, np.int64)
         ages = np.minimum(self.ages[row] + 1, self.frame_stack)
         return np.where(self.dones[row] > 0, 0, ages)
 
     def _newest_frames(self, observations: Any) -> dict[str, NDArray[Any]]:
-        """The newest frame of each stack."""
+        """Return the newest frame of each stack."""
         newest = {}
         for key, space in parts_of_space(self.frame_space).items():
             part, axis = parts_of(observations)[key], stack_axis(space)
@@ -256,7 +256,7 @@ class FrameReplayBuffer(BaseBuffer):
 
 
 def _frame_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
-    """The space of a single frame of stacks."""
+    """Return the space of a single frame of a stack."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: _frame_space(part, count) for key, part in space.items()})
     assert isinstance(space, spaces.Box)

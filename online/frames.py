@@ -1,7 +1,7 @@
-"""Several observations in a row as one, for what a single one does not show: a speed, say.
+"""Frame stacking: several successive observations as one, to make speeds visible, for example.
 
-Oldest first, along the channels of pictures and along the last axis of all else, as the networks of
-`offline/` have them, too. Before an episode's first observation, that one stands for what was.
+The order is oldest first, along the channels of images and along the last axis of other arrays, as
+in `offline/`. Missing frames before an episode's first observation are copies of it.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 WHOLE = ""
-"""The one part of observations that are no dict."""
+"""Key of the only part of observations that are not a dict."""
 
 
 def parts_of_space(space: spaces.Space[Any]) -> dict[str, Any]:
-    """The parts of a Dict space by key; any other space is its own only part."""
+    """Return the parts of a Dict space by key; any other space is its own only part."""
     return dict(space.items()) if isinstance(space, spaces.Dict) else {WHOLE: space}
 
 
 def parts_of(observations: Any) -> dict[str, NDArray[Any]]:
-    """The same of observations."""
+    """Return the parts of observations by key."""
     return observations if isinstance(observations, dict) else {WHOLE: observations}
 
 
 def whole_of(parts: dict[str, Any]) -> Any:
-    """Undo `parts_of`."""
+    """Invert `parts_of`."""
     return parts.get(WHOLE, parts)
 
 
 def stack_axis(space: spaces.Space[Any]) -> int:
-    """Along which axis of one observation frames are joined, counted from its end."""
+    """Return the axis of one observation along which frames are joined, counted from the end."""
     if is_image_space(space) and is_image_space_channels_first(cast(spaces.Box, space)):
         return -3
     return -1
 
 
 def stacked_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
-    """The space of `count` observations as one."""
+    """Return the space of `count` joined observations."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: stacked_space(part, count) for key, part in space.items()})
     if count == 1:
@@ -53,11 +53,11 @@ def stacked_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 
 
 def joined(frames: Any, space: spaces.Space[Any]) -> Any:
-    """Make one observation of each row of frames.
+    """Join the frames of each row to one observation.
 
     Args:
-        frames: (B, k, *shape), oldest first, or a dict of such.
-        space: of a single observation.
+        frames: Arrays (B, k, *shape), oldest first, or a dict of such arrays.
+        space: Space of a single observation.
     """
     found = {
         key: np.concatenate(list(np.moveaxis(parts_of(frames)[key], 1, 0)), stack_axis(part))
@@ -70,18 +70,18 @@ class FrameMemory:
     """The last k observations of each of B episodes.
 
     Attributes:
-        space: of a single observation.
-        frames: by key, (B, k, *shape), oldest first; empty before anything was seen.
+        space: Space of a single observation.
+        frames: Arrays (B, k, *shape) by key, oldest first; empty before the first observation.
     """
 
     def __init__(self, space: spaces.Space[Any], count: int) -> None:
-        """Remember `count` observations of a space."""
+        """Store the last `count` observations of a space."""
         self.space = space
         self.frames: dict[str, NDArray[Any]] = {}
         self._count = count
 
     def begin(self, observations: Any) -> Any:
-        """Take the first observations (B, *shape) of episodes; each as a stack."""
+        """Store the first observations (B, *shape) of episodes, and return them as stacks."""
         self.frames = {
             key: np.repeat(part[:, None], self._count, axis=1)
             for key, part in parts_of(observations).items()
@@ -89,7 +89,7 @@ class FrameMemory:
         return self.stacked()
 
     def see(self, observations: Any) -> Any:
-        """Take the next observations (B, *shape) of all episodes; each as a stack."""
+        """Store the next observations (B, *shape) of all episodes, and return them as stacks."""
         self.frames = {
             key: np.concatenate([self.frames[key][:, 1:], part[:, None]], axis=1)
             for key, part in parts_of(observations).items()
@@ -97,12 +97,12 @@ class FrameMemory:
         return self.stacked()
 
     def begin_one(self, row: int) -> None:
-        """Let what was seen last in an episode's place be the first observation of another."""
+        """Make the last observation of a row the first one of a new episode."""
         for part in self.frames.values():
             part[row] = part[row, -1:]
 
     def ending(self, row: int, last: Any) -> Any:
-        """The stack whose newest observation is `last` (*shape), in place of what was seen last."""
+        """Return a row's stack with `last` (*shape) instead of its newest observation."""
         frames = {key: part[row : row + 1].copy() for key, part in self.frames.items()}
         for key, part in parts_of(last).items():
             frames[key][0, -1] = part
@@ -110,12 +110,12 @@ class FrameMemory:
         return whole_of({key: part[0] for key, part in stack.items()})
 
     def stacked(self) -> Any:
-        """(B, *stacked shape)."""
+        """Return the stacks (B, *stacked shape)."""
         return joined(whole_of(self.frames), self.space)
 
 
 class StackedVecEnv(VecEnvWrapper):
-    """Environments whose observations are the last k of theirs."""
+    """A wrapper whose observations are stacks of the last k observations."""
 
     def __init__(self, venv: VecEnv, count: int) -> None:
         """Wrap environments that reset themselves in the step that ends an episode."""
@@ -123,11 +123,11 @@ class StackedVecEnv(VecEnvWrapper):
         super().__init__(venv, stacked_space(venv.observation_space, count))
 
     def reset(self) -> VecEnvObs:
-        """Start all episodes anew."""
+        """Start new episodes in all environments."""
         return cast(VecEnvObs, self._memory.begin(self.venv.reset()))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all; an episode's last observation is a stack, too."""
+        """Step all environments; the last observation of an episode is a stack as well."""
         observations, rewards, dones, infos = self.venv.step_wait()
         self._memory.see(observations)
         for row in np.flatnonzero(dones).tolist():

@@ -1,6 +1,7 @@
-"""Shows training while it goes on: one of the environments, and what the learner makes of it.
+"""Live view of training: one of the environments, and the learner's values for it.
 
-Frames are dropped, never steps, and what is learnt is the same bits with and without viewers.
+Only frames of the view are dropped, never steps; the results are bit for bit the same with and
+without viewers.
 """
 
 from __future__ import annotations
@@ -45,23 +46,23 @@ TRAINING_NAMES = (
 )
 """The numbers in `/rl/training`."""
 WATCHED = 0
-"""Which of the environments is shown."""
+"""Index of the environment in the live view."""
 
 
 class LiveTraining:
-    """What a run shows, whichever of its seeds learns just now."""
+    """The live view of a run, for one seed after the other."""
 
     def __init__(self, task: Task, *, port: int = DEFAULT_PORT, pace: Pace | None = None) -> None:
         """Listen for viewers.
 
         Args:
-            task: that is learnt.
-            port: of 127.0.0.1; 0 takes any that is free.
-            pace: when there is time for frames.
+            task: Task of the run.
+            port: Port on 127.0.0.1; 0 selects a free one.
+            pace: Rate of frames.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
-            UsageError: the port is taken, or the environment cannot be made.
+            UsageError: The port is in use, or the environment cannot be created.
         """
         self._task = task
         self._shown = make_sim(task.sim, **task.sim_options)
@@ -80,32 +81,32 @@ class LiveTraining:
             raise
 
     def watch(self, env: VectorEnv[Any, Any, Any]) -> WatchedBatch:
-        """Wrap a batch of the task's environments, so that one of them is shown."""
+        """Wrap a batch of the task's environments to show one of them."""
         return WatchedBatch(env, self.stream, self._task.algo, self._source_of(env.unwrapped))
 
     def close(self) -> None:
-        """Say goodbye to all viewers."""
+        """Disconnect all viewers."""
         with closing(self._shown):
             self.stream.close()
 
     def _source_of(self, batch: Any) -> Callable[[], object]:
-        """How to get an environment that describes what is to be seen of the watched one."""
+        """Return a function that returns an environment with the scene of the watched one."""
         shown = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(shown, VehicleEnv):
             mirror = _Mirror(batch.fleet, shown)
-            return mirror.reflect
+            return mirror.update
         if isinstance(batch, SyncVectorEnv):
             return lambda: batch.envs[WATCHED].unwrapped
         return lambda: None
 
 
 class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
-    """A batch of environments that reset themselves at once; the first one is shown.
+    """A wrapper of a batch of environments that shows the first one.
 
     Attributes:
-        model: of SB3, in training in these environments; nothing is shown before it is set.
-        score: of the last evaluation; NaN before.
-        after_asking: called when the model's network was asked for what is shown.
+        model: Model of SB3 that trains in these environments; nothing is shown before it is set.
+        score: Score of the last evaluation; NaN before the first one.
+        after_forward: Callback after each forward pass of the model for the live view.
     """
 
     def __init__(
@@ -115,11 +116,11 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         algo: str,
         source: Callable[[], object],
     ) -> None:
-        """Wrap `env`; `source` gives what describes the scene of the watched environment."""
+        """Wrap `env`; `source` returns an object with the scene of the watched environment."""
         super().__init__(env)
         self.model: BaseAlgorithm | None = None
         self.score = math.nan
-        self.after_asking: Callable[[], None] = lambda: None
+        self.after_forward: Callable[[], None] = lambda: None
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
         self._episode = -1
@@ -127,15 +128,15 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._begin_episode()
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset all; the watched environment begins an episode."""
+        """Reset all environments; the watched one starts an episode."""
         self._observations, infos = self.env.reset(seed=seed, options=options)
         self._begin_episode()
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all, and show the transition of one if there is time."""
+        """Step all environments, and show the watched transition if a frame is due."""
         shown = self.model is not None and self._stream.due()
-        before = self._look(actions) if shown else {}
+        before = self._before_step(actions) if shown else {}
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         reward = float(rewards[WATCHED])
@@ -154,7 +155,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._step += 1
         self._return_so_far += reward
         if is_over:
-            self._tell_end(bool(terminated[WATCHED]), bool(truncated[WATCHED]), infos)
+            self._show_end(bool(terminated[WATCHED]), bool(truncated[WATCHED]), infos)
             self._begin_episode()
         return result
 
@@ -162,18 +163,18 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._episode, self._step, self._return_so_far = self._episode + 1, 0, 0.0
         self._began_ns = time.time_ns()
 
-    def _look(self, actions: NDArray[Any]) -> dict[str, Any]:
-        """What is known before the step."""
+    def _before_step(self, actions: NDArray[Any]) -> dict[str, Any]:
+        """Return the fields of a live step that are known before the step."""
         model = self.model
         assert model is not None
         self._stream.look(self._source(), self._return_so_far)
         values = _values(model, actions[WATCHED : WATCHED + 1])
         epsilon = exploration(model)
         probability = behavior_probabilities(model, actions)[WATCHED]
-        self.after_asking()
-        told = model.logger.name_to_value
-        self._loss = told.get("train/loss", told.get("train/value_loss", self._loss))
-        self._mean_q = told.get("train/mean_q", self._mean_q)
+        self.after_forward()
+        logged = model.logger.name_to_value
+        self._loss = logged.get("train/loss", logged.get("train/value_loss", self._loss))
+        self._mean_q = logged.get("train/mean_q", self._mean_q)
         returns = [episode["r"] for episode in model.ep_info_buffer or ()]
         training = {
             "loss": self._loss,
@@ -195,7 +196,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             "training": training,
         }
 
-    def _tell_end(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
+    def _show_end(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
         reasons = infos.get("final_info", {}).get("reason")
         summary = EpisodeSummary(
             episode=self._episode,
@@ -213,21 +214,21 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 class _Mirror:
-    """A single vehicle that is made the same as one of a fleet, to be looked at."""
+    """A single vehicle that copies the state of one in a fleet, for the scene."""
 
     def __init__(self, fleet: Fleet, single: VehicleEnv[Any, Any]) -> None:
         self._fleet, self._single = fleet, single
 
-    def reflect(self) -> object:
-        """Take over the state."""
+    def update(self) -> object:
+        """Copy the state, and return the environment."""
         self._single.fleet.imitate(0, self._fleet, WATCHED)
-        # Frames are far apart: there is no trail to draw.
+        # Frames are too far apart for a trail.
         self._single._trail.clear()
         return self._single
 
 
 def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
-    """What the learner thinks of the watched environment: fields of `schema.values_schema`."""
+    """Return the learner's values in the watched environment: fields of `values_schema`."""
     observation = _row(model._last_obs, slice(WATCHED, WATCHED + 1))
     tensor: Any = model.policy.obs_to_tensor(observation)[0]
     start = int(cast(spaces.Discrete, model.action_space).start)
@@ -254,7 +255,7 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
 
 
 def _row(observations: Any, which: int | slice) -> Any:
-    """One environment's part of observations."""
+    """Return one environment's part of observations."""
     if isinstance(observations, dict):
         return {key: part[which] for key, part in observations.items()}
     return observations[which]

@@ -1,4 +1,4 @@
-"""Policies in `.zip` files of Stable-Baselines3, ready to act; no code from a file is run."""
+"""Policies in `.zip` files of Stable-Baselines3; nothing in a file is unpickled or executed."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolic
 
 from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
-from mcaprl.online.sb3_data import description_of
-from mcaprl.online.zip_file import read_model, write_model
+from mcaprl.online.zip_file import describe_sb3, read_model, write_model
 from mcaprl.recorder.format.spaces import space_from_json, space_to_json
 from mcaprl.runs import BEST_NAME
 
@@ -35,7 +34,7 @@ _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
     "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
 }
-"""SB3's classes for vectors, pictures and dicts; a file can ask for no other."""
+"""SB3's classes for vectors, images and dicts; a file cannot name any other."""
 _ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
     "ReLU": torch.nn.ReLU,
     "Tanh": torch.nn.Tanh,
@@ -49,14 +48,14 @@ class OnlinePolicy:
     """A trained policy; NumPy in, NumPy out. B is the number of observations, A of actions.
 
     Attributes:
-        name: of the file, or the folders of the run and of the seed.
-        algo: that trained it.
-        observation_space: of one observation; None where the file does not say its bounds.
-        action_space: of one action.
-        env_id: of the environment it learned in; empty if unknown.
-        env_kwargs: arguments to make that environment.
-        frame_stack: how many successive observations it looks at; see `act`.
-        network: SB3's policy.
+        name: Name of the file, or of the folders of the run and the seed.
+        algo: Name of the algorithm that trained it.
+        observation_space: Space of one observation; None where the file has no bounds.
+        action_space: Space of one action.
+        env_id: Gymnasium id of the environment it was trained in; empty if unknown.
+        env_kwargs: Arguments of that environment.
+        frame_stack: Number of successive observations that the network receives; see `act`.
+        network: Policy of SB3.
     """
 
     name: str
@@ -70,42 +69,42 @@ class OnlinePolicy:
     _memory: FrameMemory | None
 
     def begin(self) -> None:
-        """Forget what was seen: the next observations are the first of their episodes."""
+        """Drop the remembered observations: the next ones are the first of their episodes."""
         if self._memory is not None:
             self._memory.frames = {}
 
     def act(self, observations: Any) -> NDArray[np.int64]:
-        """The best actions (B,), values of `action_space`.
+        """Return the best actions (B,), values of `action_space`.
 
         A policy with `frame_stack` k > 1 remembers the observations of its last k calls since
         `begin`.
 
         Raises:
-            PolicyError: the observations do not fit the network.
+            PolicyError: The observations do not fit the network.
         """
         return cast(NDArray[np.int64], self._tried(self._predicted, observations)[0])
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """The values (B, A) of all actions, in the order of the action space.
+        """Return the Q-values (B, A) of all actions, in the order of the action space.
 
         Args:
             observations: (B, *shape), or (B, k, *shape), oldest first, where k frames are stacked.
 
         Raises:
-            PolicyError: the policy has none, or the observations do not fit the network.
+            PolicyError: The policy has no Q-values, or the observations do not fit the network.
         """
         if not isinstance(self.network, DQNPolicy):
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
         return cast(NDArray[np.float32], self._tried(self._outputs, observations))
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """The probabilities (B, A) of all actions; those of a Q-network are 0 but for the best.
+        """Return the probabilities (B, A) of all actions; a Q-network's best action has 1.
 
         Args:
-            observations: as of `q_values`.
+            observations: Observations as for `q_values`.
 
         Raises:
-            PolicyError: the observations do not fit the network.
+            PolicyError: The observations do not fit the network.
         """
         outputs = self._tried(self._outputs, observations)
         if not isinstance(self.network, DQNPolicy):
@@ -115,7 +114,7 @@ class OnlinePolicy:
         return probabilities
 
     def _predicted(self, observations: Any, deterministic: bool) -> Any:
-        """The best actions, after what is remembered."""
+        """Return the best actions for the remembered observations and these."""
         memory = self._memory
         if memory is not None:
             seen, now = (
@@ -126,7 +125,7 @@ class OnlinePolicy:
         return self.network.predict(observations, deterministic=deterministic)
 
     def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:
-        """Q-values, or probabilities."""
+        """Return Q-values, or probabilities."""
         if self._memory is not None:
             observations = joined(observations, self._memory.space)
         tensor = self.network.obs_to_tensor(observations)[0]
@@ -142,16 +141,16 @@ class OnlinePolicy:
         try:
             return forward(observations, deterministic=True)
         except (ValueError, RuntimeError, KeyError, AttributeError) as error:
-            raise PolicyError(f"{self.name} does not take these observations: {error}") from error
+            raise PolicyError(f"{self.name} does not accept these observations: {error}") from error
 
 
 def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Write a model's file, with what is needed to load it without unpickling.
+    """Write a model's file, with a description from which it loads without unpickling.
 
     Args:
-        path: of the `.zip` to replace.
-        model: of SB3.
-        description: what the run knows: `algo`, `net_arch`, `env_id`, `env_kwargs`, `spaces`.
+        path: `.zip` file to replace.
+        model: Model of SB3.
+        description: Description as `describe_run` returns it.
     """
     q_network = isinstance(model.policy, DQNPolicy)
     own = {
@@ -173,7 +172,7 @@ def describe_run(
     env_kwargs: dict[str, Any],
     frame_stack: int = 1,
 ) -> dict[str, Any]:
-    """What a run knows of its policies, as plain JSON types."""
+    """Return the description that all policies of a run share, as plain JSON types."""
     return {
         "algo": algo,
         "net_arch": list(hidden),
@@ -189,13 +188,13 @@ def read_policy(path: Path) -> OnlinePolicy:
     """Read the policy in a `.zip` of this package or of plain SB3.
 
     Raises:
-        PolicyError: there is none, or it is broken.
+        PolicyError: There is no such file, or it is broken.
     """
     own, data, weights = read_model(path)
     try:
         if own and own.get("format_version") != FORMAT_VERSION:
-            raise ValueError(f"format_version {own.get('format_version')} is not known")
-        return _build(path, own or description_of(data, weights), weights, exact=bool(own))
+            raise ValueError(f"format_version {own.get('format_version')} is not supported")
+        return _build(path, own or describe_sb3(data, weights), weights, exact=bool(own))
     except (ValueError, TypeError, KeyError, RuntimeError, AssertionError, SpaceError) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise PolicyError(f"cannot load the policy in {path}: {reason}") from error
@@ -209,10 +208,10 @@ def _build(
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = space_from_json(json.dumps(description["action_space"]))
     frames = int(description.get("frame_stack", 1))
-    shown = channels_first(stacked_space(observation_space, frames))
-    policy_type: Any = _policy_type(description["network"], shown)
+    shape = channels_first(stacked_space(observation_space, frames))
+    policy_type: Any = _policy_type(description["network"], shape)
     network = policy_type(
-        shown,
+        shape,
         action_space,
         lambda _: 0.0,
         net_arch=description["net_arch"],
@@ -236,7 +235,7 @@ def _build(
 
 
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """The space as SB3's networks have it: pictures with their channels in front."""
+    """Return the space of SB3's networks, whose images have the channels first."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: channels_first(part) for key, part in space.items()})
     if is_image_space(space) and not is_image_space_channels_first(cast(spaces.Box, space)):
@@ -245,7 +244,7 @@ def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
 
 
 def _policy_type(network: str, space: spaces.Space[Any]) -> type[BasePolicy]:
-    vectors, pictures, dicts = _POLICY_TYPES[network]
+    vectors, images, dicts = _POLICY_TYPES[network]
     if isinstance(space, spaces.Dict):
         return dicts
-    return pictures if is_image_space(space) else vectors
+    return images if is_image_space(space) else vectors

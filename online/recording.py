@@ -1,4 +1,4 @@
-"""What an agent in training tells its recorder before each step: how its actions came about."""
+"""Recording of training: behavior probabilities, epsilon and policy version of each step."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from mcaprl.recorder.repair.recover import recover_log
 
 
 def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
-    """The log of each seed: the file itself, or seed-K.mcap in a folder where there are several.
+    """Return the log of each seed: the file, or seed-K.mcap in a folder for several seeds.
 
     Raises:
-        UsageError: several seeds are to go into one file.
-        OutputExistsError: a file is there, and no run is to be resumed.
+        UsageError: One file was given for several seeds.
+        OutputExistsError: A file exists, and no run is resumed.
     """
     if len(seeds) > 1 and record.suffix == ".mcap":
         raise UsageError(
-            f"{len(seeds)} seeds write a file of each into a folder; {record} is no name for one"
+            f"{len(seeds)} seeds need a folder for one log each; {record} is a file name"
         )
     paths = {seed: record / f"seed-{seed}.mcap" for seed in seeds}
     if record.suffix == ".mcap":
@@ -46,18 +46,18 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
 def recorded(
     env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int, resume: bool = False
 ) -> RecordVecMcap:
-    """Record what a batch of environments does from now on, with a row for each step of learning.
+    """Record a batch of environments, with a row for each step of training.
 
     Args:
-        env: to be recorded.
-        path: of the log.
-        algo: who acts.
-        seed: of the agent.
-        resume: go on behind the last episode of a log that is there. If its recorder was killed,
-            it is recovered first, and the damaged file is kept beside it.
+        env: Environments to record.
+        path: Path of the log.
+        algo: Name of the algorithm.
+        seed: Seed of the agent.
+        resume: Whether to append to an existing log. The log of a killed recorder is recovered
+            first, and the damaged file is renamed to `*.damaged`.
 
     Raises:
-        SpaceError, OutputExistsError, LogError: as `RecordVecMcap`.
+        SpaceError, OutputExistsError, LogError: As for `RecordVecMcap`.
     """
 
     def wrap(append: bool) -> RecordVecMcap:
@@ -76,19 +76,19 @@ def recorded(
 
 
 class ActionDescriber:
-    """Tells the recorder how likely actions were; to be called with them before each step."""
+    """A callback for each step that gives the recorder the probabilities of the actions."""
 
     def __init__(self, recorder: RecordVecMcap, model: BaseAlgorithm) -> None:
-        """Watch a model, which `recorder` records."""
+        """Describe the actions of `model` to `recorder`."""
         self._recorder, self._model = recorder, model
         self._were_greedy = False
         if isinstance(model, DQN):
-            # SB3 asks the network only where it does not explore. Asking it once more at each
-            # step, to know what the greedy action is, would cost more than recording.
-            model.q_net.register_forward_hook(self._notice)
+            # SB3 evaluates the network only where it does not explore. Another forward pass at
+            # each step, to find the greedy action, would cost more than recording.
+            model.q_net.register_forward_hook(self._on_forward)
 
     def __call__(self, actions: NDArray[Any]) -> None:
-        """Describe the actions (N,) that answer the model's last observations."""
+        """Describe the actions (N,) that the model chose for its last observations."""
         model, recorder = self._model, self._recorder
         recorder.epsilon = epsilon = exploration(model)
         recorder.policy_version = cast(Any, model)._n_updates
@@ -97,37 +97,36 @@ class ActionDescriber:
             recorder.behavior_probs = np.full(len(actions), epsilon / count + 1 - epsilon)
         else:
             recorder.behavior_probs = behavior_probabilities(model, actions)
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Call it when the network was asked for anything but the next actions."""
+    def reset(self) -> None:
+        """Ignore a forward pass that was not for the next actions."""
         self._were_greedy = False
 
-    def _notice(self, network: nn.Module, *_: Any) -> None:
-        """The network was asked: for actions, if it is not learning."""
+    def _on_forward(self, network: nn.Module, *_: Any) -> None:
+        # Outside of training mode, a forward pass selects actions.
         self._were_greedy = not network.training
 
 
 def exploration(model: BaseAlgorithm) -> float:
-    """The probability of a random action in the next step; NaN where the policy is stochastic."""
+    """Return epsilon of the next step; NaN where the policy is stochastic."""
     if not isinstance(model, DQN):
         return math.nan
     at_random = model.num_timesteps < model.learning_starts
-    if at_random and not (isinstance(model, WarmDQN) and model.acts_at_once):
+    if at_random and not (isinstance(model, WarmDQN) and model.skips_random_steps):
         return 1.0
     return model.exploration_rate
 
 
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """How likely it was that the model chose these actions for its last observations.
+    """Return the probabilities with which the model chose these actions.
 
-    With a Q-network and A actions that is epsilon / A, and 1 - epsilon more for the greedy action.
-    SB3 draws once for all environments whether to explore; each one's probability is as if it
-    had drawn alone.
+    With a Q-network and A actions it is epsilon / A, plus 1 - epsilon for the greedy action. SB3
+    draws once for all environments whether to explore; the probability is that of one environment.
 
     Args:
-        model: in training; its last observations are those that the actions answer.
-        actions: (N,).
+        model: Model in training; the actions are for its last observations.
+        actions: Actions (N,).
     """
     if not isinstance(model, DQN):
         return _likelihoods(model, actions)
@@ -143,7 +142,7 @@ def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
 
 
 def _likelihoods(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Of actions that were drawn from an actor's distribution."""
+    """Return the probabilities of actions drawn from an actor's distribution."""
     policy = model.policy
     assert isinstance(policy, ActorCriticPolicy)
     with torch.inference_mode():

@@ -1,15 +1,12 @@
 """Train one algorithm in one environment, with several seeds, into a run folder.
 
-RUN/config.json                         algorithm, settings, environment
-RUN/seed-0/best_model.zip               SB3's model file of the best checkpoint; see `policy`
-RUN/seed-0/checkpoint.safetensors       to resume from; see `checkpoint`
-RUN/seed-0/curve.csv                    evaluations while training; see `curve`
-RUN/seed-0/evaluations/step-K.mcap      the episodes of each evaluation, if training is recorded
-RUN/seed-0/progress.csv                 SB3's own scalars; the same for TensorBoard
-RUN/seed-1/...
-RUN/scores.json                         each seed's best checkpoint on fresh episodes
-RUN/curve.png                           the curves of all seeds
-RUN/foxglove-layout.json                for who watches, if it is shown while it trains
+`mcaprl.runs` lists the files of a run folder; an online run also writes
+
+    RUN/seed-K/evaluations/step-N.mcap      episodes of each evaluation, if training is recorded
+    RUN/seed-K/progress.csv                 SB3's scalars; the same for TensorBoard
+    RUN/scores.json                         score of each seed's best checkpoint on new episodes
+    RUN/curve.png                           curves of all seeds
+    RUN/foxglove-layout.json                layout for live viewers
 """
 
 from __future__ import annotations
@@ -24,45 +21,35 @@ from typing import Any
 
 import gymnasium as gym
 
-from mcaprl.errors import OutputExistsError, TrainingError, UsageError
+from mcaprl.errors import TrainingError, UsageError
 from mcaprl.files import write_json
 from mcaprl.online.agent import Agent
 from mcaprl.online.algorithms import check_spaces
-from mcaprl.online.curve_picture import PICTURE_NAME, SCORES_NAME, curve_picture, read_run
+from mcaprl.online.curves import IMAGE_NAME, SCORES_NAME, draw_curves, read_run
 from mcaprl.online.evaluation import FRESH_SEED, SELECTION_SEED, Scale, measure_scale
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import read_policy
 from mcaprl.online.recording import log_paths
-from mcaprl.online.task import CONFIG_NAME, Task, read_config
+from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.runs import BEST_NAME
+from mcaprl.runs import BEST_NAME, RunSummary, open_run, seed_folder
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import evaluate
 
 
 @dataclass(frozen=True)
-class RunSummary:
-    """How the training of one seed ended.
+class OnlineSummary(RunSummary):
+    """The outcome of training one seed online.
 
     Attributes:
-        folder: with the policy, RUN/seed-K.
-        seed: K.
-        steps: environment steps done in all.
-        resumed_at: steps that an earlier session had done; 0 for a fresh start.
-        seconds: wall time of this session.
-        best_step: environment steps behind the best checkpoint.
-        mean_return: of the best checkpoint over fresh episodes, by which nothing was chosen.
-        score: the same where random is 0 and the pilot 1; NaN without a pilot.
-        ends: those episodes by the reason they ended.
+        best_step: Number of environment steps before the best checkpoint.
+        mean_return: Mean return of the best checkpoint on new episodes.
+        score: The mean return on the scale random = 0, pilot = 1; NaN without a pilot.
+        ends: Number of those episodes by the reason they ended.
     """
 
-    folder: Path
-    seed: int
-    steps: int
-    resumed_at: int
-    seconds: float
     best_step: int
     mean_return: float
     score: float
@@ -81,30 +68,30 @@ def train(
     resume: bool = False,
     live: LiveTraining | None = None,
     progress: ProgressCallback | None = None,
-) -> list[RunSummary]:
-    """Train in an environment; the same seed and machine give the same curve.
+) -> list[OnlineSummary]:
+    """Train in an environment; the same seed and machine produce the same curve.
 
     Args:
-        task: such as `Task.for_sim("lane")`.
-        out: the run's folder; it must not exist, or be empty.
-        seeds: how many agents to train, one after the other.
-        seed: of the first; the others count up from it.
-        record: log of every transition, written while it happens; with several seeds a folder.
-        data: logged transitions to begin the replay buffer with.
-        policy: a trained one with Q-values, whose weights to begin with; of several, each seed
-            takes another.
-        resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
-        live: shows the training to whoever connects; its layout is written into `out`.
-        progress: called now and then; None shows a bar where stderr is a terminal.
+        task: Task such as `Task.for_sim("lane")`.
+        out: Folder of the run; it must be empty or not exist.
+        seeds: Number of agents to train, one after the other.
+        seed: Seed of the first agent; agent k uses seed + k.
+        record: Log of every transition, written during the training; with several seeds a folder.
+        data: Logged transitions with which the replay buffer starts.
+        policy: Trained policy with Q-values whose weights the agents start with, or a list with one
+            for each seed.
+        resume: Whether to resume from the checkpoints in `out`. Seeds without one start at step 0.
+        live: Live view of the training; its layout is written into `out`.
+        progress: Callback for progress; None shows a bar if stderr is a terminal.
 
     Returns:
         One summary for each seed.
 
     Raises:
-        UnknownNameError: there is no such sim.
-        OutputExistsError: `out` or `record` is taken.
-        SpaceError: the algorithm cannot learn with these observations or actions.
-        PolicyError: `policy` has another network than the agent.
+        UnknownNameError: There is no such sim.
+        OutputExistsError: `out` or `record` exists.
+        SpaceError: The algorithm does not support these observations or actions.
+        PolicyError: The networks of `policy` and the agent differ.
         TrainingError: `out` cannot be written, or has a run of another task.
     """
     if seeds < 1 or seed < 0:
@@ -129,7 +116,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Run:
-    """A run folder, and what every seed in it shares."""
+    """A run folder, and the state that all its seeds share."""
 
     folder: Path
     task: Task
@@ -141,32 +128,21 @@ class _Run:
     first_seed: int
 
     def open(self, resume: bool) -> None:
-        """Make the folder, or make sure that it is this run's."""
-        self._open(resume)
+        """Create the folder, or check that it is this run's, and the folders of the logs."""
+        open_run(self.folder, self.task, resume)
+        try:
+            for path in self.logs.values():
+                path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise TrainingError(f"cannot write {error.filename}: {error.strerror}") from error
         if self.live is not None:
             write_json(self.folder / LAYOUT_NAME, self.live.stream.layout())
 
-    def _open(self, resume: bool) -> None:
-        if resume and (self.folder / CONFIG_NAME).exists():
-            self.task.check_same(read_config(self.folder), self.folder / CONFIG_NAME)
-            return
-        if self.folder.is_file() or (self.folder.is_dir() and any(self.folder.iterdir())):
-            hint = "it holds no run to resume" if resume else "or resume the run in it (--resume)"
-            raise OutputExistsError(f"{self.folder} exists: choose another folder; {hint}")
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            for path in self.logs.values():
-                path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self.folder / CONFIG_NAME, self.task.to_json())
-        except OSError as error:
-            raise TrainingError(f"cannot write {error.filename}: {error.strerror}") from error
-
     def train_seed(
         self, seed: int, selection: Scale, fresh: Scale, report: ProgressCallback, resume: bool
-    ) -> RunSummary:
-        """Train one agent and score its best checkpoint."""
-        folder = self.folder / f"seed-{seed}"
-        folder.mkdir(exist_ok=True)
+    ) -> OnlineSummary:
+        """Train one agent and evaluate its best checkpoint."""
+        folder = seed_folder(self.folder, seed)
         began_s = time.perf_counter()
         env_id = self.env.spec.id if self.env.spec else self.task.sim
         agent = Agent(
@@ -189,8 +165,9 @@ class _Run:
             episodes=self.task.config.final_episodes,
             seed=FRESH_SEED,
         )
-        return RunSummary(
+        return OnlineSummary(
             folder=folder,
+            algo=self.task.algo,
             seed=seed,
             steps=agent.model.num_timesteps,
             resumed_at=agent.resumed_at,
@@ -206,8 +183,8 @@ class _Run:
             return self.policy
         return self.policy[(seed - self.first_seed) % len(self.policy)]
 
-    def conclude(self, summaries: Sequence[RunSummary], fresh: Scale) -> None:
-        """Write the scores of all seeds, and their curves as a picture."""
+    def conclude(self, summaries: Sequence[OnlineSummary], fresh: Scale) -> None:
+        """Write the scores of all seeds, and the image of their curves."""
         seeds = {
             summary.folder.name: {
                 "best_step": summary.best_step,
@@ -222,4 +199,4 @@ class _Run:
         write_json(self.folder / SCORES_NAME, written)
         if find_spec("matplotlib") is not None:
             title = f"{self.task.algo} in {self.task.sim}"
-            curve_picture(self.folder / PICTURE_NAME, [read_run(self.folder)], title)
+            draw_curves(self.folder / IMAGE_NAME, [read_run(self.folder)], title)

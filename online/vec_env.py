@@ -1,6 +1,6 @@
-"""Batched Gymnasium environments as Stable-Baselines3 takes them, without a process for each.
+"""Batched Gymnasium environments behind the interface of Stable-Baselines3, in one process.
 
-SB3's own `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` hands all actions to
+SB3's `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` passes all actions to
 one `gymnasium.vector.VectorEnv` at once, which for the sims here is one compiled call.
 """
 
@@ -23,20 +23,20 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 class BatchedVecEnv(VecEnv):
     """A `gymnasium.vector.VectorEnv` behind SB3's interface.
 
-    At an episode's end `infos[i]` has what SB3 reads there: `terminal_observation`,
-    `TimeLimit.truncated`, and under `episode` what its `Monitor` would say; `reason` and
-    `progress_m`, too, where the environment tells them. Between ends the dicts are empty.
+    At an episode's end `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
+    `TimeLimit.truncated`, and under `episode` those of SB3's `Monitor`; also `reason` and
+    `progress_m` where the environment reports them. At other steps the dicts are empty.
 
     Attributes:
-        before_step: called with the actions (N,) before each step.
+        before_step: Callback with the actions (N,) before each step.
     """
 
     def __init__(self, env: Any) -> None:
-        """Adapt `env`, which must reset itself in the step that ends an episode.
+        """Adapt `env`, which has to reset itself in the step that ends an episode.
 
         Args:
-            env: a `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` takes a
-                list of seeds, as Gymnasium's own do.
+            env: `VectorEnv` with `metadata["autoreset_mode"]` SAME_STEP, whose `reset` accepts a
+                list of seeds, as in Gymnasium.
         """
         assert isinstance(env, VectorEnv)
         assert env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP
@@ -49,13 +49,13 @@ class BatchedVecEnv(VecEnv):
         self._began_s = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Let the next reset start environment i as `rollout` starts its episode i."""
+        """Seed the next reset of environment i as `rollout` seeds its episode i."""
         if seed is not None:
             self._seeds = [episode_seed(seed, i) for i in range(self.num_envs)]
         return self._seeds
 
     def reset(self) -> VecEnvObs:
-        """Start all episodes anew."""
+        """Start new episodes in all environments."""
         observations, _ = self.env.reset(seed=None if self._seeds[0] is None else self._seeds)
         self._reset_seeds()
         self._returns[:] = 0.0
@@ -63,13 +63,13 @@ class BatchedVecEnv(VecEnv):
         return cast(VecEnvObs, observations)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of the actions; `step_wait` does the work."""
+        """Store the actions for `step_wait`."""
         if self.before_step is not None:
             self.before_step(actions)
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments; those that end begin their next episode at once."""
+        """Step all environments; ended episodes are followed by the next one in the same step."""
         observations, rewards, terminated, truncated, batch_info = self.env.step(self._actions)
         self._returns += rewards
         self._lengths += 1
@@ -80,7 +80,7 @@ class BatchedVecEnv(VecEnv):
         return cast(VecEnvObs, observations), rewards.astype(np.float32), dones, infos
 
     def _end(self, i: int, batch_info: dict[str, Any], timed_out: bool) -> dict[str, Any]:
-        """What SB3 is told of the episode that has ended in environment i."""
+        """Return SB3's info dict for the episode that has ended in environment i."""
         final_info = batch_info["final_info"]
         monitor = {
             "r": float(self._returns[i]),
@@ -103,11 +103,11 @@ class BatchedVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the batch, once for each environment asked for."""
+        """Return an attribute of the batch, once for each of the environments."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the batch; the environments in it have none of their own."""
+        """Set an attribute of the batch; its environments have no separate attributes."""
         setattr(self.env, attr_name, value)
 
     def env_method(
@@ -123,5 +123,5 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """No single environment of the batch is wrapped."""
+        """Return False for each environment, because only the batch can be wrapped."""
         return [False] * len(list(self._get_indices(indices)))

@@ -1,4 +1,4 @@
-"""Starting with experience: a replay buffer filled from logs, weights from a trained policy."""
+"""Warm start: a replay buffer filled from logs, and weights from a trained policy."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from mcaprl.online.policy import channels_first
 from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
-"""Observations on which weights that were taken over must give the same values."""
+"""Number of observations on which copied weights have to produce the same values."""
 
 
 def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
-    """Put logged transitions into a replay buffer, before any of the agent's own.
+    """Copy logged transitions into the empty replay buffer of a model.
 
-    The buffer has a column for each environment, of steps that follow each other; the log is cut
-    into as many pieces. An episode that is cut counts as truncated there. If there are more
-    transitions than the buffer holds, the last ones are taken.
+    The buffer has a column of successive steps for each environment, so the log is split into equal
+    parts; an episode that is split counts as truncated there. If the log has more transitions than
+    the buffer, the last ones are copied.
 
     Args:
-        model: a fresh one.
-        dataset: with the spaces of the model's environment.
+        model: Fresh model.
+        dataset: Dataset with the spaces of the model's environment.
 
     Returns:
-        How many transitions were taken; a multiple of the environments.
+        Number of copied transitions, a multiple of the number of environments.
 
     Raises:
-        UsageError: the algorithm has no replay buffer, or there are too few transitions.
-        SpaceError: the spaces differ.
+        UsageError: The algorithm has no replay buffer, or there are too few transitions.
+        SpaceError: The spaces differ.
     """
     buffer = model.replay_buffer if isinstance(model, DQN) else None
     if buffer is None:
-        raise UsageError(f"{type(model).__name__} learns from no logs: it has no replay buffer")
+        raise UsageError(f"{type(model).__name__} cannot learn from logs: it has no replay buffer")
     count = buffer.frame_stack if isinstance(buffer, FrameReplayBuffer) else 1
-    shown = stacked_space(channels_first(dataset.observation_space), count)
-    _check_space("observation_space", shown, model)
+    space = stacked_space(channels_first(dataset.observation_space), count)
+    _check_space("observation_space", space, model)
     _check_space("action_space", dataset.action_space, model)
     rows = min(len(dataset) // buffer.n_envs, buffer.buffer_size)
     if rows == 0:
@@ -59,7 +59,7 @@ def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
 
 
 def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> None:
-    """Add one transition of each piece of the log."""
+    """Add one transition of each part of the log."""
     batch = dataset.batch(steps)
     timeouts = (batch.truncated | cut) & ~batch.terminated
     buffer.add(
@@ -73,50 +73,51 @@ def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> 
 
 
 def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) -> None:
-    """Give a DQN the weights of a trained Q-network, layer by layer.
+    """Copy the weights of a trained Q-network into a DQN, layer by layer.
 
     Args:
-        model: a fresh one.
-        policy: with `name`, `q_values`, and its network as an attribute.
-        space: of a single observation; on some drawn from it both must give the same values.
+        model: Fresh model.
+        policy: Policy with `name`, `q_values`, and its network as an attribute.
+        space: Space of a single observation; samples of it verify that both produce the same
+            values.
 
     Raises:
-        UsageError: the algorithm has no Q-network.
-        PolicyError: the policy has none, or one of another form.
+        UsageError: The algorithm has no Q-network.
+        PolicyError: The policy has no Q-network, or one of another architecture.
     """
     if not isinstance(model, DQN):
-        raise UsageError(f"{type(model).__name__} has no Q-values to start from a policy with")
+        raise UsageError(f"{type(model).__name__} has no Q-values to start from a policy")
     frames = getattr(policy, "frame_stack", 1)
     if stacked_space(channels_first(space), frames) != model.observation_space:
         raise PolicyError(
-            f"{policy.name} looks at {frames} observations in a row, the agent at another number:"
-            " pass --frame-stack"
+            f"{policy.name} stacks {frames} observations, the agent another number: pass"
+            " --frame-stack"
         )
-    stacks = _drawn(space, frames)
+    stacks = _sample_stacks(space, frames)
     expected = policy.q_values(stacks if frames > 1 else _first_frames(stacks))
-    given, taken = _layers(_network_of(policy)), _layers(model.q_net)
-    shapes = [tuple(layer.weight.shape) for layer in given]
-    own = [tuple(layer.weight.shape) for layer in taken]
+    theirs, ours = _layers(_network_of(policy)), _layers(model.q_net)
+    shapes = [tuple(layer.weight.shape) for layer in theirs]
+    own = [tuple(layer.weight.shape) for layer in ours]
     if shapes != own:
         raise PolicyError(
             f"{policy.name} has layers {_chain(shapes)}, the agent {_chain(own)}: pass --hidden"
         )
-    for source, target in zip(given, taken, strict=True):
+    for source, target in zip(theirs, ours, strict=True):
         target.load_state_dict(source.state_dict())
     take_plain_weights(model.q_net)
     model.q_net_target.load_state_dict(model.q_net.state_dict())
     with torch.inference_mode():
-        shown = model.policy.obs_to_tensor(joined(stacks, space))[0]
-        values = model.q_net(shown).cpu().numpy()
+        inputs = model.policy.obs_to_tensor(joined(stacks, space))[0]
+        values = model.q_net(inputs).cpu().numpy()
     if not np.allclose(values, expected, rtol=1e-4, atol=1e-4):
         raise PolicyError(
-            f"{policy.name} has a network of another form (normalised inputs, say): its weights"
-            " mean other values in the agent's network"
+            f"{policy.name} has a network of another architecture (normalized inputs, for example):"
+            " with its weights, the agent's network produces other values"
         )
 
 
-def _drawn(space: spaces.Space[Any], count: int) -> Any:
-    """Some stacks of observations of a space, to compare networks on: (B, count, *shape)."""
+def _sample_stacks(space: spaces.Space[Any], count: int) -> Any:
+    """Sample stacks (B, count, *shape) of observations to compare networks."""
     space.seed(0)
     drawn = [parts_of(space.sample()) for _ in range(_CHECKED * count)]
     columns = {key: np.stack([one[key] for one in drawn]) for key in parts_of_space(space)}
@@ -134,7 +135,7 @@ def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> N
 
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
-    """Pictures (N, height, width, channels) as SB3's networks take them; all else as it is."""
+    """Transpose images (N, height, width, channels) for SB3's networks, and nothing else."""
     if isinstance(space, spaces.Dict):
         return {key: _channels_first(values[key], part) for key, part in space.items()}
     if is_image_space(space) and channels_first(space) != space:
@@ -143,7 +144,7 @@ def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
 
 
 def _network_of(policy: Any) -> nn.Module:
-    """The module that gives a policy's Q-values."""
+    """Return the module that computes a policy's Q-values."""
     modules = [value for value in vars(policy).values() if isinstance(value, nn.Module)]
     if not modules:
         raise PolicyError(f"{policy.name} has no network to start from")
@@ -151,12 +152,12 @@ def _network_of(policy: Any) -> nn.Module:
 
 
 def _layers(network: nn.Module) -> list[Any]:
-    """The layers with weights, in the order of the flow."""
+    """Return the layers with weights, from input to output."""
     return [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
 
 
 def _chain(shapes: list[tuple[int, ...]]) -> str:
-    """Widths from the input to the output.
+    """Format the widths from the input to the output.
 
     >>> _chain([(256, 12), (6, 256)])
     '12-256-6'

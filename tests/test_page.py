@@ -15,7 +15,7 @@ import pytest
 import mcaprl
 from mcaprl.cli.curves import learning_curves
 from mcaprl.figures import new_figure, to_svg
-from mcaprl.online.curve import CurvePoint, write_curve
+from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.record.wrapper import RecordMcap

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import PolicyError, UsageError
 from mcaprl.offline.algorithms.dqn import DQNConfig
 from mcaprl.offline.algorithms.losses import q_learning_target
-from mcaprl.offline.training.run_folder import CONFIG_NAME
 from mcaprl.recorder.dataset.episode import Episode
+from mcaprl.runs import CONFIG_NAME
 
 Columns = dict[str, NDArray[Any]]
 

@@ -1,13 +1,14 @@
-"""Checkpoints: a killed run goes on from one as if it had never been killed.
+"""Checkpoints from which a killed run resumes as if it had never been killed.
 
-`checkpoint.safetensors` holds one seed's tensors (weights, target, optimiser, generator) and, in
-its header, the update it belongs to and the run's identity. They are one file because two could be
-torn apart by a kill between them.
+`checkpoint.safetensors` contains one seed's tensors (weights, target network, optimizer,
+generator) and, in its header, the number of updates and the run's identity. One file holds both,
+because a kill between two writes could separate them.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,19 @@ from torch import Tensor
 from mcaprl.errors import TrainingError
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.runs import CHECKPOINT_NAME, broken_checkpoint, check_same
 from mcaprl.tensor_files import read_tensors, write_tensors
-
-CHECKPOINT_NAME = "checkpoint.safetensors"
 
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What must be the same for a run to go on.
+    """What has to be the same for a run to be resumed.
 
     Attributes:
-        algo: the algorithm's name.
-        config: its settings.
-        data: the fingerprint of the data and their weights.
-        other_data: go on with other data all the same.
+        algo: Name of the algorithm.
+        config: Settings of the algorithm.
+        data: Fingerprint of the data and their weights.
+        other_data: Whether the run may be resumed with other data.
     """
 
     algo: str
@@ -39,34 +39,31 @@ class RunIdentity:
     other_data: bool = False
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON types."""
-        settings = {
-            k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self.config).items()
-        }
-        return {"algo": self.algo, "config": settings, "data": self.data}
+        """Return plain JSON types."""
+        return {"algo": self.algo, "config": self.config.to_json(), "data": self.data}
 
-    def check_same(self, found: dict[str, Any], where: Path) -> None:
+    def check_same(self, found: Mapping[str, Any], where: Path) -> None:
         """Compare with the identity in a file.
 
         Raises:
-            TrainingError: the file is from another run; the message names the first difference.
+            TrainingError: The file is from another run; the message names the first difference.
         """
-        mine = self.to_json()
-        for part in ("algo", "config") if self.other_data else ("algo", "config", "data"):
-            if found.get(part) != mine[part]:
-                raise TrainingError(
-                    f"cannot resume: {where} {_difference(part, found.get(part), mine[part])}"
-                )
+        check_same({"algo": self.algo, "config": self.config.to_json()}, found, where)
+        if not self.other_data and found.get("data") != self.data:
+            raise TrainingError(
+                f"cannot resume: {where} was trained on other data; resume with the same data and"
+                " weights, train into another folder, or allow other data (--other-data)"
+            )
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One seed's state, as it was read.
+    """The stored state of one seed.
 
     Attributes:
-        path: of the file.
-        step: updates done.
-        tensors: see `Learner.state`.
+        path: Path of the file.
+        step: Number of finished updates.
+        tensors: State as `Learner.state` returns it.
     """
 
     path: Path
@@ -74,28 +71,28 @@ class Checkpoint:
     tensors: dict[str, Tensor]
 
     def restore(self, learner: Learner, seed: int) -> None:
-        """Bring a fresh learner's seed to this state.
+        """Load this state into a seed of a fresh learner.
 
         Raises:
-            TrainingError: the tensors are not the learner's.
+            TrainingError: The tensors are not the learner's.
         """
         try:
             learner.load_state(seed, self.tensors, self.step)
         except (KeyError, RuntimeError) as error:
-            raise _broken(self.path, error) from error
+            raise broken_checkpoint(self.path, error) from error
 
 
 def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIdentity) -> None:
-    """Replace the folder's checkpoint by a seed's present state."""
+    """Replace the checkpoint in a folder with the current state of a seed."""
     description = {"step": learner.step, **identity.to_json()}
     write_tensors(folder / CHECKPOINT_NAME, learner.state(seed), description)
 
 
 def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
-    """The folder's checkpoint, if there is one.
+    """Read the checkpoint in a folder; None if there is none.
 
     Raises:
-        TrainingError: it is from another run, or broken.
+        TrainingError: The checkpoint is from another run, or broken.
     """
     path = folder / CHECKPOINT_NAME
     if not path.exists():
@@ -105,23 +102,4 @@ def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
         identity.check_same(description, path)
         return Checkpoint(path, int(description["step"]), tensors)
     except (OSError, SafetensorError, ValueError, KeyError) as error:
-        raise _broken(path, error) from error
-
-
-def _broken(path: Path, error: Exception) -> TrainingError:
-    return TrainingError(
-        f"cannot resume: {path} is broken ({error}); delete it to start this seed anew"
-    )
-
-
-def _difference(part: str, found: Any, expected: Any) -> str:
-    elsewhere = "resume with the same settings, or train into another folder"
-    if part == "data":
-        return (
-            "was trained on other data; resume with the same data and weights, train into another"
-            " folder, or go on with these data all the same (--other-data)"
-        )
-    if part == "config" and isinstance(found, dict):
-        name = next(k for k in [*expected, *found] if found.get(k) != expected.get(k))
-        return f"has {name} {found.get(name)}, not {expected.get(name)}; {elsewhere}"
-    return f"has {part} {found!r}, not {expected!r}; {elsewhere}"
+        raise broken_checkpoint(path, error) from error

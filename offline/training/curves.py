@@ -1,36 +1,33 @@
-"""The curves of a run as a picture: one panel for each term, one line for each seed."""
+"""Images of a run's curves: one panel for each term, one line for each seed."""
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.figures import COLORS, new_figure, save_png
-from mcaprl.offline.training.metrics import METRICS_NAME
+from mcaprl.runs import METRICS_NAME, Curve, read_curves
 
 CURVES_NAME = "curves.png"
-Curve = dict[str, NDArray[np.float64]]
 
 _COLUMNS = 3
 _LEARNED, _HELD_OUT = COLORS[:2]
 
 
 def draw_curves(folder: Path) -> Path:
-    """Write RUN/curves.png from the metrics of all its seeds; thick lines are means over seeds.
+    """Write RUN/curves.png from the metrics of all seeds; thick lines are means over seeds.
 
     Returns:
-        Its path.
+        Path of the image.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        ReportError: it cannot be written.
+        ReportError: The image cannot be written.
     """
-    curves = read_curves(folder)
-    names = _shown(curves)
+    curves = read_curves(folder, METRICS_NAME)
+    names = _drawn_terms(curves)
     rows = -(-len(names) // _COLUMNS)
     figure, panels = new_figure((4 * _COLUMNS, 2.4 * rows), rows, _COLUMNS, grid=True)
     for panel in panels.flat[len(names) :]:
@@ -44,14 +41,14 @@ def draw_curves(folder: Path) -> Path:
 
 
 def curve_figures(folder: Path) -> list[tuple[str, Any]]:
-    """The same as a small figure for each term, by its name; for pages.
+    """Return a small figure for each term with its title, for HTML pages.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
     """
-    curves = read_curves(folder)
+    curves = read_curves(folder, METRICS_NAME)
     found = []
-    for name in _shown(curves):
+    for name in _drawn_terms(curves):
         figure, axes = new_figure((4.4, 2.6))
         _draw(axes, curves, name)
         axes.set_xlabel(_legend(curves))
@@ -59,12 +56,7 @@ def curve_figures(folder: Path) -> list[tuple[str, Any]]:
     return found
 
 
-def read_curves(folder: Path) -> list[Curve]:
-    """Those of all seeds of a run; none if there are no metrics."""
-    return [read_curve(path) for path in sorted(folder.glob(f"seed-*/{METRICS_NAME}"))]
-
-
-def _shown(curves: list[Curve]) -> list[str]:
+def _drawn_terms(curves: list[Curve]) -> list[str]:
     return [name for name in curves[0] if name not in ("update", "learning_rate")] if curves else []
 
 
@@ -75,16 +67,9 @@ def _legend(curves: list[Curve]) -> str:
 def _draw(axes: Any, curves: list[Curve], name: str) -> None:
     color = _HELD_OUT if name.startswith("held_out_") else _LEARNED
     shortest = min((curve["update"] for curve in curves), key=len)
-    # A line through one point cannot be seen.
+    # A line through one point is invisible.
     marker = "o" if len(shortest) == 1 else None
     for curve in curves:
         axes.plot(curve["update"], curve[name], color=color, lw=0.7, alpha=0.5, marker=marker)
     mean = np.mean([curve[name][: len(shortest)] for curve in curves], axis=0)
     axes.plot(shortest, mean, color=color, lw=1.8, marker=marker)
-
-
-def read_curve(path: Path) -> Curve:
-    """The columns of a `metrics.csv`, by name."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}

@@ -1,4 +1,4 @@
-"""Logs that grow while one learns from them, because another process still records."""
+"""Training on logs that grow because another process still records them."""
 
 from __future__ import annotations
 
@@ -17,27 +17,26 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 CHECK_INTERVAL = 500
-"""Updates between two looks at the logs; a larger data set has to be packed anew."""
+"""Updates between two checks of the logs; a larger dataset has to be packed again."""
 _POLL_S = 0.2
 
 
 class GrowingLogs:
-    """Reads each finished episode once, and none before it is finished.
+    """A reader of growing logs that reads each episode once, after it is finished.
 
     Attributes:
-        dataset: all that was read so far, in the order of reading; a logged episode that is here
-            keeps its number.
+        dataset: Episodes read so far, in the order of reading; their numbers do not change.
     """
 
     def __init__(self, data: Sequence[str | Path], *, patience_s: float = 60.0) -> None:
-        """Wait for the first finished episode, and read what there is.
+        """Wait for the first finished episode, and read all finished ones.
 
         Args:
-            data: files, folders or globs; files that join them later are read, too.
-            patience_s: how long to wait.
+            data: Files, folders or globs; files that appear later are read as well.
+            patience_s: Longest time to wait in seconds.
 
         Raises:
-            LogError: no episode was finished in that time, or a log is damaged.
+            LogError: No episode was finished in that time, or a log is damaged.
         """
         self._data = data
         self._counts: dict[Path, int] = {}
@@ -54,7 +53,7 @@ class GrowingLogs:
             time.sleep(_POLL_S)
 
     def grow(self) -> bool:
-        """Read the episodes that were finished since the last call; whether there were any."""
+        """Read the episodes finished since the last call; return whether there were any."""
         parts = self._read_more()
         if parts:
             self.dataset = Dataset.concatenate([self.dataset, *parts])
@@ -77,12 +76,12 @@ class GrowingLogs:
 
 
 def with_more_data(learner: Learner, dataset: Dataset, never_drawn: NDArray[np.int64]) -> Learner:
-    """The same learner at the same step, on a data set that has grown.
+    """Return the same learner at the same step, on a dataset that has grown.
 
     Args:
-        learner: that goes on.
-        dataset: what it learned from, with more episodes behind.
-        never_drawn: numbers of the episodes that are held out.
+        learner: Learner to continue.
+        dataset: Its dataset with more episodes appended.
+        never_drawn: Numbers of the held-out episodes.
     """
     weights = np.ones(len(dataset.episodes))
     weights[never_drawn] = 0.0
@@ -96,9 +95,9 @@ def with_more_data(learner: Learner, dataset: Dataset, never_drawn: NDArray[np.i
 
 
 def _read_from(path: Path, first: int) -> Dataset | None:
-    """The episodes of a log from a number on; None if there are none."""
+    """Read the episodes of a log from number `first`; None if there are none."""
     with warnings.catch_warnings():
-        # That a log is still being written is no news here.
+        # The warning that a log is still being written is expected here.
         warnings.simplefilter("ignore", UserWarning)
         try:
             whole = open_logs(path, columns=[])

@@ -1,33 +1,36 @@
-"""The curve of a training run: `metrics.csv`, and the same scalars for TensorBoard."""
+"""Metrics of a training run: `metrics.csv`, TensorBoard, and the summary of each seed."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
 from mcaprl.files import write_atomically
-
-METRICS_NAME = "metrics.csv"
+from mcaprl.runs import METRICS_NAME, RunSummary
+from mcaprl.sims.evaluation.statistics import bootstrap_interval
 
 
 class MetricsWriter:
-    """Writes one row per call, and closes both files at the end of its `with` block.
+    """A writer of one row per call; a context manager that closes both files.
 
-    The CSV has columns `update`, `learning_rate` and the algorithm's terms. Values are of one
-    batch, not averages, so the same seed gives the same file.
+    The CSV has columns `update`, `learning_rate` and the algorithm's terms. Values are those of one
+    batch, not averages, so the same seed writes the same file.
     """
 
     def __init__(self, folder: Path, first_update: int) -> None:
         """Open both files in `folder`.
 
         Args:
-            folder: an existing folder.
-            first_update: of this session, from 1; later rows of an earlier session are dropped.
+            folder: Existing folder.
+            first_update: First update of this session, from 1; rows of later updates, which an
+                earlier session wrote, are dropped.
         """
         path = folder / METRICS_NAME
         kept = _rows_before(path, first_update)
@@ -63,8 +66,38 @@ class MetricsWriter:
         self._board.close()
 
 
+@dataclass(frozen=True)
+class OfflineSummary(RunSummary):
+    """The outcome of training one seed offline.
+
+    Attributes:
+        terms: Loss terms of the last update; empty if no update was left to do.
+    """
+
+    terms: dict[str, float]
+
+
+def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
+    """Return a line for each seed, and one with means and 95 % intervals over seeds."""
+    lines = []
+    for summary in summaries:
+        done = summary.steps - summary.resumed_at
+        rate = done / summary.seconds if summary.seconds else 0.0
+        terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
+        lines.append(f"{summary.folder}: {done} updates, {rate:.0f} per second; {terms}")
+    finished = [summary.terms for summary in summaries if summary.terms]
+    if len(finished) > 1:
+        means = []
+        for name in finished[0]:
+            values = np.array([[terms[name]] for terms in finished])
+            low, high = bootstrap_interval(values)
+            means.append(f"{name} {values.mean():.4g} [{low:.4g}, {high:.4g}]")
+        lines.append(f"mean of {len(finished)} seeds [95 % interval]: {', '.join(means)}")
+    return lines
+
+
 def _rows_before(path: Path, update: int) -> list[str]:
-    """The lines of the header and of earlier updates, without a row that a kill has torn."""
+    """Return the header and the rows of earlier updates, without a row cut short by a kill."""
     if update == 1 or not path.exists():
         return []
     header, *rows = path.read_text().splitlines(keepends=True)

@@ -1,11 +1,6 @@
 """Train one algorithm on one dataset, with several seeds at once, into a run folder.
 
-RUN/config.json                         algorithm, settings, data
-RUN/curves.png                          all seeds' curves, see `curves`
-RUN/seed-0/policy.json, .safetensors    see `policy`
-RUN/seed-0/checkpoint.safetensors       see `checkpoint`
-RUN/seed-0/metrics.csv                  loss terms by update; the same for TensorBoard
-RUN/seed-1/...
+`mcaprl.runs` lists the files of a run folder.
 """
 
 from __future__ import annotations
@@ -31,16 +26,13 @@ from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import (
-    CHECKPOINT_NAME,
     Checkpoint,
     RunIdentity,
     read_checkpoint,
     save_checkpoint,
 )
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
-from mcaprl.offline.training.metrics import MetricsWriter
-from mcaprl.offline.training.run_folder import RunFolder
-from mcaprl.offline.training.summary import RunSummary
+from mcaprl.offline.training.metrics import MetricsWriter, OfflineSummary
 from mcaprl.offline.training.watch import (
     HeldOut,
     choose_held_out,
@@ -49,7 +41,7 @@ from mcaprl.offline.training.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
-from mcaprl.runs import POLICY_NAME
+from mcaprl.runs import CHECKPOINT_NAME, open_run, policy_files, seed_folder
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -70,34 +62,34 @@ def train(
     follow: GrowingLogs | None = None,
     device: str = "cpu",
     progress: ProgressCallback | None = None,
-) -> list[RunSummary]:
-    """Train on a dataset; the same seed, data and machine give the same weights.
+) -> list[OfflineSummary]:
+    """Train on a dataset; the same seed, data and machine produce the same weights.
 
     Args:
-        dataset: with discrete actions.
-        algo: a name such as `cql`, with default settings, or a config such as
-            `CQLConfig(alpha=0.5)`.
-        out: the run's folder; it must not exist, or be empty.
-        seeds: how many networks to train, side by side; they do not depend on each other.
-        seed: of the first; the others count up from it.
-        weights: (E,) how often each transition of an episode is drawn, relative to others; default:
-            all alike.
-        resume: go on from the last checkpoints in `out`. What is not there yet starts afresh.
-        other_data: when resuming, go on even if the checkpoints are from other data.
-        follow: logs that `dataset` was read from and that grow; each episode that is finished
-            while the networks learn is learned from, too.
-        device: `cpu` or `cuda`: there the data and the networks are, and the updates are made.
-        progress: called with each row of metrics; None shows a bar where stderr is a terminal.
+        dataset: Dataset with discrete actions.
+        algo: Name such as `cql`, for default settings, or a config such as `CQLConfig(alpha=0.5)`.
+        out: Folder of the run; it must be empty or not exist.
+        seeds: Number of networks to train in parallel; they are independent of each other.
+        seed: Seed of the first network; network k uses seed + k.
+        weights: (E,) relative frequencies with which an episode's transitions are drawn; default:
+            all equal.
+        resume: Whether to resume from the checkpoints in `out`. Seeds without one start from
+            update 0.
+        other_data: Whether to resume even from checkpoints of other data.
+        follow: Growing logs from which `dataset` was read; episodes finished during the training
+            are added to it.
+        device: Device of the data, the networks and the updates, `cpu` or `cuda`.
+        progress: Callback for each row of metrics; None shows a bar if stderr is a terminal.
 
     Returns:
         One summary for each seed.
 
     Raises:
-        UnknownNameError: there is no such algorithm.
-        UsageError: there is no such device.
-        OutputExistsError: `out` is taken.
-        SpaceError: the algorithm cannot learn with these observations or actions.
-        TrainingError: the loss is NaN or infinite, or `out` has a run with other data or settings.
+        UnknownNameError: There is no such algorithm.
+        UsageError: There is no such device.
+        OutputExistsError: `out` exists and is not empty.
+        SpaceError: The algorithm does not support these observations or actions.
+        TrainingError: The loss is NaN or infinite, or `out` has a run with other data or settings.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
@@ -106,8 +98,7 @@ def train(
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     _check_weights(weights, len(dataset.episodes))
     identity = RunIdentity(learner_type.name, config, _fingerprint(dataset, weights), other_data)
-    source = {"env_id": dataset.env_id, "transitions": len(dataset)}
-    folder = RunFolder(Path(out), identity, source)
+    folder = Path(out)
     held_out = choose_held_out(len(weights), config.held_out)
     buffer = TransitionBuffer.from_dataset(
         dataset,
@@ -115,29 +106,31 @@ def train(
         encoder=_earlier_encoder(folder) if resume and other_data else None,
         weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
     ).to(place)
-    folder.open(resume)
+    open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
     if message := horizon_warning(config):
         warnings.warn(message, stacklevel=2)
-    run = _Run.over(folder, dataset, buffer, held_out, follow)
+    run = _Run.create(folder, identity, dataset, buffer, held_out, follow)
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
         return run.train(learner_type, range(seed, seed + seeds), report)
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What all seeds of a run share.
+    """State that all seeds of a run share.
 
     Attributes:
-        folder: of the run.
-        dataset: that it learns from.
-        buffer: the same, packed.
-        held_out: transitions to judge the networks by, if any.
-        limit: no return can be larger in size.
-        never_drawn: numbers of the held-out episodes.
-        follow: the logs, if they may grow.
+        folder: Folder of the run.
+        identity: Algorithm, settings and data of the run.
+        dataset: Training data, including held-out episodes.
+        buffer: The same data as tensors.
+        held_out: Transitions for validation, if any.
+        limit: Upper bound on the absolute value of a return.
+        never_drawn: Numbers of the held-out episodes.
+        follow: Growing logs from which the data were read, if any.
     """
 
-    folder: RunFolder
+    folder: Path
+    identity: RunIdentity
     dataset: Dataset
     buffer: TransitionBuffer
     held_out: HeldOut | None
@@ -146,42 +139,51 @@ class _Run:
     follow: GrowingLogs | None
 
     @classmethod
-    def over(
+    def create(
         cls,
-        folder: RunFolder,
+        folder: Path,
+        identity: RunIdentity,
         dataset: Dataset,
         buffer: TransitionBuffer,
         held_out: NDArray[np.int64],
         follow: GrowingLogs | None,
     ) -> _Run:
-        """A run that holds out some episodes, given by their numbers."""
+        """Create a run that holds out the episodes with these numbers."""
         gamma = buffer.packing.gamma
         watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
         limit = largest_return(dataset, gamma)
-        return cls(folder, dataset, buffer, watched, limit, held_out, follow)
+        return cls(folder, identity, dataset, buffer, watched, limit, held_out, follow)
 
     def train(
         self, learner_type: type[Learner], seeds: range, report: ProgressCallback
-    ) -> list[RunSummary]:
-        """Train seeds, side by side if their checkpoints are at the same update."""
+    ) -> list[OfflineSummary]:
+        """Train seeds, in parallel if their checkpoints are at the same update."""
         summaries = []
-        for start in _starts(self.folder, seeds):
-            learner = learner_type(self.folder.identity.config, self.buffer, list(start))
+        for start in self._starts(seeds):
+            learner = learner_type(self.identity.config, self.buffer, list(start))
             for seed, checkpoint in start.items():
                 if checkpoint is not None:
                     checkpoint.restore(learner, seed)
             summaries += self._train_learner(learner, report)
         return sorted(summaries, key=lambda summary: summary.seed)
 
-    def _train_learner(self, learner: Learner, report: ProgressCallback) -> list[RunSummary]:
-        """Make all updates that are left to a learner's seeds."""
+    def _starts(self, seeds: range) -> list[dict[int, Checkpoint | None]]:
+        """Return seeds with their checkpoints, grouped by the number of finished updates."""
+        groups: dict[int, dict[int, Checkpoint | None]] = {}
+        for seed in seeds:
+            checkpoint = read_checkpoint(seed_folder(self.folder, seed), self.identity)
+            groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
+        return list(groups.values())
+
+    def _train_learner(self, learner: Learner, report: ProgressCallback) -> list[OfflineSummary]:
+        """Run the remaining updates of a learner's seeds."""
         began, resumed_at = time.perf_counter(), learner.step
         updates, seeds = learner.config.updates, learner.seeds
         terms: list[dict[str, float]] = [{} for _ in seeds]
         warned = False
         with ExitStack() as stack:
             metrics = [
-                stack.enter_context(MetricsWriter(self.folder.of_seed(seed), learner.step + 1))
+                stack.enter_context(MetricsWriter(seed_folder(self.folder, seed), learner.step + 1))
                 for seed in (seeds if learner.step < updates else ())
             ]
             while learner.step < updates:
@@ -191,16 +193,16 @@ class _Run:
                 for seed, mine in zip(seeds, terms, strict=True):
                     report(TrainingProgress(seed, learner.step, updates, mine))
         seconds = time.perf_counter() - began
-        folders = [self.folder.of_seed(seed) for seed in seeds]
+        folders = [seed_folder(self.folder, seed) for seed in seeds]
         return [
-            RunSummary(folder, learner.name, seed, updates, resumed_at, seconds, mine)
+            OfflineSummary(folder, learner.name, seed, updates, resumed_at, seconds, mine)
             for folder, seed, mine in zip(folders, seeds, terms, strict=True)
         ]
 
     def _train_to_next_stop(
         self, learner: Learner, metrics: list[MetricsWriter]
     ) -> list[dict[str, float]]:
-        """Update until something is to be written, and write it."""
+        """Update until metrics or a checkpoint are due, and write them."""
         config = learner.config
         while True:
             terms = self._check(learner.update)
@@ -211,11 +213,11 @@ class _Run:
         self._check(learner.check)
         values = learner.seed_means(terms)
         if self.held_out is not None:
-            judged = self.held_out.terms(learner)
-            values = [mine | held for mine, held in zip(values, judged, strict=True)]
+            validated = self.held_out.terms(learner)
+            values = [mine | held for mine, held in zip(values, validated, strict=True)]
         if self.follow is not None:
-            known = {"transitions": float(len(learner.buffer))}
-            values = [mine | known for mine in values]
+            size = {"transitions": float(len(learner.buffer))}
+            values = [mine | size for mine in values]
         rate = config.learning_rate_at(learner.step - 1)
         for writer, mine in zip(metrics, values, strict=True):
             writer.write(learner.step, rate, mine)
@@ -224,7 +226,7 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """The learner, now and then with the episodes that were logged meanwhile."""
+        """Return the learner, with newly logged episodes every `CHECK_INTERVAL` updates."""
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
         return with_more_data(learner, self.follow.dataset, self.never_drawn)
@@ -232,28 +234,28 @@ class _Run:
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.
 
-        The checkpoint comes last: a kill before it costs updates, but leaves no policy behind that
-        is older than a finished run.
+        The checkpoint is last: a kill before it costs updates, but a finished run never has an
+        outdated policy.
         """
         for seed in learner.seeds:
-            folder = self.folder.of_seed(seed)
+            folder = seed_folder(self.folder, seed)
             save_policy(folder, learner, seed, self.dataset.env_id, self.dataset.env_kwargs)
-            save_checkpoint(folder, learner, seed, self.folder.identity)
+            save_checkpoint(folder, learner, seed, self.identity)
 
     def _check(self, work: Callable[[], _T]) -> _T:
-        """Do a part of the work; a loss that is not finite stops the run."""
+        """Call `work`, and report a loss that is not finite with the last good checkpoint."""
         try:
             return work()
         except NotFiniteError as error:
-            paths = sorted(self.folder.path.glob(f"seed-*/{CHECKPOINT_NAME}"))
+            paths = sorted(self.folder.glob(f"seed-*/{CHECKPOINT_NAME}"))
             good = ", ".join(map(str, paths)) or "none yet"
             raise TrainingError(
-                f"update {error.update} of {self.folder.path}: {error}. Last good checkpoint:"
+                f"update {error.update} of {self.folder}: {error}. Last good checkpoint:"
                 f" {good}. Look for huge values in the data, or lower the learning rate"
             ) from error
 
     def _warn(self, before: list[dict[str, float]], now: list[dict[str, float]]) -> bool:
-        """Tell of values that run away, once; gives whether it was told."""
+        """Warn about diverging values; return whether there was a warning."""
         for earlier, later in zip(before, now, strict=True):
             if "mean_q" not in earlier:
                 continue
@@ -263,23 +265,14 @@ class _Run:
         return False
 
 
-def _starts(folder: RunFolder, seeds: range) -> list[dict[int, Checkpoint | None]]:
-    """Seeds with their checkpoints, in groups that have done the same number of updates."""
-    groups: dict[int, dict[int, Checkpoint | None]] = {}
-    for seed in seeds:
-        checkpoint = read_checkpoint(folder.of_seed(seed), folder.identity)
-        groups.setdefault(checkpoint.step if checkpoint else 0, {})[seed] = checkpoint
-    return list(groups.values())
-
-
-def _earlier_encoder(folder: RunFolder) -> ObservationEncoder | None:
-    """The normalisation that the weights in a folder are used to."""
-    policies = sorted(folder.path.glob(f"seed-*/{POLICY_NAME}"))
+def _earlier_encoder(folder: Path) -> ObservationEncoder | None:
+    """Return the normalization with which the weights in a run folder were trained."""
+    policies = policy_files(folder)
     return read_policy(policies[0].parent).encoder if policies else None
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Of the data, and of their weights where these differ."""
+    """Return a hash of the data, and of their weights where these differ."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()
@@ -287,6 +280,4 @@ def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
 
 def _check_weights(weights: NDArray[np.float64], n_episodes: int) -> None:
     if weights.shape != (n_episodes,) or not np.isfinite(weights).all() or (weights < 0).any():
-        raise UsageError(
-            f"weights must be {n_episodes} numbers of at least 0, one for each episode"
-        )
+        raise UsageError(f"weights must be {n_episodes} numbers of at least 0, one per episode")

@@ -1,6 +1,6 @@
-"""What is watched while learning: episodes held out, and signs that values go astray.
+"""Validation while training: held-out episodes, and warnings about diverging values.
 
-Values are compared with what really came: the discounted sum of rewards behind each transition.
+Values are compared with the discounted sum of rewards that followed each transition.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 MAX_ROWS = 256
-"""Transitions that are judged each time, spread evenly over the episodes held out."""
-MIN_REACH = 0.3
-"""Below this part of an endless return, values can hardly tell a good action from a bad one."""
+"""Number of transitions per validation, spread evenly over the held-out episodes."""
+MIN_HORIZON_FRACTION = 0.3
+"""Below this fraction of an infinite return, values hardly distinguish good from bad actions."""
 MAX_EXCESS = 2.0
-"""So many times the largest possible return, and a value has run away."""
+"""Ratio of a mean value to the largest possible return above which values diverge."""
 _CUT_OFF = 0.05
-"""What is missing behind a truncated episode may count so much of its worth, and not more."""
+"""Largest weight of the rewards missing after a truncated episode."""
 
 
 class HeldOut:
-    """Some transitions of episodes that are not learned from."""
+    """Transitions of held-out episodes, for validation."""
 
     def __init__(
         self, dataset: Dataset, buffer: TransitionBuffer, episodes: NDArray[np.int64], gamma: float
@@ -38,10 +38,10 @@ class HeldOut:
         """Choose the transitions.
 
         Args:
-            dataset: all of it.
-            buffer: all of it, packed.
-            episodes: numbers of the episodes held out.
-            gamma: discount.
+            dataset: All episodes.
+            buffer: The same episodes as tensors.
+            episodes: Numbers of the held-out episodes.
+            gamma: Discount.
         """
         lengths = dataset.episode_lengths
         rows = np.flatnonzero(np.isin(np.repeat(np.arange(len(lengths)), lengths), episodes))
@@ -55,20 +55,20 @@ class HeldOut:
         self.mean_return = float(returns[chosen].mean())
 
     def terms(self, learner: Learner) -> list[dict[str, float]]:
-        """What each seed's networks make of these transitions, by names that begin `held_out_`."""
+        """Return the terms of each seed on these transitions, with the prefix `held_out_`."""
         seeds = len(learner.seeds)
         with torch.no_grad():
-            judged = learner.judge(self._buffer.batch(self._rows.repeat(seeds)))
-        means = learner.seed_means({f"held_out_{name}": term for name, term in judged.items()})
+            terms = learner.judge(self._buffer.batch(self._rows.repeat(seeds)))
+        means = learner.seed_means({f"held_out_{name}": term for name, term in terms.items()})
         has_values = "q" in learner.models and math.isfinite(self.mean_return)
         known = {"held_out_return": self.mean_return} if has_values else {}
         return [{**mine, **known} for mine in means]
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Numbers of about `fraction` of the episodes: at least one of ten or more, never all.
+    """Choose about `fraction` of the episodes: at least one of ten or more, never all.
 
-    The choice depends on the number of episodes alone, so it is the same for all seeds.
+    The choice depends only on the number of episodes, so it is the same for all seeds.
     """
     count = round(fraction * n_episodes)
     if fraction > 0 and n_episodes >= 10:
@@ -80,16 +80,16 @@ def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
 def monte_carlo_returns(
     dataset: Dataset, episodes: NDArray[np.int64], gamma: float
 ) -> NDArray[np.float64]:
-    """The discounted sum of rewards from each transition of some episodes to their ends.
+    """Return the discounted sum of rewards from each transition to the end of its episode.
 
     Args:
-        dataset: of all episodes.
-        episodes: numbers of those that are asked for, rising.
-        gamma: discount.
+        dataset: All episodes.
+        episodes: Numbers of the requested episodes, ascending.
+        gamma: Discount.
 
     Returns:
-        As many as these episodes have transitions; NaN where an episode was truncated so soon that
-        what is missing may count for more than 5 %.
+        One sum for each transition of these episodes; NaN where rewards after a truncation would
+        have a weight above 5 %.
     """
     returns = []
     ends = np.cumsum(dataset.episode_lengths)
@@ -107,35 +107,35 @@ def monte_carlo_returns(
 
 
 def largest_return(dataset: Dataset, gamma: float) -> float:
-    """No discounted sum of rewards like these is larger in size."""
+    """Return an upper bound on the absolute value of a discounted sum of these rewards."""
     longest = float(dataset.episode_lengths.max())
     steps = longest if gamma == 1 else 1 / (1 - gamma)
     return float(np.abs(dataset.rewards).max()) * steps
 
 
 def horizon_warning(config: TrainingConfig) -> str | None:
-    """What to say of settings that leave values no time to learn what is far ahead."""
-    if not isinstance(config, BootstrapConfig) or config.reach >= MIN_REACH:
+    """Return a warning about settings with too few target updates for their horizon, if any."""
+    if not isinstance(config, BootstrapConfig) or config.horizon_fraction >= MIN_HORIZON_FRACTION:
         return None
-    copies = config.updates // config.target_interval
+    target_updates = config.updates // config.target_interval
     return (
-        f"{copies} copies into the target network in {config.updates} updates: values can reach"
-        f" {config.reach:.0%} of what gamma {config.gamma} looks ahead to; lower target_interval"
-        " or gamma, or give more updates or n_steps"
+        f"{target_updates} updates of the target network in {config.updates} updates: values cover"
+        f" {config.horizon_fraction:.0%} of the horizon of gamma {config.gamma}; lower"
+        " target_interval or gamma, or raise updates or n_steps"
     )
 
 
 def divergence_warning(before: float, value: float, limit: float) -> str | None:
-    """What to say of values beyond twice the largest possible return that go on growing.
+    """Return a warning about growing values beyond twice the largest possible return, if any.
 
     Args:
-        before: mean value of an earlier batch; fresh networks may begin anywhere.
-        value: mean value of this one.
-        limit: the largest possible return.
+        before: Mean value of an earlier batch; fresh networks may start anywhere.
+        value: Mean value of this batch.
+        limit: Largest possible return.
     """
     if abs(value) <= max(MAX_EXCESS * limit, 1.0) or abs(value) <= abs(before):
         return None
     return (
-        f"values diverge: the mean of a batch is {value:.4g}, and no return can be beyond"
+        f"values diverge: the mean of a batch is {value:.4g}, and no return can exceed"
         f" {limit:.4g}; lower the learning rate, or raise target_interval or alpha"
     )

@@ -263,7 +263,7 @@ def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
     more = ["--resume", "--updates", "30"]
     assert "has updates 20" in fails_after(capsys, 1, *train, *more)
     Path("run/config.json").write_text("[]")
-    assert "no JSON object" in fails_after(capsys, 1, *train, "--resume")
+    assert "not a JSON object" in fails_after(capsys, 1, *train, "--resume")
 
 
 def test_check_goes_on_behind_a_missing_file(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
 from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
-from mcaprl.online.sim_settings import SIM_SETTINGS, settings_for
+from mcaprl.online.presets import SIM_SETTINGS, settings_for
 from mcaprl.online.task import Task
 from mcaprl.settings import field_help
 from mcaprl.sims import SIMS

@@ -113,7 +113,7 @@ def test_dicts_are_understood(tmp_path: Path) -> None:
     expected = model.predict(observations, deterministic=True)[0]
     np.testing.assert_array_equal(policy.act(observations), expected)
     model.save(tmp_path / "sb3.zip")
-    with pytest.raises(PolicyError, match="observation space is no Box"):
+    with pytest.raises(PolicyError, match="observation space is not a Box"):
         read_policy(tmp_path / "sb3.zip")
 
 
@@ -170,7 +170,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
     read_policy(rewrite(path, tmp_path / "bare.zip", data=text, mcaprl_json=None))
     weights = io.BytesIO()
     torch.save({"q_net.q_net.0.weight": Bomb()}, weights)
-    with pytest.raises(PolicyError, match="no plain tensors"):
+    with pytest.raises(PolicyError, match="not plain tensors"):
         read_policy(rewrite(path, tmp_path / "weights.zip", policy_pth=weights.getvalue()))
     assert not ran.exists()
 
@@ -178,14 +178,14 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        ({"policy_pth": None}, "is no model of Stable-Baselines3: .*policy.pth"),
-        ({"data": None}, "is no model of Stable-Baselines3: .*data"),
+        ({"policy_pth": None}, "is not a model of Stable-Baselines3: .*policy.pth"),
+        ({"data": None}, "is not a model of Stable-Baselines3: .*data"),
         ({"data": b"{"}, "cannot read the model"),
-        ({"data": b"[]"}, "its parts are of other kinds"),
-        ({"policy_pth": b"PK"}, "cannot read the model|no plain tensors"),
-        ({"mcaprl_json": b'{"format_version": 9}'}, "format_version 9 is not known"),
+        ({"data": b"[]"}, "its parts have other types"),
+        ({"policy_pth": b"PK"}, "cannot read the model|not plain tensors"),
+        ({"mcaprl_json": b'{"format_version": 9}'}, "format_version 9 is not supported"),
         ({"mcaprl_json": b'{"format_version": 1}'}, "cannot load the policy .* KeyError"),
-        ({"mcaprl_json": None, "data": b"{}"}, "observation space is no Box"),
+        ({"mcaprl_json": None, "data": b"{}"}, "observation space is not a Box"),
     ],
 )
 def test_broken_files_are_told_in_one_line(
@@ -230,7 +230,7 @@ def test_unknown_networks_are_refused(tmp_path: Path) -> None:
 
 def test_observations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     policy = read_policy(ours(tmp_path / "model.zip", dqn(), gym.make("CartPole-v1")))
-    with pytest.raises(PolicyError, match="does not take these observations"):
+    with pytest.raises(PolicyError, match="does not accept these observations"):
         policy.act(np.zeros((1, 5), dtype=np.float32))
 
 

@@ -22,11 +22,11 @@ from mcaprl.cli import run
 from mcaprl.errors import TrainingError
 from mcaprl.offline.training.follow import GrowingLogs
 from mcaprl.online.agent import Agent
-from mcaprl.online.curve import read_curve
 from mcaprl.online.evaluation import Scale
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
+from mcaprl.runs import read_curve
 
 SHORT: dict[str, Any] = {
     "steps": 2_000,
@@ -107,8 +107,8 @@ def test_a_stopped_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
         train(task, tmp_path / "run", progress=stop_at(1_000))
     (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (800, 2_000)
-    points = read_curve(summary.folder / "curve.csv")
-    assert [point.step for point in points] == [400, 800, 1_200, 1_600, 2_000]
+    curve = read_curve(summary.folder / "curve.csv")
+    assert curve["step"].tolist() == [400, 800, 1_200, 1_600, 2_000]
     names = sorted(path.name for path in summary.folder.glob("progress*"))
     assert names == ["progress-from-800.csv", "progress.csv"]
 
@@ -221,16 +221,16 @@ def test_a_broken_checkpoint_is_told(tmp_path: Path) -> None:
     train(task, tmp_path / "run", progress=silent)
     path = tmp_path / "run" / "seed-0" / "checkpoint.safetensors"
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(TrainingError, match=r"is broken .* delete it to start this seed anew"):
+    with pytest.raises(TrainingError, match=r"is broken .* delete it to restart this seed"):
         train(task, tmp_path / "run", resume=True, progress=silent)
 
 
 def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"algo": "cql", "config": {}}))
-    with pytest.raises(TrainingError, match="is of no online run"):
+    with pytest.raises(TrainingError, match="is not of an online run"):
         Task.of_run(tmp_path)
     (tmp_path / "config.json").write_text("[]")
-    with pytest.raises(TrainingError, match="is no JSON object"):
+    with pytest.raises(TrainingError, match="is not a JSON object"):
         Task.of_run(tmp_path)
 
 

@@ -252,7 +252,7 @@ def test_ppo_begins_with_neither(logs: Path, tmp_path: Path) -> None:
     task = Task.for_sim("lane", "ppo", steps=64, envs=4, rollout_steps=64)
     begun = Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))
     with closing(begun):
-        with pytest.raises(UsageError, match="PPO learns from no logs"):
+        with pytest.raises(UsageError, match="PPO cannot learn from logs"):
             begun.start_from(mcaprl.open(logs), None)
         with pytest.raises(UsageError, match="PPO has no Q-values"):
             begun.start_from(None, object())

@@ -48,17 +48,17 @@ def test_a_dueling_network_needs_a_hidden_layer() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "reach"),
+    ("settings", "fraction"),
     [
-        # Two copies of one step each: 1 + .5 of 2 rewards.
+        # Two target updates of one step each: 1 + .5 of 2 rewards.
         ({"updates": 20, "target_interval": 10, "gamma": 0.5}, 0.75),
         ({"updates": 20, "target_interval": 10, "gamma": 0.5, "n_steps": 2}, 1 - 0.5**4),
         ({"updates": 20, "target_interval": 10, "gamma": 0.0}, 1.0),
         ({"updates": 20, "target_interval": 10, "gamma": 1.0}, 0.0),
     ],
 )
-def test_how_far_values_reach(settings: dict[str, Any], reach: float) -> None:
-    assert DQNConfig(**settings).reach == pytest.approx(reach)
+def test_the_covered_fraction_of_the_horizon(settings: dict[str, Any], fraction: float) -> None:
+    assert DQNConfig(**settings).horizon_fraction == pytest.approx(fraction)
 
 
 def test_configs_cannot_be_changed() -> None:

@@ -17,10 +17,10 @@ from mcaprl.cli import run
 from mcaprl.errors import LogError
 from mcaprl.offline.algorithms.cql import CQL, CQLConfig
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.training.curves import read_curve
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.training.train import train
 from mcaprl.progress import TrainingProgress
+from mcaprl.runs import read_curve
 from mcaprl.sims.evaluation.rollout import EpsilonGreedy, run_episode
 from tests.support.paths import ROOT
 

@@ -26,11 +26,12 @@ from mcaprl.offline.algorithms.cql import CQLConfig
 from mcaprl.offline.algorithms.dqn import DoubleDQNConfig, DQNConfig
 from mcaprl.offline.algorithms.iql import IQLConfig
 from mcaprl.offline.policy import read_policy
-from mcaprl.offline.training.curves import draw_curves, read_curve
-from mcaprl.offline.training.summary import describe_seeds
+from mcaprl.offline.training.curves import draw_curves
+from mcaprl.offline.training.metrics import describe_seeds
 from mcaprl.offline.training.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.runs import read_curve
 from tests.support.offline_tasks import corridor, crossing
 from tests.support.paths import ROOT
 
@@ -92,7 +93,7 @@ def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
 def test_a_run_folder_has_settings_policy_checkpoint_and_curve(tmp_path: Path) -> None:
     (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
     assert summary.folder == tmp_path / "run" / "seed-0"
-    assert (summary.algo, summary.seed, summary.updates, summary.resumed_at) == ("cql", 0, 100, 0)
+    assert (summary.algo, summary.seed, summary.steps, summary.resumed_at) == ("cql", 0, 100, 0)
     assert summary.seconds > 0
     names = {path.name for path in summary.folder.iterdir()}
     assert names > {"policy.json", "policy.safetensors", "checkpoint.safetensors", "metrics.csv"}
@@ -169,7 +170,7 @@ def test_a_stopped_run_resumes_bit_for_bit(tmp_path: Path, stop: int, config: An
         train(corridor(), config, tmp_path / "cut", progress=StopAt(stop))
     (summary,) = train(corridor(), config, tmp_path / "cut", resume=True, progress=silent)
     assert summary.resumed_at == {20: 0, 40: 40, 70: 40, 100: 100}[stop]
-    assert summary.updates == 100
+    assert summary.steps == 100
     assert_same_result(tmp_path / "cut", tmp_path / "whole")
 
 
@@ -315,7 +316,7 @@ def test_a_folder_of_other_things_is_left_alone(tmp_path: Path, resume: bool) ->
 
 def test_resuming_what_never_began_begins_it(tmp_path: Path) -> None:
     (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
-    assert (summary.resumed_at, summary.updates) == (0, 100)
+    assert (summary.resumed_at, summary.steps) == (0, 100)
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path: Path) -> None:

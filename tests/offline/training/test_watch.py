@@ -62,7 +62,9 @@ def test_about_a_twentieth_of_the_episodes_is_held_out(episodes: int, count: int
 
 def test_too_few_copies_for_the_horizon_are_told(tmp_path: Path) -> None:
     config = replace(SHORT_CQL, gamma=0.99)
-    with pytest.warns(UserWarning, match="3 copies .* 3% of what gamma 0.99 looks ahead to"):
+    with pytest.warns(
+        UserWarning, match="3 updates of the target network .* 3% of the horizon of gamma 0.99"
+    ):
         train(corridor(), config, tmp_path / "run", progress=silent)
 
 
@@ -74,7 +76,7 @@ def test_values_that_run_away_are_told_once(tmp_path: Path) -> None:
         train(data, replace(config, target_interval=1), tmp_path / "run", progress=silent)
     (warning,) = caught
     # Every step pays 1, so no return is above 1 / (1 - .99).
-    assert "beyond 100;" in str(warning.message)
+    assert "exceed 100;" in str(warning.message)
 
 
 @pytest.mark.parametrize(
