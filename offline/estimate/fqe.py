@@ -20,9 +20,9 @@ from typing import ClassVar
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner, Losses
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import chosen, expected_sarsa_target, square_regression
-from mcaprl.offline.algorithms.target import outputs_everywhere
+from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import Batch, Packing, TransitionBuffer
 
 SYNCS_PER_HORIZON = 5.0
@@ -83,7 +83,7 @@ class FQE(Learner):
         """
         super().__init__(config, buffer, seeds)
         self.pi_t = pi_t
-        self.target = self.add_target("q", config.target_interval)
+        self.target_network = self.add_target_network("q", config.target_interval)
         rewards, _ = buffer.returns
         drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
         self.low, self.high = reachable(drawn, config.gamma)
@@ -92,19 +92,18 @@ class FQE(Learner):
         """A value for each action."""
         return {"q": (self.n_actions,)}
 
-    def losses(self, batch: Batch) -> Losses:
-        """Half the squared temporal difference."""
-        q_tm1 = self.learn("q", batch.observations)
-        q_t = self.target.outputs(batch).clamp(self.low, self.high)
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return half the squared temporal difference."""
+        q_tm1 = self.outputs("q", batch.observations)
+        q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
         pi_t = self.pi_t.index_select(0, batch.rows)
         target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
         td_loss = square_regression(q_tm1, batch.actions, target_tm1)
-        q_a_tm1 = chosen(q_tm1, batch.actions)
-        return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
+        return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 
     def values(self, *, next_states: bool) -> Tensor:
         """(N, A) the first seed's values of the buffer's states, or next states, within reach."""
-        everywhere = outputs_everywhere(self.models["q"], self.buffer, next_states=next_states)
+        everywhere = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
         return everywhere[: len(self.buffer)].clamp(self.low, self.high)
 
 

@@ -160,21 +160,22 @@ def test_looking_up_the_target_is_the_same_as_computing_it(
         learner.buffer.sample_rows(64 * len(seeds), torch.Generator().manual_seed(0))
     )
     if isinstance(learner, IQL):
-        target, seen = learner.copies["q_twin"], batch.observations
+        target, seen = learner.target_networks["q_twin"], batch.observations
     else:
         assert isinstance(learner, DQN)
-        target, seen = learner.target, batch.next_observations
-    torch.testing.assert_close(target.outputs(batch), target.model(seen))
+        target, seen = learner.target_network, batch.next_observations
+    with torch.no_grad():
+        torch.testing.assert_close(target.outputs(batch), target.model(seen))
 
 
-def test_the_target_stands_still_between_two_copies() -> None:
+def test_the_target_network_is_constant_between_two_syncs() -> None:
     learner = learner_of(DQNConfig(**{**SMALL_Q, "target_interval": 5}), corridor())
     assert isinstance(learner, DQN)
     batch = learner.buffer.sample(16, torch.Generator().manual_seed(0))
-    seen = [learner.target.outputs(batch)]
+    seen = [learner.target_network.outputs(batch)]
     for _ in range(10):
         learner.update()
-        seen.append(learner.target.outputs(batch))
+        seen.append(learner.target_network.outputs(batch))
     changes = [not torch.equal(before, after) for before, after in pairwise(seen)]
     assert changes == [False, False, False, False, True] * 2
 
