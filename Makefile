@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # Whatever of these changes, the environments are set up anew.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test faults fuzz check bench bench-learning bench-gpu sim-grid docs wheel clean
+.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs wheel clean
 
 help:
 	@echo "make demo    record a car, learn from its log offline, evaluate, make the replay"
@@ -17,7 +17,6 @@ help:
 	@echo "make check   format, lint, types, and the direction of imports"
 	@echo "make bench   measure speed against other libraries, as ratios"
 	@echo "make bench-learning   the same of learning and off-policy estimates, beside d3rlpy, SB3, SCOPE-RL"
-	@echo "make bench-gpu   updates per second on a GPU, and the share of what it can do"
 	@echo "make sim-grid    learn offline from six logs of each sim, four seeds; it takes long, and goes on if stopped"
 	@echo "make docs    write docs/cli.md and the pictures of the docs anew"
 	@echo "make wheel   build the wheel and try it, bare, in an environment of its own"
@@ -52,9 +51,6 @@ bench-learning: $(VENV)/.rivals
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.learning
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.off_policy
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.cartpole_grid $(VENV)/cartpole
-
-bench-gpu: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.gpu
 
 sim-grid: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.sim_grid $(VENV)/sim-grid

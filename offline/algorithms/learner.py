@@ -124,7 +124,7 @@ class Learner(ABC):
         if not math.isfinite(loss.item()):
             raise self._not_finite(self.seed_means(terms))
         self.optimizer.zero_grad()
-        (loss / size).backward()
+        torch.autograd.backward(loss / size)
         self.optimizer.param_groups[0]["lr"] = self.config.learning_rate_at(self.step)
         self.optimizer.step()
         self.step += 1
@@ -173,10 +173,8 @@ class Learner(ABC):
     def state(self, seed: int) -> dict[str, Tensor]:
         """Return all state of a seed except `step`: weights, optimizer moments, generator."""
         k = self.seeds.index(seed)
-        tensors = {
-            f"{name}.weights": model.weights.detach()[k]
-            for name, model in self.all_models().items()
-        }
+        models = self.all_models()
+        tensors = {f"{name}.weights": models[name].weights.detach()[k] for name in models}
         for name, model in self.models.items():
             moments = self.optimizer.state[model.weights]
             tensors |= {f"{name}.{moment}": moments[moment][k] for moment in _MOMENTS}

@@ -137,11 +137,10 @@ def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Ten
     _check_shape("target_tm1", target_tm1, (len(z_tm1), n_quantiles))
     tau = (torch.arange(n_quantiles, device=z_tm1.device) + 0.5) / n_quantiles
     # (B, quantile i, sample j)
-    quantiles, samples = torch.broadcast_tensors(
-        chosen(z_tm1, a_tm1).unsqueeze(2), target_tm1.unsqueeze(1)
-    )
+    quantiles = chosen(z_tm1, a_tm1).unsqueeze(2).expand(-1, -1, n_quantiles)
+    samples = target_tm1.unsqueeze(1).expand_as(quantiles)
     weight = (tau.unsqueeze(1) - (quantiles > samples).float()).abs()
-    loss = functional.huber_loss(quantiles, samples, reduction="none")
+    loss: Tensor = functional.huber_loss(quantiles, samples, reduction="none")
     return (weight * loss).mean(2).sum(1)
 
 

@@ -46,7 +46,7 @@ class Model(ABC):
         device = next(iter(parameters.values())).device
         self.weights = torch.zeros(len(networks), sum(self._sizes), device=device)
         for row, network in zip(self.weights, networks, strict=True):
-            parts = zip(network.parameters(), row.split(self._sizes), strict=False)
+            parts = zip(network.parameters(), row.split_with_sizes(self._sizes), strict=False)
             for parameter, part in parts:
                 part.copy_(parameter.detach().flatten())
                 parameter.data = part.view_as(parameter)
@@ -72,7 +72,7 @@ class AnyModel(Model):
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
         """Compute one network with the weights of a row, so that autograd sees the matrix."""
-        parts = zip(self._names, self._shapes, row.split(self._sizes), strict=False)
+        parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
         return cast(Tensor, functional_call(network, weights, (observations,)))
 
@@ -103,7 +103,7 @@ class StackedMLP(Model):
         if count == 1:
             # Products with a vector have other bits for one seed than for several.
             columns = columns.expand(-1, -1, 2)
-        parts = self.weights.split(self._sizes, 1)[:-1]
+        parts = self.weights.split_with_sizes(self._sizes, 1)[:-1]
         last = len(parts) // 2 - 1
         for layer, (matrix, bias) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
             matrices = matrix.view(seeds, *self._shapes[2 * layer])

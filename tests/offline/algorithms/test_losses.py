@@ -9,7 +9,7 @@ from typing import Any
 import hypothesis.strategies as st
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from numpy import float32, int64
 from numpy.typing import NDArray
@@ -193,8 +193,8 @@ def test_likely_actions_are_measured_by_the_likeliest() -> None:
 
 
 def losses_to_check() -> dict[str, tuple[Callable[[Tensor], Tensor], tuple[int, ...]]]:
-    a_tm1, target = torch.tensor([0, 2, 1, 1]), torch.tensor([0.3, -4.0, 2.0, 0.0])
-    samples = torch.linspace(-3, 3, 20).view(4, 5)
+    a_tm1, target = torch.tensor([0, 2, 1, 1]), torch.tensor([0.3, -4.0, 2.0, 0.0]).double()
+    samples = torch.linspace(-3, 3, 20).double().view(4, 5)
     return {
         "huber": (lambda q: huber_regression(q, a_tm1, target), (4, 3)),
         "square regression": (lambda q: square_regression(q, a_tm1, target), (4, 3)),
@@ -207,6 +207,7 @@ def losses_to_check() -> dict[str, tuple[Callable[[Tensor], Tensor], tuple[int, 
 
 
 @pytest.mark.parametrize("name", losses_to_check())
+@settings(max_examples=25)
 @given(data=st.data())
 def test_gradients_are_finite_differences(name: str, data: st.DataObject) -> None:
     loss_of, shape = losses_to_check()[name]

@@ -110,7 +110,7 @@ def networks(count: int, hidden: tuple[int, ...] = (32, 16)) -> list[Network]:
 
 def gradients(model: Model, observations: Observations, d_output: Tensor) -> tuple[Tensor, Tensor]:
     outputs = model(observations)
-    outputs.backward(d_output)
+    torch.autograd.backward(outputs, d_output)
     assert model.weights.grad is not None
     return outputs.detach(), model.weights.grad
 
