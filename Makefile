@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test faults fuzz check bench bench-learning bench-gpu sim-grid docs wheel clean
+.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
@@ -17,7 +17,6 @@ help:
 	@echo "make check            check format, lint, words, types and import contracts"
 	@echo "make bench            measure speed relative to other libraries"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
-	@echo "make bench-gpu        measure updates per second on a GPU, and the share of its peak"
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
 	@echo "make docs             generate docs/cli.md and the images of the docs"
 	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
@@ -53,9 +52,6 @@ bench-learning: $(VENV)/.rivals
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.learning
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.off_policy
 	OMP_NUM_THREADS=1 $(VENV)/rivals/bin/python -m benchmarks.cartpole_grid $(VENV)/cartpole
-
-bench-gpu: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.gpu
 
 sim-grid: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.sim_grid $(VENV)/sim-grid

@@ -18,16 +18,19 @@ class _TrainCommand(click.Command):
     """Has an option for each setting of the algorithms; loads them when it is asked for options."""
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
-        from mcaprl.offline.algorithms.registry import ALGORITHMS
+        from mcaprl.offline.algorithms.registry import all_algorithms
 
-        configs = [learner.config_type() for learner in ALGORITHMS.values()]
+        configs = [learner.config_type() for learner in all_algorithms().values()]
         return [*super().get_params(ctx), *setting_options(configs)]
 
 
 @click.command(cls=_TrainCommand)
 @click.argument("data", nargs=-1, required=True, metavar="DATA...")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to make.")
-@click.option("--algo", help="dqn, double-dqn, cql, bc, bcq or iql.  [default: cql]")
+@click.option(
+    "--algo",
+    help="dqn, double-dqn, cql, bc, bcq, iql, or an installed package's.  [default: cql]",
+)
 @click.option(
     "--seeds",
     default=1,
@@ -49,7 +52,7 @@ class _TrainCommand(click.Command):
     "--device",
     default="cpu",
     show_default=True,
-    help="cpu, or cuda: data and networks on the GPU, each update one CUDA graph.",
+    help="Device of data and networks: cpu or cuda.",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Learn from logs that are still being written, too.")

@@ -1,7 +1,7 @@
-"""Behavior cloning: choose in each situation what the log chose most often.
+"""Behavior cloning: take the action that the log takes most often in a state.
 
-It reads no reward, and is hard to beat where the log is good: the mark to hold every algorithm
-against that does. See Pomerleau, "ALVINN: An Autonomous Land Vehicle in a Neural Network", 1988.
+It reads no reward, and is hard to beat on good logs: the baseline for algorithms that do. See
+Pomerleau, "ALVINN: An Autonomous Land Vehicle in a Neural Network", 1988.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from torch import Tensor
+
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner, Losses
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import cross_entropy
 from mcaprl.offline.batches.buffer import Batch
 
@@ -21,7 +23,7 @@ class BCConfig(TrainingConfig):
 
 
 class BC(Learner):
-    """A classifier of actions; its softmax estimates the policy that acted in the log."""
+    """A classifier of actions; its softmax estimates the behavior policy of the log."""
 
     name = "bc"
     config_type: ClassVar[type[TrainingConfig]] = BCConfig
@@ -30,12 +32,11 @@ class BC(Learner):
     config: BCConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """A logit for each action."""
+        """Return one logit per action."""
         return {"logits": (self.n_actions,)}
 
-    def losses(self, batch: Batch) -> Losses:
-        """The cross entropy, and how often the likeliest action is the logged one."""
-        logits_tm1 = self.learn("logits", batch.observations)
-        right = logits_tm1.argmax(1) == batch.actions
-        loss = cross_entropy(logits_tm1, batch.actions)
-        return Losses({"accuracy": right.float(), "loss": loss.value}, {"logits": loss.slope})
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the cross entropy, and whether the most likely action is the logged one."""
+        logits_tm1 = self.outputs("logits", batch.observations)
+        correct = logits_tm1.argmax(1) == batch.actions
+        return {"accuracy": correct.float(), "loss": cross_entropy(logits_tm1, batch.actions)}

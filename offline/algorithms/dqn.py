@@ -1,15 +1,15 @@
-"""DQN and Double DQN on a fixed data set.
+"""DQN and Double DQN on a fixed dataset.
 
     DQN         https://doi.org/10.1038/nature14236   target r + gamma max_a Q'(s', a)
     Double DQN  https://arxiv.org/abs/1509.06461      target r + gamma Q'(s', argmax_a Q(s', a))
     quantiles   https://arxiv.org/abs/1710.10044      Q is the mean of `n_quantiles` learned ones
 
-Q is the network that learns, Q' a copy of it renewed every `target_interval` updates.
+Q is the learning network, Q' the target network, synced every `target_interval` updates.
 
 Departures from the papers: the data are a log and not a growing replay buffer, so there is no
-exploration; Adam takes the place of RMSProp; the learning rate falls to almost nothing, because no
-new data come that a large one would help to follow. Neither algorithm knows which actions the log
-never shows, and both overrate them: they are the baseline that CQL mends.
+exploration; Adam replaces RMSProp; the learning rate decays to almost 0, because no new data
+arrive that a large one would help to follow. Both algorithms overestimate actions that the log
+never shows: they are the baselines of CQL.
 """
 
 from __future__ import annotations
@@ -18,19 +18,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner, Losses
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import (
-    Loss,
     allowed_only,
     chosen,
     double_q_learning_target,
-    huber_regression,
     mean_values,
     q_learning_target,
-    quantile_regression,
+    temporal_difference_loss,
 )
 from mcaprl.offline.algorithms.networks import Architecture
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
@@ -41,19 +40,19 @@ class DQNConfig(BootstrapConfig):
     """Settings of DQN."""
 
     dueling: bool = False
-    """learn the value of a state apart from the advantages of its actions"""
+    """learn the value of a state separately from the advantages of its actions"""
     n_quantiles: int = 1
-    """learn so many quantiles of the return, and act by their mean; 1 learns the mean alone"""
+    """number of quantiles of the return; the policy acts by their mean; 1 learns the mean alone"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse invalid settings."""
         super().__post_init__()
         self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
 
     @property
     def architecture(self) -> Architecture:
-        """What networks look like."""
+        """The shape of the networks."""
         return replace(super().architecture, dueling=self.dueling)
 
 
@@ -72,64 +71,48 @@ class DQN(Learner):
     config: DQNConfig
 
     def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
-        """Start with random weights, and the same ones as target."""
+        """Initialize the network with random weights, and the target network with the same ones."""
         super().__init__(config, buffer, seeds)
-        self.target = self.add_target("q", config.target_interval)
+        self.target_network = self.add_target_network("q", config.target_interval)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """A value for each action, or quantiles."""
+        """Return one value per action, or quantiles."""
         count = self.config.n_quantiles
         return {"q": (self.n_actions,) if count == 1 else (self.n_actions, count)}
 
-    def losses(self, batch: Batch) -> Losses:
-        """The loss of the temporal difference."""
-        q_tm1, target_tm1 = self.learn_q(batch)
-        td_loss = temporal_difference(q_tm1, batch.actions, target_tm1)
-        q_a_tm1 = chosen(mean_values(q_tm1), batch.actions)
-        return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the temporal-difference loss."""
+        q_tm1 = self.outputs("q", batch.observations)
+        td_loss = temporal_difference_loss(q_tm1, batch.actions, self.targets(batch))
+        return {"mean_q": chosen(mean_values(q_tm1), batch.actions), "loss": td_loss}
 
-    def judge(self, batch: Batch) -> dict[str, Tensor]:
-        """The values of the actions taken, and how far they are from their targets."""
+    def validate(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the values of the logged actions, and their absolute errors."""
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch)
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
         return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
 
-    def learn_q(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Values (R, A) or quantiles (R, A, N) to be learned from, and the targets of some."""
-        return self.learn("q", batch.observations), self.targets(batch)
-
+    @torch.no_grad()
     def targets(self, batch: Batch) -> Tensor:
-        """The target network both chooses the next action and judges it."""
+        """Return the targets (R,) or (R, N); the target network selects and evaluates actions."""
         return q_learning_target(batch.rewards, batch.discounts, self.target_outputs(batch))
 
     def target_outputs(self, batch: Batch) -> Tensor:
-        """(R, A) values of the next states, or (R, A, N) quantiles, under the target network."""
-        return allowed_only(self.target.outputs(batch), batch.next_observations.mask)
+        """Return the target network's values (R, A) or quantiles (R, A, N) of the next states."""
+        return allowed_only(self.target_network.outputs(batch), batch.next_observations.mask)
 
 
 class DoubleDQN(DQN):
-    """DQN whose learning network chooses the next action that the target network judges."""
+    """DQN in which the learning network selects the next action."""
 
     name = "double-dqn"
     config_type: ClassVar[type[TrainingConfig]] = DoubleDQNConfig
     config: DoubleDQNConfig
 
-    def learn_q(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """What is learned from, and the next states' values, come out of one pass."""
-        q_tm1, q_t_selector = self.learn_with_next("q", batch)
-        return q_tm1, self._targets(batch, q_t_selector)
-
+    @torch.no_grad()
     def targets(self, batch: Batch) -> Tensor:
-        """The learning network chooses, the target network judges."""
-        return self._targets(batch, self.outputs("q", batch.next_observations))
-
-    def _targets(self, batch: Batch, q_t_selector: Tensor) -> Tensor:
+        """Return the targets; the learning network selects, the target network evaluates."""
+        q_t_selector = self.outputs("q", batch.next_observations)
         q_t_value = self.target_outputs(batch)
         return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)
-
-
-def temporal_difference(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Loss:
-    """The regression of values (R, A), or quantiles (R, A, N), of actions to their targets."""
-    regression = huber_regression if q_tm1.ndim == 2 else quantile_regression
-    return regression(q_tm1, a_tm1, target_tm1)

@@ -1,15 +1,15 @@
-"""Implicit Q-learning with discrete actions: no action is ever valued that the log does not show.
+"""Implicit Q-learning with discrete actions: no action is evaluated that the log does not show.
 
     https://arxiv.org/abs/2110.06169
-        V(s)    expectile regression to Q'(s, a_data): nearly the best that was done there
+        V(s)    expectile regression to Q'(s, a_data): close to the best action taken there
         Q(s,a)  regression to r + gamma V(s')
         pi      behavior cloning, each action weighted with exp(beta (Q'(s, a) - V(s)))
 
-Q is the smaller of two networks that learn alike, Q' a copy of both renewed every `target_interval`
-updates.
+Q' is the smaller value of two target networks, one for each of two networks Q that learn from the
+same targets; they are synced every `target_interval` updates.
 
-Departures from the paper: discrete actions, so the policy is a classifier and Q has an output for
-each action; hard copies of the target where the paper averages; the Huber loss for Q.
+Departures from the paper: discrete actions, so the policy is a classifier and Q has one output per
+action; target networks are synced at intervals instead of averaged; Huber loss for Q.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner, Losses
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import (
     chosen,
     cross_entropy,
     expectile_regression,
     huber_regression,
-    scaled,
 )
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
 MAX_WEIGHT = 100.0
-"""The most that one action can count in the policy's loss, as in the paper's code."""
+"""Largest weight of one action in the policy's loss, as in the paper's code."""
 _TWINS = ("q", "q_twin")
 
 
@@ -42,21 +41,21 @@ class IQLConfig(BootstrapConfig):
     """Settings of IQL."""
 
     target_interval: int = 50
-    """updates between two copies of the weights into the target network"""
+    """updates between two syncs of the target networks"""
     expectile: float = 0.8
-    """which part of what was done in a state its value follows; 0.5 the mean, near 1 the best"""
+    """expectile of the action values that a state's value is; 0.5 is the mean, near 1 the best"""
     beta: float = 3.0
-    """how much more what beat the expected return by a reward of 1 is cloned; 0 clones all alike"""
+    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse invalid settings."""
         super().__post_init__()
         self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
         self._require("beta", self.beta >= 0, "at least 0")
 
 
 class IQL(Learner):
-    """Values of what was done, and a clone that prefers the better of it."""
+    """Values of logged actions, and a clone that prefers the better ones."""
 
     name = "iql"
     config_type: ClassVar[type[TrainingConfig]] = IQLConfig
@@ -65,51 +64,47 @@ class IQL(Learner):
     config: IQLConfig
 
     def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
-        """Start with random weights, and the same ones as targets."""
+        """Initialize the networks with random weights, and the target networks with the same."""
         super().__init__(config, buffer, seeds)
         for name in _TWINS:
-            self.add_target(name, config.target_interval, next_states=False)
+            self.add_target_network(name, config.target_interval, next_states=False)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Two networks of values, one of states, and the policy's logits."""
+        """Return the shapes of the policy's logits, two networks Q, and V."""
         per_action = (self.n_actions,)
         return {"logits": per_action, "q": per_action, "q_twin": per_action, "v": (1,)}
 
-    def losses(self, batch: Batch) -> Losses:
-        """Each network has a loss of its own; what is logged is their sum."""
-        values = [chosen(self.copies[name].outputs(batch), batch.actions) for name in _TWINS]
-        q_a_tm1 = torch.minimum(*values)
-        target_tm1 = self.next_values(batch)
-        v_tm1 = self.models["v"].learn_from(batch.observations)
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the losses of V, of Q and of the policy; they share no weights."""
+        q_a_tm1 = torch.minimum(
+            *(chosen(self.target_networks[name].outputs(batch), batch.actions) for name in _TWINS)
+        )
+        v_tm1 = self.models["v"](batch.observations)
         v_loss = expectile_regression(v_tm1, q_a_tm1, self.config.expectile)
+        target_tm1 = self.targets(batch)
         q_loss, twin_loss = (
-            huber_regression(self.learn(name, batch.observations), batch.actions, target_tm1)
+            huber_regression(self.outputs(name, batch.observations), batch.actions, target_tm1)
             for name in _TWINS
         )
-        weight = (self.config.beta * (q_a_tm1 - v_tm1.squeeze(1))).exp().clamp(max=MAX_WEIGHT)
-        logits_tm1 = self.learn("logits", batch.observations)
-        policy_loss = scaled(cross_entropy(logits_tm1, batch.actions), weight)
-        terms = {
+        advantage = q_a_tm1 - v_tm1.detach().squeeze(1)
+        weight = (self.config.beta * advantage).exp().clamp(max=MAX_WEIGHT)
+        logits_tm1 = self.outputs("logits", batch.observations)
+        policy_loss = weight * cross_entropy(logits_tm1, batch.actions)
+        return {
             "mean_q": q_a_tm1,
-            "value_loss": v_loss.value,
-            "td_loss": q_loss.value,
-            "policy_loss": policy_loss.value,
-            "loss": v_loss.value + q_loss.value + twin_loss.value + policy_loss.value,
+            "value_loss": v_loss,
+            "td_loss": q_loss,
+            "policy_loss": policy_loss,
+            "loss": v_loss + q_loss + twin_loss + policy_loss,
         }
-        slopes = {
-            "q": q_loss.slope,
-            "q_twin": twin_loss.slope,
-            "v": v_loss.slope,
-            "logits": policy_loss.slope,
-        }
-        return Losses(terms, slopes)
 
-    def judge(self, batch: Batch) -> dict[str, Tensor]:
-        """The values of the actions taken, and how far they are from their targets."""
+    def validate(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the values of the logged actions, and their absolute errors."""
         q_a_tm1 = chosen(self.outputs("q", batch.observations), batch.actions)
-        return {"q": q_a_tm1, "td_error": (self.next_values(batch) - q_a_tm1).abs()}
+        return {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
 
-    def next_values(self, batch: Batch) -> Tensor:
-        """(R,) r + gamma V(s')."""
+    @torch.no_grad()
+    def targets(self, batch: Batch) -> Tensor:
+        """Return r + gamma V(s') (R,)."""
         v_t = self.models["v"](batch.next_observations).squeeze(1)
         return batch.rewards + batch.discounts * v_t

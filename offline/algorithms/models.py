@@ -1,11 +1,8 @@
-"""K networks of one shape, one for each seed, that learn side by side.
+"""K networks of one shape, one per seed, that learn side by side, and their target networks.
 
-Their weights are the rows of one matrix (K, P), and so are their gradients: the optimiser, the copy
-into a target and a checkpoint each deal with one tensor. Batches hold the rows of all seeds, those
-of the first seed first: R = K * B rows.
-
-Nothing here asks what a loss is. A loss hands back its slope, its derivative with respect to the
-outputs; `backward` takes it from there.
+The weights are the rows of one matrix (K, P), a leaf of autograd: the optimizer, the target network
+and a checkpoint each handle one tensor. Batches contain the rows of all seeds, those of the first
+seed first: R = K * B rows.
 """
 
 from __future__ import annotations
@@ -13,187 +10,173 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from mcaprl.offline.algorithms.networks import Network
+from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
 _ALIGNMENT = 16
-"""Floats in a vector register: rows of this length get the same arithmetic whatever K is."""
+"""Floats in a vector register: rows of this length get the same arithmetic for any K."""
+_ROWS_AT_ONCE = 1024
 
 
 class Model(ABC):
-    """K networks whose weights and gradients are matrices.
+    """K networks whose weights are one matrix, a leaf of autograd.
 
     Attributes:
-        networks: the K networks; their parameters are views of `weights`.
+        networks: K networks; their parameters share memory with `weights`.
         weights: (K, P).
-        gradients: (K, P), set by `backward`.
-        bulk_gain: how many times less a row takes among a thousand than in a small batch.
+        bulk_gain: Time per row in a small batch, relative to a batch of a thousand rows.
     """
 
     bulk_gain: ClassVar[float] = 1.0
 
     def __init__(self, networks: Sequence[Network]) -> None:
-        """Gather the networks' weights; they must be of one shape."""
+        """Gather the weights of networks of one shape."""
         self.networks = list(networks)
-        length = sum(parameter.numel() for parameter in networks[0].parameters())
-        padded = -(-length // _ALIGNMENT) * _ALIGNMENT
-        device = next(networks[0].parameters()).device
-        self.weights = torch.zeros(len(networks), padded, device=device)
-        self.gradients = torch.zeros_like(self.weights)
-        self.weights.grad = self.gradients
+        parameters = dict(networks[0].named_parameters())
+        self._names, self._shapes = list(parameters), [p.shape for p in parameters.values()]
+        length = sum(parameter.numel() for parameter in parameters.values())
+        self._sizes = [*(shape.numel() for shape in self._shapes), -length % _ALIGNMENT]
+        device = next(iter(parameters.values())).device
+        self.weights = torch.zeros(len(networks), sum(self._sizes), device=device)
         for row, network in zip(self.weights, networks, strict=True):
-            start = 0
-            for parameter in network.parameters():
-                stop = start + parameter.numel()
-                row[start:stop] = parameter.detach().flatten()
-                parameter.data = row[start:stop].view_as(parameter)
-                start = stop
+            parts = zip(network.parameters(), row.split_with_sizes(self._sizes), strict=False)
+            for parameter, part in parts:
+                part.copy_(parameter.detach().flatten())
+                parameter.data = part.view_as(parameter)
+        self.weights.requires_grad_()
 
     @abstractmethod
     def __call__(self, observations: Observations) -> Tensor:
-        """The outputs (R, *output_shape), with nothing remembered."""
-
-    @abstractmethod
-    def learn_from(self, observations: Observations) -> Tensor:
-        """The outputs (R, *output_shape); remembers what `backward` needs."""
-
-    def learn_beside(
-        self, observations: Observations, others: Observations
-    ) -> tuple[Tensor, Tensor]:
-        """As `learn_from`, and the outputs for others, as many, which nothing is learned from."""
-        return self.learn_from(observations), self(others)
-
-    @abstractmethod
-    def backward(self, slope: Tensor) -> None:
-        """Set `gradients` from d loss / d outputs (R, *output_shape) of the last `learn_from`."""
+        """Map the observations of all seeds to outputs (R, *output_shape)."""
 
     def clone(self) -> Model:
-        """Another model with the same weights."""
+        """Return another model with the same weights."""
         return type(self)([copy.deepcopy(network) for network in self.networks])
 
 
 class AnyModel(Model):
-    """Networks of any kind, one after the other, by automatic differentiation."""
+    """Networks of any kind, computed one after the other."""
 
-    @torch.no_grad()
     def __call__(self, observations: Observations) -> Tensor:
-        """The outputs, with nothing remembered."""
-        return self._forward(observations)
-
-    def learn_from(self, observations: Observations) -> Tensor:
-        """The outputs, detached; the graph stays here."""
-        with torch.enable_grad():
-            self._outputs = self._forward(observations)
-        return self._outputs.detach()
-
-    def backward(self, slope: Tensor) -> None:
-        """Let autograd go on from the outputs."""
-        counts = [len(list(network.parameters())) for network in self.networks]
-        parameters = [p for network in self.networks for p in network.parameters()]
-        found = iter(torch.autograd.grad(self._outputs, parameters, slope))
-        for row, count in zip(self.gradients, counts, strict=True):
-            flat = [next(found).flatten() for _ in range(count)]
-            torch.cat(flat, out=row[: sum(map(len, flat))])
-
-    def _forward(self, observations: Observations) -> Tensor:
+        """Map the observations of all seeds to outputs (R, *output_shape)."""
         parts = observations.split(len(observations) // len(self.networks))
-        return torch.cat([net(part) for net, part in zip(self.networks, parts, strict=True)])
+        seeds = zip(self.networks, self.weights.unbind(), parts, strict=True)
+        return torch.cat([self._apply(network, row, part) for network, row, part in seeds])
+
+    def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
+        """Compute one network with the weights of a row, so that autograd sees the matrix."""
+        parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
+        weights = {name: part.view(shape) for name, shape, part in parts}
+        return cast(Tensor, functional_call(network, weights, (observations,)))
 
 
 class StackedMLP(Model):
-    """Plain fully connected networks on vectors, all seeds in one matrix product for each layer.
-
-    The backward pass is written out: a third of the time of a small update is autograd's
-    bookkeeping, which none of these tensors asks for. Results are those of `AnyModel`, against
-    which the tests hold it.
-    """
+    """Plain fully connected networks on vectors: one batched matrix product per layer."""
 
     bulk_gain = 2.0
 
-    def __init__(self, networks: Sequence[Network]) -> None:
-        """Stack networks for which `fits` is true."""
-        super().__init__(networks)
-        self._output_shape = networks[0].output_shape
-        self._layers = _layer_views(networks[0], self.weights)
-        self._slopes = _layer_views(networks[0], self.gradients)
-        self._inputs: list[Tensor] = []
-
     @staticmethod
     def fits(network: Network) -> bool:
-        """Whether a network has nothing but linear layers and ReLU.
+        """Return whether a network consists of linear layers and ReLU only.
 
-        Layers with a single input or output are left to others: a product with a vector is
-        computed in another way for one seed than for several, and ends in other bits.
+        Layers with a single input or output are excluded: a product with a vector is computed
+        differently for one seed and for several, with other bits as the result.
         """
         kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.ReLU)
         plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
         return plain and all(min(p.shape) > 1 for p in network.parameters() if p.ndim == 2)
 
     def __call__(self, observations: Observations) -> Tensor:
-        """The outputs, with nothing remembered."""
-        return self._forward(self._by_seed(observations))[-1].view(-1, *self._output_shape)
-
-    def learn_from(self, observations: Observations) -> Tensor:
-        """The outputs; remembers what went into each layer."""
-        *self._inputs, outputs = self._forward(self._by_seed(observations))
-        return outputs.view(-1, *self._output_shape)
-
-    def learn_beside(
-        self, observations: Observations, others: Observations
-    ) -> tuple[Tensor, Tensor]:
-        """One pass for both: twice the rows take less than twice the time."""
-        rows = torch.cat([self._by_seed(observations), self._by_seed(others)], 1)
-        half = rows.shape[1] // 2
-        *inputs, outputs = self._forward(rows)
-        self._inputs = [values[:, :half] for values in inputs]
-        mine, theirs = outputs[:, :half], outputs[:, half:]
-        shape = self._output_shape
-        return mine.reshape(-1, *shape), theirs.reshape(-1, *shape)
-
-    def backward(self, slope: Tensor) -> None:
-        """The chain rule, layer by layer: y = x W^T + b, so dW = dy^T x, db = sum dy, dx = dy W."""
-        slope = slope.reshape(len(self.weights), -1, self._layers[-1][0].shape[1])
-        for index in reversed(range(len(self._layers))):
-            inputs = self._inputs[index]
-            matrix, bias = self._slopes[index]
-            torch.bmm(slope.mT, inputs, out=matrix)
-            torch.sum(slope, 1, keepdim=True, out=bias)
-            if index > 0:
-                # ReLU lets through what was above 0.
-                slope = torch.bmm(slope, self._layers[index][0]).mul_(inputs > 0)
-
-    def _by_seed(self, observations: Observations) -> Tensor:
-        """(K, B, V)."""
-        return observations.vector.view(len(self.weights), -1, observations.vector.shape[1])
-
-    def _forward(self, rows: Tensor) -> list[Tensor]:
-        """What goes into each layer (K, B, width), and what comes out of the last."""
-        values = [rows]
-        last = len(self._layers) - 1
-        for index, (matrix, bias) in enumerate(self._layers):
-            outputs = torch.baddbmm(bias, values[-1], matrix.mT)
-            values.append(outputs if index == last else outputs.relu_())
-        return values
+        """Map the observations of all seeds to outputs (R, *output_shape)."""
+        # Observations are columns (K, width, B): autograd's weight gradients, dy x^T, then have the
+        # layout of the weights and need no transposition.
+        seeds = len(self.networks)
+        columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
+        count = columns.shape[2]
+        if count == 1:
+            # Products with a vector have other bits for one seed than for several.
+            columns = columns.expand(-1, -1, 2)
+        parts = self.weights.split_with_sizes(self._sizes, 1)[:-1]
+        last = len(parts) // 2 - 1
+        for layer, (matrix, bias) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
+            matrices = matrix.view(seeds, *self._shapes[2 * layer])
+            columns = torch.baddbmm(bias.unsqueeze(2), matrices, columns)
+            columns = columns if layer == last else columns.relu_()
+        return columns[:, :, :count].mT.reshape(-1, *self.networks[0].output_shape)
 
 
 def build_model(networks: Sequence[Network]) -> Model:
-    """The fastest model for networks of one shape."""
+    """Return the fastest model for networks of one shape."""
     return StackedMLP(networks) if StackedMLP.fits(networks[0]) else AnyModel(networks)
 
 
-def _layer_views(network: Network, flat: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Matrix (K, outputs, inputs) and bias (K, 1, outputs) of each linear layer."""
-    views, start = [], 0
-    for layer in network.modules():
-        if isinstance(layer, nn.Linear):
-            middle = start + layer.weight.numel()
-            stop = middle + layer.out_features
-            matrix = flat[:, start:middle].view(-1, *layer.weight.shape)
-            views.append((matrix, flat[:, middle:stop].unsqueeze(1)))
-            start = stop
-    return views
+class TargetNetwork:
+    """A model that gets the weights of a learning model at intervals.
+
+    Its outputs do not change in between. Where that takes less time than computing them for each
+    batch, they are computed once for the whole dataset and then looked up.
+
+    Attributes:
+        model: The K target networks.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        buffer: TransitionBuffer,
+        rows_per_sync: int,
+        *,
+        next_states: bool = True,
+    ) -> None:
+        """Copy `model`.
+
+        Args:
+            model: The model that learns.
+            buffer: Its training data.
+            rows_per_sync: Approximate number of rows per seed between two calls of `sync`.
+            next_states: Whether the outputs are those of the next states, or of the states.
+        """
+        self.model = model.clone()
+        self._buffer = buffer
+        self._next_states = next_states
+        self._use_table = len(buffer) <= rows_per_sync * model.bulk_gain
+        self._table: Tensor | None = None
+        seeds = torch.arange(len(model.weights), device=buffer.device)
+        self._offsets = seeds.unsqueeze(1) * len(buffer)
+
+    @torch.no_grad()
+    def sync(self, model: Model) -> None:
+        """Copy the weights of `model`."""
+        self.model.weights.copy_(model.weights)
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the computed outputs, because the weights have changed."""
+        self._table = None
+
+    @torch.no_grad()
+    def outputs(self, batch: Batch) -> Tensor:
+        """Return the outputs (R, ...) for the batch's states, or next states; no gradient."""
+        if not self._use_table:
+            return self.model(batch.next_observations if self._next_states else batch.observations)
+        if self._table is None:
+            self._table = outputs_of_buffer(self.model, self._buffer, next_states=self._next_states)
+        rows = batch.rows.view(len(self._offsets), -1) + self._offsets
+        return self._table.index_select(0, rows.flatten())
+
+
+@torch.no_grad()
+def outputs_of_buffer(model: Model, buffer: TransitionBuffer, *, next_states: bool) -> Tensor:
+    """Return the outputs (K * N, ...) of K networks for a buffer's N states, or next states."""
+    seeds, parts = len(model.weights), []
+    for places in torch.split(buffer.places[int(next_states)], _ROWS_AT_ONCE):
+        outputs = model(buffer.observe(places.repeat(seeds)))
+        parts.append(outputs.view(seeds, len(places), *outputs.shape[1:]))
+    return torch.cat(parts, 1).flatten(0, 1)

@@ -15,13 +15,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mcaprl.errors import SpaceError, TrainingError
+from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 
+DEVICES = ("cpu", "cuda")
 _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
 
 
@@ -217,6 +218,23 @@ class TransitionBuffer:
     def image_inputs(self) -> list[ImageInput]:
         """How a network takes the pictures that it sees."""
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
+
+
+def choose_device(name: str) -> torch.device:
+    """Return the device of a name.
+
+    Raises:
+        UnknownNameError: The name is not in `DEVICES`.
+        UsageError: torch finds no such device on this machine.
+    """
+    if name not in DEVICES:
+        raise UnknownNameError("device", name, DEVICES)
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UsageError(
+            f"device cuda: torch {torch.__version__} finds no CUDA device; install a torch that is"
+            " built for CUDA, or omit --device"
+        )
+    return torch.device(name)
 
 
 def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:

@@ -2,13 +2,13 @@
 
     Le, Voloshin and Yue, "Batch policy learning under constraints", https://arxiv.org/abs/1903.08738
 
-Q learns the target r + gamma sum_a pi(a|s') Q'(s', a), where pi is the policy in question and Q' a
-copy of Q renewed every `target_interval` updates. A truncated episode would have gone on, so only
-`terminated` ends the return.
+Q learns the target r + gamma sum_a pi(a|s') Q'(s', a), where pi is the evaluated policy and Q' the
+target network, synced every `target_interval` updates. A truncated episode would have continued, so
+only `terminated` ends the return.
 
-Departure from the paper: gradient steps on random batches between two copies, not a fit to the end;
-and targets are clipped to the returns that the logged rewards can add up to, since a network asked
-about actions that the log never shows answers with anything.
+Departures from the paper: gradient steps on random batches between two syncs, not a fit to
+convergence; targets are clipped to the returns that the logged rewards can add up to, because the
+network's values of actions that the log never shows are arbitrary.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from typing import ClassVar
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner, Losses
+from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import chosen, expected_sarsa_target, square_regression
-from mcaprl.offline.algorithms.target import outputs_everywhere
+from mcaprl.offline.algorithms.models import outputs_of_buffer
 from mcaprl.offline.batches.buffer import Batch, Packing, TransitionBuffer
 
 SYNCS_PER_HORIZON = 5.0
-"""Fewer copies than 5 / (1 - gamma), and Q has not seen the end of its horizon."""
+"""Number of syncs per effective horizon 1 / (1 - gamma) below which Q has not converged."""
 
 
 @dataclass(frozen=True)
@@ -38,31 +38,31 @@ class FQEConfig(TrainingConfig):
     gamma: float = 0.97
     """discount of the reward one step later"""
     target_interval: int = 50
-    """updates between two copies of the weights into the target network"""
+    """updates between two syncs of the target network"""
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot be meant."""
+        """Refuse invalid settings."""
         super().__post_init__()
         self._require("gamma", 0 <= self.gamma <= 1, "within [0, 1]")
         self._require("target_interval", self.target_interval >= 1, "at least 1")
 
     @property
     def packing(self) -> Packing:
-        """Single steps: sums of several would be those of the policy that acted in the log."""
+        """Single steps, because n-step rewards would be those of the behavior policy."""
         return Packing(gamma=self.gamma)
 
     @property
     def enough_syncs(self) -> bool:
-        """Whether rewards have had the time to travel through the horizon.
+        """Whether rewards can have propagated through the effective horizon.
 
-        After k copies, Q can be (1 - gamma^k) / (1 - gamma) of the largest reward at most.
+        After k syncs, Q can be (1 - gamma^k) / (1 - gamma) of the largest reward at most.
         """
         syncs = self.updates / self.target_interval
         return syncs * (1 - self.gamma) >= SYNCS_PER_HORIZON
 
 
 class FQE(Learner):
-    """A Q-network of a policy that is given."""
+    """A Q-network of a given policy."""
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
@@ -73,43 +73,42 @@ class FQE(Learner):
     def __init__(
         self, config: FQEConfig, buffer: TransitionBuffer, seeds: Sequence[int], pi_t: Tensor
     ) -> None:
-        """Start with random weights, and the same ones as target.
+        """Initialize the network with random weights, and the target network with the same.
 
         Args:
-            config: settings.
-            buffer: the log's N transitions.
-            seeds: of the weights and the batches.
-            pi_t: (N, A) probabilities of the policy in question in each next state.
+            config: Settings.
+            buffer: N transitions of the log.
+            seeds: Seeds of the weights and the batches.
+            pi_t: Probabilities (N, A) of the evaluated policy in each next state.
         """
         super().__init__(config, buffer, seeds)
         self.pi_t = pi_t
-        self.target = self.add_target("q", config.target_interval)
+        self.target_network = self.add_target_network("q", config.target_interval)
         rewards, _ = buffer.returns
         drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
         self.low, self.high = reachable(drawn, config.gamma)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """A value for each action."""
+        """Return one value per action."""
         return {"q": (self.n_actions,)}
 
-    def losses(self, batch: Batch) -> Losses:
-        """Half the squared temporal difference."""
-        q_tm1 = self.learn("q", batch.observations)
-        q_t = self.target.outputs(batch).clamp(self.low, self.high)
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return half the squared temporal difference."""
+        q_tm1 = self.outputs("q", batch.observations)
+        q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
         pi_t = self.pi_t.index_select(0, batch.rows)
         target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
         td_loss = square_regression(q_tm1, batch.actions, target_tm1)
-        q_a_tm1 = chosen(q_tm1, batch.actions)
-        return Losses({"mean_q": q_a_tm1, "loss": td_loss.value}, {"q": td_loss.slope})
+        return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 
     def values(self, *, next_states: bool) -> Tensor:
-        """(N, A) the first seed's values of the buffer's states, or next states, within reach."""
-        everywhere = outputs_everywhere(self.models["q"], self.buffer, next_states=next_states)
-        return everywhere[: len(self.buffer)].clamp(self.low, self.high)
+        """Return the first seed's values (N, A) of the states, or next states, clipped."""
+        outputs = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
+        return outputs[: len(self.buffer)].clamp(self.low, self.high)
 
 
 def reachable(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """The least and the most that rewards like these can add up to, from 1 step to endless ones."""
+    """Return the bounds of the discounted sum of such rewards, over one step or more."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

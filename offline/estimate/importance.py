@@ -1,17 +1,18 @@
 """Estimates of a policy's value from another's log, by importance sampling: pure functions.
 
-Each takes episodes side by side and gives quotients of means over them, and so a value for every
-resampling, and an interval:
+Each maps a table of episodes to ratios of means over them, which have a value for each resampling
+and an interval:
 
     TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
     WIS     weighted                               the same, over the sum of all rho
     PDIS    per-decision importance sampling       sum_t gamma^t rho_t r_t
     WPDIS   weighted                               each step's rho_t over their sum at that step
-    DR      doubly robust                          PDIS of what a model Q leaves to explain
+    DR      doubly robust                          PDIS of the residuals of a model Q
     WDR     weighted doubly robust                 WPDIS of the same
 
-with rho_t the product of pi(a|s) / mu(a|s) up to step t, pi the policy in question and mu the one
-that acted. TIS, PDIS and DR are unbiased and swing; the weighted ones are a little biased and calm.
+with rho_t the product of pi(a|s) / mu(a|s) up to step t, pi the evaluated policy and mu the
+behavior policy. TIS, PDIS and DR are unbiased with a large variance; the weighted (self-normalized)
+ones have a small bias and a smaller variance.
 
     Precup, Sutton and Singh, "Eligibility traces for off-policy policy evaluation", ICML 2000
     Jiang and Li, "Doubly robust off-policy value evaluation", https://arxiv.org/abs/1511.03722
@@ -27,7 +28,7 @@ from typing import Final
 
 import numpy as np
 
-from mcaprl.offline.estimate.quotients import Floats, Quotients, quotient
+from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate, divide
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,49 +72,49 @@ class EpisodeTable:
         return np.hstack([np.ones((len(self.ratios), 1)), self.rho[:, :-1]])
 
 
-def trajectory(episodes: EpisodeTable) -> Quotients:
+def trajectory(episodes: EpisodeTable) -> RatioEstimate:
     """TIS: the mean of rho_T sum_t gamma^t r_t."""
-    return Quotients.mean(episodes.rho[:, -1] * _returns(episodes))
+    return RatioEstimate.mean(episodes.rho[:, -1] * _returns(episodes))
 
 
-def weighted_trajectory(episodes: EpisodeTable) -> Quotients:
+def weighted_trajectory(episodes: EpisodeTable) -> RatioEstimate:
     """WIS: the mean of the returns, weighted by rho_T."""
     rho = episodes.rho[:, -1:]
-    return Quotients(np.ones(1), ((rho * _returns(episodes)[:, None], rho),))
+    return RatioEstimate(np.ones(1), ((rho * _returns(episodes)[:, None], rho),))
 
 
-def per_decision(episodes: EpisodeTable) -> Quotients:
+def per_decision(episodes: EpisodeTable) -> RatioEstimate:
     """PDIS: the mean of sum_t gamma^t rho_t r_t."""
-    return Quotients.mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1))
+    return RatioEstimate.mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1))
 
 
-def weighted_per_decision(episodes: EpisodeTable) -> Quotients:
+def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
     """WPDIS: sum_t gamma^t of the mean reward at t, weighted by rho_t."""
     rho = episodes.rho
-    return Quotients(episodes.discounts, ((rho * episodes.rewards, rho),))
+    return RatioEstimate(episodes.discounts, ((rho * episodes.rewards, rho),))
 
 
-def doubly_robust(episodes: EpisodeTable) -> Quotients:
+def doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
     """DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
 
     Jiang and Li, equation 10, written out. With a model of zeros it is PDIS.
     """
     unexplained = episodes.rho * (episodes.rewards - episodes.q)
     per_step = unexplained + episodes.rho_before * episodes.v
-    return Quotients.mean((episodes.discounts * per_step).sum(1))
+    return RatioEstimate.mean((episodes.discounts * per_step).sum(1))
 
 
-def weighted_doubly_robust(episodes: EpisodeTable) -> Quotients:
+def weighted_doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
     """WDR: DR with rho_t over its sum at that step.
 
     Thomas and Brunskill, equation 10.
     """
     rho, before = episodes.rho, episodes.rho_before
     unexplained = rho * (episodes.rewards - episodes.q)
-    return Quotients(episodes.discounts, ((unexplained, rho), (before * episodes.v, before)))
+    return RatioEstimate(episodes.discounts, ((unexplained, rho), (before * episodes.v, before)))
 
 
-ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], Quotients]]] = {
+ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], RatioEstimate]]] = {
     "TIS": trajectory,
     "WIS": weighted_trajectory,
     "PDIS": per_decision,
@@ -134,7 +135,7 @@ def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
     episode has all the weight, 0 if none has any.
     """
     rho = episodes.rho
-    return quotient(rho.sum(0) ** 2, (rho**2).sum(0))
+    return divide(rho.sum(0) ** 2, (rho**2).sum(0))
 
 
 def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
@@ -151,7 +152,7 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
         return float(discounts.sum() / (discounts @ (1 / sizes)))
 
 
-def mean_weight(estimator: str, episodes: EpisodeTable) -> Quotients | None:
+def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
     """The mean of an unbiased estimator's weights, over steps with their discounts: 1 is right.
 
     It is clearly less where the log lacks whole episodes that the policy would make: the few that
@@ -159,9 +160,9 @@ def mean_weight(estimator: str, episodes: EpisodeTable) -> Quotients | None:
     estimators that divide by it.
     """
     if estimator == "TIS":
-        return Quotients.mean(episodes.rho[:, -1])
+        return RatioEstimate.mean(episodes.rho[:, -1])
     if estimator in ("PDIS", "DR"):
-        return Quotients.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
+        return RatioEstimate.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
     return None
 
 

@@ -24,7 +24,7 @@ from mcaprl.offline.estimate.importance import (
     effective_sample_size,
     mean_weight,
 )
-from mcaprl.offline.estimate.quotients import Floats, Quotients
+from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -138,7 +138,7 @@ class OffPolicyEvaluator:
         self._fold = random.permutation(len(self._lengths)) % FOLDS
         returns = self._padded(dataset.rewards, 0.0) @ self._discounts()
         self.behavior_return = float(returns.mean())
-        self.behavior_interval = Quotients.mean(returns).interval(self._counts)
+        self.behavior_interval = RatioEstimate.mean(returns).interval(self._counts)
 
     def evaluate(
         self,
@@ -279,10 +279,10 @@ class OffPolicyEvaluator:
         verdict = _verdict(size)
         if verdict == TRUSTED and not self._config.enough_syncs:
             verdict = (
-                f"refused: {self._config.updates // self._config.target_interval} target copies"
+                f"refused: {self._config.updates // self._config.target_interval} target syncs"
                 f" are too few for gamma {self.gamma}: more updates"
             )
-        interval = Quotients.mean(first).interval(self._counts)
+        interval = RatioEstimate.mean(first).interval(self._counts)
         return Estimate(name, "FQE", float(first.mean()), interval, size, verdict)
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:

@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import TrainingError, UsageError
-from mcaprl.offline.algorithms.captured import choose_device
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner, NotFiniteError
 from mcaprl.offline.algorithms.registry import choose_algorithm
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import (
@@ -210,7 +209,6 @@ class _Run:
             checkpoint_due = last or learner.step % config.checkpoint_interval == 0
             if checkpoint_due or learner.step % config.log_interval == 0:
                 break
-        self._check(learner.check)
         values = learner.seed_means(terms)
         if self.held_out is not None:
             validated = self.held_out.terms(learner)

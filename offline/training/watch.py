@@ -58,7 +58,7 @@ class HeldOut:
         """Return the terms of each seed on these transitions, with the prefix `held_out_`."""
         seeds = len(learner.seeds)
         with torch.no_grad():
-            terms = learner.judge(self._buffer.batch(self._rows.repeat(seeds)))
+            terms = learner.validate(self._buffer.batch(self._rows.repeat(seeds)))
         means = learner.seed_means({f"held_out_{name}": term for name, term in terms.items()})
         has_values = "q" in learner.models and math.isfinite(self.mean_return)
         known = {"held_out_return": self.mean_return} if has_values else {}

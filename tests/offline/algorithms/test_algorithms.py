@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.offline.algorithms.bc import BCConfig
 from mcaprl.offline.algorithms.bcq import BCQ, BCQConfig
 from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
@@ -23,6 +25,7 @@ from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 from mcaprl.offline.policy import Scores
+from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import (
     ACTION_SPACE,
@@ -160,21 +163,22 @@ def test_looking_up_the_target_is_the_same_as_computing_it(
         learner.buffer.sample_rows(64 * len(seeds), torch.Generator().manual_seed(0))
     )
     if isinstance(learner, IQL):
-        target, seen = learner.copies["q_twin"], batch.observations
+        target, seen = learner.target_networks["q_twin"], batch.observations
     else:
         assert isinstance(learner, DQN)
-        target, seen = learner.target, batch.next_observations
-    torch.testing.assert_close(target.outputs(batch), target.model(seen))
+        target, seen = learner.target_network, batch.next_observations
+    with torch.no_grad():
+        torch.testing.assert_close(target.outputs(batch), target.model(seen))
 
 
-def test_the_target_stands_still_between_two_copies() -> None:
+def test_the_target_network_is_constant_between_two_syncs() -> None:
     learner = learner_of(DQNConfig(**{**SMALL_Q, "target_interval": 5}), corridor())
     assert isinstance(learner, DQN)
     batch = learner.buffer.sample(16, torch.Generator().manual_seed(0))
-    seen = [learner.target.outputs(batch)]
+    seen = [learner.target_network.outputs(batch)]
     for _ in range(10):
         learner.update()
-        seen.append(learner.target.outputs(batch))
+        seen.append(learner.target_network.outputs(batch))
     changes = [not torch.equal(before, after) for before, after in pairwise(seen)]
     assert changes == [False, False, False, False, True] * 2
 
@@ -358,3 +362,28 @@ def test_pictures_are_learned_from() -> None:
     seen = learner.buffer.encoder.encode(images[:2])
     for seed in (0, 1):
         assert learner.network("logits", seed)(seen).argmax(1).tolist() == [0, 1]
+
+
+def test_a_device_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match="device"):
+        train(corridor(), "bc", tmp_path / "run", device="tpu")
+    if not torch.cuda.is_available():
+        with pytest.raises(UsageError, match=r"device cuda: torch .* finds no CUDA device"):
+            train(corridor(), "bc", tmp_path / "run", device="cuda")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no CUDA device")
+@pytest.mark.parametrize("learner_type", ALL)
+def test_updates_on_a_gpu_are_those_of_the_cpu(learner_type: type[Learner]) -> None:
+    config = learner_type.config_type(updates=40, batch_size=16, hidden=(16, 16))
+    buffer = TransitionBuffer.from_dataset(corridor(), config.packing)
+    found, expected = (
+        trained(learner_type(config, buffer.to(torch.device(device)), (0, 1)))
+        for device in ("cuda", "cpu")
+    )
+    # Sums are added up in another order, and Adam divides by small numbers: not to the last bit.
+    for name, model in expected.all_models().items():
+        weights = found.all_models()[name].weights.detach().cpu()
+        torch.testing.assert_close(weights, model.weights.detach(), rtol=2e-3, atol=2e-3)

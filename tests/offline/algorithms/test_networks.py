@@ -108,46 +108,32 @@ def networks(count: int, hidden: tuple[int, ...] = (32, 16)) -> list[Network]:
     return [Network(5, [], (4,), Architecture(hidden)) for _ in range(count)]
 
 
-def gradients(model: Model, observations: Observations, slope: Tensor) -> tuple[Tensor, Tensor]:
-    outputs = model.learn_from(observations)
-    model.backward(slope)
-    return outputs, model.gradients.clone()
+def gradients(model: Model, observations: Observations, d_output: Tensor) -> tuple[Tensor, Tensor]:
+    outputs = model(observations)
+    torch.autograd.backward(outputs, d_output)
+    assert model.weights.grad is not None
+    return outputs.detach(), model.weights.grad
 
 
 @pytest.mark.parametrize("hidden", [(), (32,), (32, 16, 24)])
 @pytest.mark.parametrize("seeds", [1, 3])
-def test_the_written_out_backward_pass_is_that_of_autograd(
+def test_stacked_networks_have_the_gradients_of_separate_ones(
     seeds: int, hidden: tuple[int, ...]
 ) -> None:
-    seen, slope = vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
-    by_hand = gradients(StackedMLP(networks(seeds, hidden)), seen, slope)
-    automatic = gradients(AnyModel(networks(seeds, hidden)), seen, slope)
-    for mine, reference in zip(by_hand, automatic, strict=True):
+    seen, d_output = vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
+    stacked = gradients(StackedMLP(networks(seeds, hidden)), seen, d_output)
+    separate = gradients(AnyModel(networks(seeds, hidden)), seen, d_output)
+    for mine, reference in zip(stacked, separate, strict=True):
         torch.testing.assert_close(mine, reference, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
-@pytest.mark.parametrize("seeds", [1, 3])
-def test_learning_from_some_beside_others_is_learning_from_them_alone(
-    model_type: type[Model], seeds: int
-) -> None:
-    seen, others, slope = vectors(seeds * 7, 5), vectors(seeds * 7, 5), torch.randn(seeds * 7, 4)
-    model = model_type(networks(seeds))
-    outputs, alone = gradients(model, seen, slope)
-    beside, looked_up = model.learn_beside(seen, others)
-    model.backward(slope)
-    for found, reference in ((beside, outputs), (looked_up, model(others))):
-        torch.testing.assert_close(found, reference, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(model.gradients, alone, rtol=1e-5, atol=1e-6)
-
-
 def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Tensor, Tensor]]:
-    seen, slope = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
-    together = gradients(model_type(networks(4)), seen, slope)
+    seen, d_output = vectors(4 * rows, 5), torch.randn(4 * rows, 4)
+    together = gradients(model_type(networks(4)), seen, d_output)
     pairs = []
     for k, network in enumerate(networks(4)):
         mine = slice(k * rows, (k + 1) * rows)
-        alone = gradients(model_type([network]), Observations(seen.vector[mine]), slope[mine])
+        alone = gradients(model_type([network]), Observations(seen.vector[mine]), d_output[mine])
         pairs += [(alone[0], together[0][mine]), (alone[1][0], together[1][k])]
     return pairs
 
@@ -163,7 +149,8 @@ def test_a_seed_gets_the_same_bits_alone_and_beside_others(
 def test_a_network_shows_the_weights_of_its_model() -> None:
     model = build_model(networks(2))
     seen = vectors(6, 5)
-    model.weights.mul_(0.5)
+    with torch.no_grad():
+        model.weights.mul_(0.5)
     expected = torch.cat(
         [net(part) for net, part in zip(model.networks, seen.split(3), strict=True)]
     )
@@ -174,7 +161,8 @@ def test_a_clone_has_weights_of_its_own() -> None:
     model = build_model(networks(2))
     clone = model.clone()
     before = clone(vectors(4, 5))
-    model.weights.zero_()
+    with torch.no_grad():
+        model.weights.zero_()
     assert torch.equal(clone(vectors(4, 5)), before)
     assert before.abs().min() > 0
 

@@ -168,7 +168,7 @@ def test_a_model_that_saw_too_little_of_the_horizon_says_so() -> None:
     config = FQEConfig(updates=100, target_interval=25, hidden=(4,), gamma=0.9)
     estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")
     assert estimate.estimates[0].verdict.startswith(
-        "refused: 4 target copies are too few for gamma 0.9"
+        "refused: 4 target syncs are too few for gamma 0.9"
     )
 
 

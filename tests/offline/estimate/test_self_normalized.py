@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from mcaprl.offline.estimate.importance import ESTIMATORS
-from mcaprl.offline.estimate.quotients import Quotients, student_factor
+from mcaprl.offline.estimate.self_normalized import RatioEstimate, student_factor
 from tests.support import two_state_task as task
 
 columns = st.integers(2, 9).flatmap(
@@ -24,15 +24,15 @@ def resamplings(episodes: int, count: int, seed: int) -> NDArray[np.float64]:
     return random.multinomial(episodes, [1 / episodes] * episodes, count).astype(np.float64)
 
 
-def test_a_quotient_by_hand() -> None:
+def test_a_ratio_by_hand() -> None:
     # a is 2 and 6, b is 1 and 3: 8 / 4, the same for both episodes, so nothing can be off.
-    same = Quotients(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
+    same = RatioEstimate(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
     # Twice the second: 12 / 6.
     assert same.values(np.array([[1.0, 1.0], [0.0, 2.0]])) == pytest.approx([1.0, 1.0])
     assert same.errors(np.ones((1, 2))) == pytest.approx([0.0])
     assert same.interval(resamplings(2, 50, 0)) == pytest.approx((1.0, 1.0))
     # a is 2 and 2: 4 / 4 = 1. They move it by (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
-    other = Quotients(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
+    other = RatioEstimate(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
     assert other.errors(np.ones((1, 2))) == pytest.approx([np.sqrt(1 / 8)])
     # Counted twice each, it is as if there were four: half of the variance.
     assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
@@ -41,16 +41,16 @@ def test_a_quotient_by_hand() -> None:
 def test_pairs_add_up_with_their_weights() -> None:
     one = (np.array([[1.0, 2.0], [3.0, 2.0]]), np.array([[1.0, 0.0], [1.0, 4.0]]))
     # (4 / 2 + 4 / 4 of the second) and each twice.
-    assert Quotients(np.array([1.0, 10.0]), (one, one)).values(np.ones((1, 2))) == [24.0]
-    # Where b is nought in all episodes, the quotient is nought.
-    nothing = Quotients(np.ones(1), ((np.ones((2, 1)), np.zeros((2, 1))),))
+    assert RatioEstimate(np.array([1.0, 10.0]), (one, one)).values(np.ones((1, 2))) == [24.0]
+    # Where b is 0 in all episodes, the ratio is 0.
+    nothing = RatioEstimate(np.ones(1), ((np.ones((2, 1)), np.zeros((2, 1))),))
     assert nothing.values(np.ones((1, 2))) == [0.0]
     assert nothing.interval(resamplings(2, 20, 0)) == (0.0, 0.0)
 
 
 @given(columns)
 def test_the_error_of_a_mean_is_scipys(values: NDArray[np.float64]) -> None:
-    mean = Quotients.mean(values)
+    mean = RatioEstimate.mean(values)
     once = np.ones((1, len(values)))
     assert mean.values(once) == pytest.approx([values.mean()])
     assert mean.errors(once) == pytest.approx([scipy.stats.sem(values, ddof=0)], abs=1e-9)
@@ -61,9 +61,9 @@ def test_an_interval_moves_and_grows_with_its_values(
     values: NDArray[np.float64], seed: int
 ) -> None:
     counts = resamplings(len(values), 60, seed)
-    low, high = Quotients.mean(values).interval(counts)
+    low, high = RatioEstimate.mean(values).interval(counts)
     assert low <= high
-    moved = Quotients.mean(3 * values + 5).interval(counts)
+    moved = RatioEstimate.mean(3 * values + 5).interval(counts)
     assert moved == pytest.approx((3 * low + 5, 3 * high + 5), rel=1e-6, abs=1e-6)
 
 
@@ -96,12 +96,12 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 def test_degrees_of_freedom_by_hand() -> None:
     # 0 and 2 lie as far from 1: two episodes tell alike, one degree. 0 0 0 4 lie 1 1 1 3 from it:
     # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) = 144 / 84 is less than two, and one the least.
-    assert Quotients.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
-    assert Quotients.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
-    alike = Quotients.mean(np.array([-1.0, 1.0] * 10))
+    assert RatioEstimate.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
+    assert RatioEstimate.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
+    alike = RatioEstimate.mean(np.array([-1.0, 1.0] * 10))
     assert alike.degrees_of_freedom() == pytest.approx(19.0)
     # 0 0 0 2 2 4 4 4 lie 2 2 2 0 0 2 2 2 from their mean: six of eight tell, five degrees.
-    some = Quotients.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
+    some = RatioEstimate.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
     assert some.degrees_of_freedom() == pytest.approx(5.0)
 
 
