@@ -1,7 +1,7 @@
-"""Settings of whatever trains: frozen dataclasses, checked when made, each field with its help.
+"""Settings of training: frozen dataclasses that check their values, with help for each field.
 
-A string under a field, as `TrainingConfig` in `offline/algorithms/config.py` has them, says what the field is
-for; the command line prints it as the help of the field's option.
+The string under a field (see `TrainingConfig` in `offline/algorithms/config.py`) describes it; the
+command line prints that string as the help of the field's option.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from mcaprl.errors import UsageError
 
 @dataclass(frozen=True)
 class Settings:
-    """Base of all settings: it has none itself."""
+    """Base class of all settings."""
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
-        """Refuse a setting that cannot be meant.
+        """Refuse an invalid value of a field.
 
         Raises:
-            UsageError: it does not hold.
+            UsageError: `holds` is false.
         """
         if not holds:
             raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
@@ -34,12 +34,12 @@ def check_settings(algo: str, config: Settings | type[Settings], given: Iterable
     """Refuse settings that an algorithm does not have.
 
     Args:
-        algo: the algorithm's name.
-        config: its settings, or their type.
-        given: names of those that were asked for.
+        algo: Name of the algorithm.
+        config: Settings of the algorithm, or their type.
+        given: Names of the settings that the user gave.
 
     Raises:
-        UsageError: there is such a one.
+        UsageError: A name is not a field of `config`.
     """
     known = [field.name for field in fields(config)]
     for name in given:
@@ -49,13 +49,13 @@ def check_settings(algo: str, config: Settings | type[Settings], given: Iterable
 
 
 def plain_settings(found: object) -> dict[str, Any]:
-    """The settings of an earlier session, as JSON has them: lists are tuples again."""
+    """Return settings that were read from JSON, with tuples instead of lists."""
     settings = found if isinstance(found, dict) else {}
     return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
 
 
 def flag(name: str) -> str:
-    """What the command line calls a setting.
+    """Return the command-line option of a setting.
 
     >>> flag("batch_size")
     '--batch-size'
@@ -64,13 +64,13 @@ def flag(name: str) -> str:
 
 
 def field_help(config_type: type) -> dict[str, str]:
-    """The doc line under each field of a config dataclass, inherited fields first.
+    """Return the string under each field of a config dataclass, inherited fields first.
 
     Args:
-        config_type: a dataclass whose source can be read.
+        config_type: Dataclass whose source file is available.
 
     Returns:
-        Field name -> its line, in the order of the fields.
+        Strings by field name, in the order of the fields.
     """
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
@@ -81,7 +81,7 @@ def field_help(config_type: type) -> dict[str, str]:
 
 
 def _lines_under_fields(config_type: type) -> dict[str, str]:
-    """Python keeps no docstring of a field, so it is read from the source."""
+    """Parse the strings from the source, since Python does not store docstrings of fields."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
     assert isinstance(tree, ast.ClassDef)
     lines = {}

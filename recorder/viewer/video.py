@@ -71,7 +71,8 @@ def _write(path: Path, kind: str, pictures: Iterable[Picture], pictures_per_s: f
             imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    with imageio.imopen(path, "w", plugin="pyav", extension=kind) as film:
+    options = {"plugin": "pyav", "extension": kind, "container": kind[1:]}
+    with imageio.imopen(path, "w", **options) as film:
         film.init_video_stream("libx264", fps=float(pictures_per_s))
         for picture in pictures:
             film.write_frame(picture)
