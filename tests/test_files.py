@@ -1,4 +1,4 @@
-"""A file that is written atomically has its old or its new content, and leaves nothing beside it."""
+"""A file that is replaced has its old or its new content, and nothing is left beside it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from mcaprl.files import replacing, write_atomically, write_json
 from mcaprl.problem import Problem
 
 
+def fail_halfway(path: Path) -> None:
+    with replacing(path) as unfinished:
+        unfinished.write_bytes(b"half")
+        raise KeyError
+
+
 def test_an_error_leaves_the_old_content(tmp_path: Path) -> None:
     path = tmp_path / "new" / "file.txt"
     write_atomically(path, b"old")
-    with pytest.raises(KeyError), replacing(path) as unfinished:
-        unfinished.write_bytes(b"half")
-        raise KeyError
+    with pytest.raises(KeyError):
+        fail_halfway(path)
     assert path.read_bytes() == b"old"
     with replacing(path, concurrent=True) as unfinished:
         unfinished.write_bytes(b"new")
