@@ -104,23 +104,37 @@ def recover_log(
         try:
             restore = partial(_restore_metadata, recovery.damages)
             recover_file(source, copied, recovery.damages, restore)
-            reader = McapReader(copied)
-            recovery.messages = _count_messages(reader)
-            if recovery.messages == 0:
-                raise LogError(f"{source} cannot be recovered: no message in it can be read")
-            plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
-            if plan is not None:
-                _add_plan(recovery, plan)
-            if plan is not None and plan.changes_anything:
-                write_planned(reader, result, plan)
-                recovery.messages = _count_messages(McapReader(result))
-            else:
-                os.replace(copied, result)
-            if plan is not None:
-                _require_valid(source, result)
+            _keep_whole_episodes(copied, result, recovery, keep_unfinished)
         finally:
             copied.unlink(missing_ok=True)
     return recovery
+
+
+def _keep_whole_episodes(
+    copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
+) -> None:
+    """Move a valid MCAP file to `result`, or write its whole episodes there if it has others.
+
+    Raises:
+        LogError: There is nothing to keep, or the new log has a problem.
+    """
+    reader = McapReader(copied)
+    recovery.messages = _count_messages(reader)
+    if recovery.messages == 0:
+        raise LogError(f"{recovery.source} cannot be recovered: no message in it can be read")
+    plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
+    if plan is None:
+        os.replace(copied, result)
+        return
+    _add_plan(recovery, plan)
+    if plan.changes_anything:
+        write_planned(reader, result, plan)
+        recovery.messages = _count_messages(McapReader(result))
+    else:
+        os.replace(copied, result)
+    if problems := check_log(result):
+        what, where = problems[0].what, problems[0].where
+        raise LogError(f"{recovery.source} cannot be recovered: {what} ({where})")
 
 
 def _restore_metadata(
@@ -163,14 +177,3 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""
         raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")
-
-
-def _require_valid(source: Path, result: Path) -> None:
-    """Check the new log before it is moved into place.
-
-    Raises:
-        LogError: The check finds a problem.
-    """
-    problems = check_log(result)
-    if problems:
-        raise LogError(f"{source} cannot be recovered: {problems[0].what} ({problems[0].where})")
