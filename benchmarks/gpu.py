@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -24,6 +23,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.workloads import vectors
+from mcaprl.files import write_json
 from mcaprl.offline.algorithms.cql import CQL, CQLConfig
 from mcaprl.offline.batches.buffer import TransitionBuffer
 
@@ -53,7 +53,7 @@ def main() -> None:
         share = rates["graph"] / rates["limit"]
         print(f"| {seeds} | {' | '.join(f'{r:.0f}' for r in rates.values())} | {share:.0%} |")
         rows.append({"seeds": seeds, **rates, "share": share})
-    RESULTS.write_text(json.dumps({"device": name, "rows": rows}, indent=2) + "\n")
+    write_json(RESULTS, {"device": name, "rows": rows})
 
 
 def measure(

@@ -52,11 +52,7 @@ class RunFolder:
                 "; it holds no run to resume" if resume else ", or resume the run in it (--resume)"
             )
             raise OutputExistsError(f"{self.path} exists: choose another folder{hint}")
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise TrainingError(f"cannot write {self.path}: {error.strerror}") from error
-        write_json(config, {**self.identity.to_json(), **self.source})
+        write_json(config, {**self.identity.to_json(), **self.source}, TrainingError)
 
     def of_seed(self, seed: int) -> Path:
         """The folder of one seed; it is made."""
