@@ -36,6 +36,7 @@ import mcaprl
 from benchmarks import rivals
 from benchmarks.page import write_section
 from benchmarks.workloads import EPISODE_STEPS, vectors
+from mcaprl.files import write_json
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 
@@ -212,7 +213,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             results[WHOLE] = whole_way(Path(folder), turns)
     print(table := as_table(results))
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(RESULTS, results)
     write_section("learning-speed", table)
 
 

@@ -27,6 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
+from mcaprl.files import write_json
 from mcaprl.offline.estimate.fqe import FQEConfig
 from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
 from mcaprl.offline.estimate.ranking import rank_correlation, regret_at_1
@@ -171,7 +172,7 @@ def main() -> None:
     for seed in range(len(by_seed), SEEDS):
         log, kept = train(arguments.sim, folder / f"seed-{seed}", seed, STEPS[arguments.sim])
         by_seed.append(ask(arguments.sim, log, kept, config))
-        result.write_text(json.dumps(by_seed, indent=1) + "\n")
+        write_json(result, by_seed)
     show(arguments.sim, by_seed)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks import growth, logs, sims
 from benchmarks.measure import Table
 from benchmarks.workloads import IMAGE_STEPS
+from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -89,7 +90,7 @@ def write_results(tables: list[Table], transitions: int) -> None:
         "versions": {name: _version(name) for name in LIBRARIES},
         "tables": [table.to_json() for table in tables],
     }
-    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+    write_json(RESULTS, results)
     versions = ", ".join(f"{name} {_version(name)}" for name in LIBRARIES)
     about = (
         f"The log of vectors has {transitions:,} transitions of 19 float32 in episodes of 1,000;"

@@ -1,19 +1,19 @@
-"""Every error a user can meet. A message says what is wrong, where, and what to do.
+"""All errors that a user can meet. A message says what is wrong, where, and what to do.
 
 McaprlError
-├── UsageError            the request itself cannot be meant           (exit code 2)
-│   ├── UnknownNameError    no sim, policy, observation... of that name
-│   ├── OutputExistsError   the output path is taken
+├── UsageError            the request is invalid                       (exit code 2)
+│   ├── UnknownNameError    a sim, policy, observation... is unknown
+│   ├── OutputExistsError   the output path exists
 │   └── MissingExtraError   an optional dependency is not installed
 ├── LogError              a log cannot be read or written as asked     (exit code 1)
-│   ├── NotMcapError        the file is no MCAP file
+│   ├── NotMcapError        the file is not an MCAP file
 │   ├── NoStepsError        the file has no `/rl/step` topic, or no finished episode
-│   │   └── NoEpisodesError   it has the topic, but no finished episode (yet)
-│   └── CorruptLogError     the file's bytes contradict each other
+│   │   └── NoEpisodesError   it has the topic, but no finished episode
+│   └── CorruptLogError     the file is damaged
 ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
 ├── PolicyError           a saved policy cannot be used                (exit code 1)
-├── TrainingError         learning cannot go on                        (exit code 1)
-└── ReportError           a picture or report cannot be written        (exit code 1)
+├── TrainingError         training cannot continue                     (exit code 1)
+└── ReportError           a figure, video or report cannot be written  (exit code 1)
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from typing import ClassVar
 
 
 class McaprlError(Exception):
-    """Base of all errors that a user's data or request can cause."""
+    """Base class of all errors caused by data or a request of the user."""
 
     exit_code: ClassVar[int] = 1
 
 
 class UsageError(McaprlError):
-    """The request cannot be carried out as it was put."""
+    """The request is invalid."""
 
     exit_code = 2
 
 
 class UnknownNameError(UsageError):
-    """No such name; the message lists the nearest ones, or all when there are few."""
+    """A name is unknown; the message lists the known names and suggests similar ones."""
 
     def __init__(
         self, kind: str, name: str, known: Iterable[str], others: Iterable[str] = ()
     ) -> None:
-        """Say which `kind` of thing `name` was meant to be.
+        """Compose the message.
 
         Args:
-            kind: such as `policy`.
-            name: that is not known.
-            known: names that are, to be listed.
-            others: more of them, too many to list.
+            kind: Kind of the named thing, such as `policy`.
+            name: Unknown name.
+            known: Known names, which the message lists.
+            others: More known names, which are only suggested if they are similar.
         """
         names, more = sorted(known), sorted(others)
         near = difflib.get_close_matches(name, [*names, *more], n=3, cutoff=0.5)
@@ -58,12 +58,12 @@ class UnknownNameError(UsageError):
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
-        """Make it again in another process, which cannot be done from the message alone."""
+        """Return the arguments to pickle: the message alone is not enough."""
         return type(self), self._arguments
 
 
 class OutputExistsError(UsageError):
-    """The output path exists and may not be replaced."""
+    """The output path exists and must not be replaced."""
 
 
 class MissingExtraError(UsageError):
@@ -75,7 +75,7 @@ class LogError(McaprlError):
 
 
 class NotMcapError(LogError):
-    """The file is no MCAP file."""
+    """The file is not an MCAP file."""
 
 
 class NoStepsError(LogError):
@@ -83,38 +83,38 @@ class NoStepsError(LogError):
 
 
 class NoEpisodesError(NoStepsError):
-    """The file is a log, but no episode of it is finished."""
+    """The file is a log, but has no finished episode."""
 
 
 class CorruptLogError(LogError):
-    """The file's bytes contradict each other: a CRC, a length or an index is wrong."""
+    """The file is damaged: a CRC, a length or an index is wrong."""
 
 
 class SpaceError(McaprlError):
-    """Spaces that cannot be logged, or that do not agree with each other."""
+    """Spaces cannot be logged, or do not match."""
 
 
 class PolicyError(McaprlError):
-    """A saved policy cannot be loaded, or does not fit what it is asked to drive."""
+    """A saved policy cannot be loaded, or does not fit the environment or dataset."""
 
 
 class TrainingError(McaprlError):
-    """Learning cannot go on."""
+    """Training cannot continue."""
 
 
 class ReportError(McaprlError):
-    """A picture or report cannot be written."""
+    """A figure, video or report cannot be written."""
 
 
 def import_extra(module: str, extra: str) -> ModuleType:
     """Import an optional dependency.
 
     Args:
-        module: the module's import name, such as `"torch"`.
-        extra: the extra of `mcaprl` that installs it, such as `"offline"`.
+        module: Import name of the module, such as `"torch"`.
+        extra: Extra of `mcaprl` that installs it, such as `"offline"`.
 
     Raises:
-        MissingExtraError: it is not installed; the message has the pip line that mends it.
+        MissingExtraError: It is not installed; the message has the pip command that installs it.
     """
     try:
         return importlib.import_module(module)

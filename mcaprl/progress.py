@@ -1,4 +1,4 @@
-"""How far training has come: told to a callback, shown in a terminal."""
+"""Progress of training: values for a callback, and progress bars in a terminal."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """One sign of life, after everything that belongs to that moment is written.
+    """State of a run, reported after all files of that state are written.
 
     Attributes:
-        seed: which run.
-        done: updates done, or steps.
-        total: updates in all, or steps.
-        terms: what was measured, such as the loss.
+        seed: Seed of the run.
+        done: Number of updates or steps so far.
+        total: Number of updates or steps of the whole run.
+        terms: Measured values by name, such as the loss.
     """
 
     seed: int
@@ -30,16 +30,16 @@ class TrainingProgress:
 
 
 ProgressCallback = Callable[[TrainingProgress], None]
-"""Called now and then while training; what it raises stops the training."""
+"""Callback that is called from time to time; an exception that it raises stops the training."""
 
 
 @contextmanager
 def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
-    """A bar per seed with speed, one term and time left; silent where stderr is no terminal.
+    """Show a bar for each seed with speed, one term and time left, if stderr is a terminal.
 
     Args:
-        unit: of what is counted, such as `updates`.
-        term: to show beside it, such as `loss`.
+        unit: Unit of `done` and `total`, such as `updates`.
+        term: Name of the term to show, such as `loss`.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -57,7 +57,7 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
 
 
 class _SeedBars:
-    """Adds a bar when a seed is first heard of."""
+    """Progress bars; a bar is added when a seed first reports."""
 
     def __init__(self, bars: Progress, term: str) -> None:
         self._bars = bars

@@ -1,4 +1,4 @@
-"""Tensors in safetensors files, with a JSON object beside them; nothing is ever unpickled."""
+"""Safetensors files with a JSON object in the header; nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _DESCRIPTION = "description"
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Write tensors, with a JSON object in the file's header."""
-    # Copies, because safetensors refuses views of one storage.
+    """Write tensors, and a description in the header of the file, with `replacing`."""
+    # Safetensors refuses tensors that share storage.
     whole = {
         name: tensor.clone(memory_format=torch.contiguous_format)
         for name, tensor in tensors.items()
@@ -27,12 +27,12 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str,
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `write_tensors` wrote.
+    """Read the tensors and the description of a file that `write_tensors` wrote.
 
     Raises:
-        OSError: the file cannot be opened.
-        SafetensorError: it is no safetensors file.
-        ValueError: its header has no JSON object.
+        OSError: The file cannot be opened.
+        SafetensorError: The file is not a safetensors file.
+        ValueError: The header has no description.
     """
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

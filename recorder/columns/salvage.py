@@ -1,9 +1,9 @@
-"""Finds what is sound in a damaged MCAP file: records that are what their lengths say.
+"""Search for the valid records of a damaged MCAP file.
 
-MCAP has no marks to begin again at. Where a record is damaged, the one behind it is looked for: by
-the damaged one's length if that leads to a sound record, else byte by byte for a while, else by the
-form of a chunk, in which two lengths must agree. A record that passes is exactly as its writer
-would have written it; whether a chunk's contents are whole, its CRC tells whoever opens it.
+MCAP has no synchronization marks. The record after a damaged one is found by the length of the
+damaged one if that leads to a valid record, else byte by byte over a limited distance, else by the
+layout of a chunk, in which two lengths must agree. A valid record has the bytes that its writer
+would have written; the CRC of a chunk is not checked here, but when it is decompressed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from mcaprl.recorder.columns.records import RECORD_HEADER, parse_record, records
 ValidRecord = tuple[int, int, memoryview]
 """Offset, opcode and content."""
 
-# Records that carry something; what the rest say can be found out again.
+# Records with content that cannot be recomputed from other records.
 _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _SEARCHED = (*_REWRITTEN, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _CHUNK_NAME = struct.Struct("<QQQII")
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-# So far every byte is tried; a search for chunks goes on from there.
+# Distance over which every byte is tried; after it, only chunks are searched for.
 _NEAR_BYTES = 2**16
 _BLOCK_BYTES = 2**22
 
@@ -42,9 +42,9 @@ class Damage:
     """A place in a file that cannot be read.
 
     Attributes:
-        offset: of its first byte.
-        bytes: how many.
-        what: is wrong there.
+        offset: Offset of the first byte.
+        bytes: Number of bytes; 0 if the damage is not in one place.
+        what: Description of the damage.
     """
 
     offset: int
@@ -53,11 +53,11 @@ class Damage:
 
 
 def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidRecord]:
-    """Yield offset, opcode and content of each sound record of the data section.
+    """Yield offset, opcode and content of each valid record of the data section.
 
     Args:
-        view: the file.
-        damages: what is between them is added here.
+        view: Content of the file.
+        damages: List to which the bytes between valid records are added.
     """
     offset = len(MCAP0_MAGIC)
     if bytes(view[:offset]) != MCAP0_MAGIC:
@@ -76,7 +76,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
         if opcode == Opcode.DATA_END:
             if _ends_data(view, offset, content):
                 return
-            damages.append(Damage(offset, 0, "the data does not match the CRC of all"))
+            damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
         # Not before the end: a copy of the rest at each record would make this quadratic.
@@ -85,9 +85,9 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
 
 
 def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
-    """Whether a DataEnd record is the data's end: all in front of it is, then, as it was written.
+    """Return whether a DataEnd record is the end of the data section.
 
-    Without a CRC it is believed if only a summary can follow.
+    Its CRC must match the data before it. Without a CRC, no chunk may follow.
     """
     (crc,) = struct.unpack("<I", content)
     if crc:
@@ -96,7 +96,7 @@ def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
 
 
 def _valid_record(view: memoryview, offset: int) -> memoryview | None:
-    """The content of the record at `offset`, if it is as a writer would have written it."""
+    """Return the content of the record at `offset`; None if it is not valid."""
     if offset + RECORD_HEADER_BYTES > len(view):
         return None
     opcode, length = RECORD_HEADER.unpack_from(view, offset)
@@ -105,10 +105,10 @@ def _valid_record(view: memoryview, offset: int) -> memoryview | None:
     if (opcode not in _KNOWN and opcode < 0x80) or length > len(view) - start:
         return None
     content = view[start : start + length]
-    return content if _is_sound(opcode, content) else None
+    return content if _is_valid(opcode, content) else None
 
 
-def _is_sound(opcode: int, content: memoryview) -> bool:
+def _is_valid(opcode: int, content: memoryview) -> bool:
     match opcode:
         case Opcode.CHUNK:
             return _is_chunk(content)
@@ -129,16 +129,16 @@ def _is_sound(opcode: int, content: memoryview) -> bool:
 
 
 def _repeats(opcode: int, content: memoryview) -> bool:
-    """Whether a record that is read and written again is the same."""
+    """Return whether parsing and serializing a record returns the same bytes."""
     try:
         builder = RecordBuilder()
         parse_record(opcode, content).write(builder)
     except (CorruptLogError, struct.error):
         return False
-    again, told = bytes(builder.end()[RECORD_HEADER_BYTES:]), bytes(content)
-    # The CRC of an attachment may have been left out.
-    without_crc = opcode == Opcode.ATTACHMENT and told[-4:] == bytes(4)
-    return again == told or (without_crc and again[:-4] == told[:-4])
+    again, original = bytes(builder.end()[RECORD_HEADER_BYTES:]), bytes(content)
+    # A writer can leave out the CRC of an attachment.
+    without_crc = opcode == Opcode.ATTACHMENT and original[-4:] == bytes(4)
+    return again == original or (without_crc and again[:-4] == original[:-4])
 
 
 def _is_chunk(content: memoryview) -> bool:
@@ -151,14 +151,16 @@ def _is_chunk(content: memoryview) -> bool:
 
 
 def _next_record(view: memoryview, damaged: int) -> int:
-    """Where the next sound record is behind a damaged one; the file's end if there is none."""
+    """Return the offset of the next valid record after a damaged one, or the length of the file."""
     if damaged + RECORD_HEADER_BYTES <= len(view):
         _, length = RECORD_HEADER.unpack_from(view, damaged)
-        behind = int(damaged + RECORD_HEADER_BYTES + length)
-        leads_on = behind < len(view) and view[behind] in _KNOWN and _valid_record(view, behind)
-        # A wrong length may lead to a message within another chunk, past whole ones.
-        if leads_on and _next_chunk(view, damaged + 1, behind) == behind:
-            return behind
+        following = int(damaged + RECORD_HEADER_BYTES + length)
+        is_valid = (
+            following < len(view) and view[following] in _KNOWN and _valid_record(view, following)
+        )
+        # A wrong length can lead into a later chunk, past valid ones.
+        if is_valid and _next_chunk(view, damaged + 1, following) == following:
+            return following
     near = min(damaged + _NEAR_BYTES, len(view))
     for offset in range(damaged + 1, near):
         if view[offset] in _SEARCHED and _valid_record(view, offset) is not None:
@@ -167,7 +169,7 @@ def _next_record(view: memoryview, damaged: int) -> int:
 
 
 def _next_chunk(view: memoryview, start: int, stop: int) -> int:
-    """Where the first sound chunk begins from `start` on; `stop` if there is none before it."""
+    """Return the offset of the first valid chunk from `start` on; `stop` if there is none."""
     bytes_ = np.frombuffer(view, np.uint8)
     for block in range(start, stop, _BLOCK_BYTES):
         for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, stop)):
@@ -177,7 +179,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
 
 
 def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
-    """Places with a chunk's opcode and a length below 2**40."""
+    """Return offsets of bytes with a chunk's opcode and a length below 2**40."""
     found = start + np.flatnonzero(bytes_[start:stop] == int(Opcode.CHUNK))
     found = found[found + RECORD_HEADER_BYTES <= len(bytes_)]
     for high in (6, 7, 8):
@@ -187,7 +189,7 @@ def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
 
 
 def intact_summary(view: memoryview) -> list[Any]:
-    """Schemas and channels from the summary, if that is there and matches its CRC."""
+    """Return schemas and channels of the summary; none if it is missing or fails its CRC."""
     end = len(view) - len(MCAP0_MAGIC)
     start = end - RECORD_HEADER_BYTES - 20
     if start < len(MCAP0_MAGIC) or bytes(view[end:]) != MCAP0_MAGIC:

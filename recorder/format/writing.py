@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from mcaprl.recorder.columns.append import what_is_written
 from mcaprl.recorder.columns.file_lock import refuse_if_taken
 from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.columns.ros_types import ENCAPSULATION
 from mcaprl.recorder.columns.signals import HoldSignals
+from mcaprl.recorder.columns.valid_copy import DROP, KEEP, copy_messages, recover_file
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 
 __all__ = [
     "COMPRESSIONS",
+    "DROP",
     "ENCAPSULATION",
+    "KEEP",
     "HoldSignals",
     "McapWriter",
+    "copy_messages",
     "message_rows",
+    "recover_file",
     "refuse_if_taken",
-    "what_is_written",
 ]

@@ -1,6 +1,6 @@
 """Checks of a whole log.
 
-    file      summary, CRC of the data section                         (this module)
+    file      summary, CRCs of the data section and attachments        (file_check)
     chunks    CRCs, message indexes, chunk indexes of the summary      (chunk_check)
     log       metadata, schema, episodes, order of steps, images       (episode_check)
 
@@ -9,7 +9,6 @@ Each chunk is decompressed once.
 
 from __future__ import annotations
 
-import struct
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,20 +17,15 @@ from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
-from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
-
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.problem import Problem
 from mcaprl.recorder.format.reading import (
-    RECORD_HEADER_BYTES,
     McapReader,
     Piece,
     Scratch,
+    check_file,
     check_piece,
     check_statistics,
-    crc32,
-    is_intact_attachment,
     packed,
     place,
 )
@@ -56,7 +50,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
         action = _recover(path) if isinstance(error, CorruptLogError) else "restore it from a copy"
         what = _without_path(error, path)
         return [Problem(what, "opening the file", next=action, file=str(path))]
-    found = [*_check_file(reader)]
+    found = [*check_file(reader)]
     try:
         found += _check_contents(reader, whole=not found, threads=threads)
     except (LogError, SpaceError) as error:
@@ -115,42 +109,6 @@ def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Cal
                 return
             numbers, future = ahead.popleft()
             yield numbers, future.result
-
-
-def _check_file(reader: McapReader) -> list[Problem]:
-    """Check that there is a summary, and the CRCs of the data section and of attachments."""
-    found = []
-    if not reader.complete:
-        found.append(
-            Problem(
-                "the file has no summary: its writer was killed or is still running",
-                f"after byte {reader.data_end}",
-            )
-        )
-    end = None
-    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
-        if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):
-            found.append(Problem("an attachment does not match its CRC", f"byte {offset}"))
-        if opcode == Opcode.DATA_END:
-            end = offset
-            found += _check_data_end(reader, offset, content)
-            break
-    if reader.complete and end is None:
-        where = "the records between header and summary"
-        found.append(Problem("the data section has no end", where))
-    return found
-
-
-def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> list[Problem]:
-    if len(content) != 4 or (
-        reader.summary_start and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start
-    ):
-        return [Problem("the data section's end is damaged", f"byte {offset}")]
-    (crc,) = struct.unpack("<I", content)
-    if crc and crc32(reader.view[:offset]) != crc:
-        where = f"bytes 0 to {offset}"
-        return [Problem("the data section does not match its CRC", where)]
-    return []
 
 
 def _recover(path: Path) -> str:

@@ -1,8 +1,7 @@
 """Recovery of the valid part of a log that was cut off or damaged.
 
-    valid records -> valid MCAP file        -> complete episodes -> OUT
-    (salvage)        (valid_copy: chunks,      (whole_episodes)
-                      new indexes and CRCs)
+    valid records -> valid MCAP file with new indexes and CRCs -> whole episodes -> OUT
+    (salvage)        (valid_copy)                                (whole_episodes)
 
 Metadata, attachments and all topics are kept; only messages of `/rl/` topics that belong to a
 dropped episode are left out. Whatever is left out is reported.
@@ -11,27 +10,21 @@ dropped episode are left out. Whatever is left out is reported.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
-from mcap.opcode import Opcode
+from mcap.records import Channel, Metadata
 
 from mcaprl.errors import LogError, NoEpisodesError, OutputExistsError, UsageError
 from mcaprl.files import replacing
 from mcaprl.problem import Problem
-from mcaprl.recorder.format.reading import (
-    Damage,
-    McapReader,
-    ValidRecord,
-    chunk_header,
-    map_file,
-    parse_record,
-    valid_records,
-)
-from mcaprl.recorder.format.writing import McapWriter, refuse_if_taken
+from mcaprl.recorder.format.metadata import METADATA_NAME
+from mcaprl.recorder.format.reading import Damage, McapReader
+from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder.format.writing import recover_file, refuse_if_taken
 from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.valid_copy import copy_records
 from mcaprl.recorder.repair.whole_episodes import (
     DroppedEpisode,
     EpisodePlan,
@@ -109,59 +102,53 @@ def recover_log(
     with replacing(target, LogError) as result:
         copied = result.with_name(f"{result.name}.records")
         try:
-            view = map_file(source)
-            records = list(valid_records(view, recovery.damages))
-            style = _Style.of(view, records)
-            style.write(copied, lambda new: copy_records(view, records, new, recovery.damages))
-            reader = McapReader(copied)
-            recovery.messages = _count_messages(reader)
-            if recovery.messages == 0:
-                raise LogError(f"{source} cannot be recovered: no message in it can be read")
-            plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
-            if plan is not None:
-                _add_plan(recovery, plan)
-            if plan is not None and plan.changes_anything:
-                style.write(result, lambda writer: write_planned(reader, writer, plan))
-                recovery.messages = _count_messages(McapReader(result))
-            else:
-                os.replace(copied, result)
-            if plan is not None:
-                _require_valid(source, result)
+            restore = partial(_restore_metadata, recovery.damages)
+            recover_file(source, copied, recovery.damages, restore)
+            _keep_whole_episodes(copied, result, recovery, keep_unfinished)
         finally:
             copied.unlink(missing_ok=True)
     return recovery
 
 
-@dataclass(frozen=True)
-class _Style:
-    """Compression and profile of the damaged file, which the new one has as well.
+def _keep_whole_episodes(
+    copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
+) -> None:
+    """Move a valid MCAP file to `result`, or write its whole episodes there if it has others.
 
-    Attributes:
-        compression: Compression of the first chunk.
-        profile: Profile in the header.
+    Raises:
+        LogError: There is nothing to keep, or the new log has a problem.
     """
+    reader = McapReader(copied)
+    recovery.messages = _count_messages(reader)
+    if recovery.messages == 0:
+        raise LogError(f"{recovery.source} cannot be recovered: no message in it can be read")
+    plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
+    if plan is None:
+        os.replace(copied, result)
+        return
+    _add_plan(recovery, plan)
+    if plan.changes_anything:
+        write_planned(reader, result, plan)
+        recovery.messages = _count_messages(McapReader(result))
+    else:
+        os.replace(copied, result)
+    if problems := check_log(result):
+        what, where = problems[0].what, problems[0].where
+        raise LogError(f"{recovery.source} cannot be recovered: {what} ({where})")
 
-    compression: str
-    profile: str
 
-    @classmethod
-    def of(cls, view: memoryview, records: list[ValidRecord]) -> _Style:
-        first = next((offset for offset, opcode, _ in records if opcode == Opcode.CHUNK), None)
-        name = "zstd" if first is None else chunk_header(view, first).compression or "none"
-        headers = [parse_record(opcode, c) for _, opcode, c in records if opcode == Opcode.HEADER]
-        profile = headers[0].profile if headers else "ros2"
-        return cls(name if name in ("zstd", "lz4", "none") else "zstd", profile)
-
-    def write(self, path: Path, write: Callable[[McapWriter], None]) -> None:
-        """Write a file from the first to the last record."""
-        writer = McapWriter(
-            path, compression=self.compression, overwrite=True, profile=self.profile
-        )
-        try:
-            write(writer)
-            writer.close()
-        finally:
-            writer.abandon()
+def _restore_metadata(
+    damages: list[Damage], metadata: list[Metadata], channels: Iterable[Channel]
+) -> list[Metadata]:
+    """Replace the metadata record with its copy in the channel of `/rl/step`, if there is one."""
+    for channel in channels:
+        if channel.topic == STEP_TOPIC and "format_version" in channel.metadata:
+            records = [record for record in metadata if record.name == METADATA_NAME]
+            if any(record.metadata != channel.metadata for record in records):
+                damages.append(Damage(0, 0, "the metadata record and its copy differ"))
+            others = [record for record in metadata if record.name != METADATA_NAME]
+            return [Metadata(METADATA_NAME, channel.metadata), *others]
+    return metadata
 
 
 def _check_paths(source: Path, target: Path, overwrite: bool) -> None:
@@ -190,14 +177,3 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
         can_end = any(dropped.can_end for dropped in plan.dropped)
         hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""
         raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")
-
-
-def _require_valid(source: Path, result: Path) -> None:
-    """Check the new log before it is moved into place.
-
-    Raises:
-        LogError: The check finds a problem.
-    """
-    problems = check_log(result)
-    if problems:
-        raise LogError(f"{source} cannot be recovered: {problems[0].what} ({problems[0].where})")

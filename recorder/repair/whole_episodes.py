@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel, Metadata, Schema
+from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
@@ -23,17 +24,14 @@ from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, 
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
     LOG_TIME,
-    MESSAGE_HEADER,
     Columns,
     McapReader,
     Topic,
-    contents_of,
-    only,
 )
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
-from mcaprl.recorder.format.writing import McapWriter, what_is_written
+from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
 
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Prefix of topics whose messages belong to episodes; other topics are kept as they are.
@@ -46,8 +44,8 @@ Place = tuple[int, int]
 class RowAction(IntEnum):
     """Action for one record of `/rl/step`."""
 
-    DROP = 0
-    KEEP = 1
+    DROP = DROP
+    KEEP = KEEP
     # For an episode whose end is missing: its last transition, and the observation after it.
     TRUNCATE = 2
     MAKE_FINAL = 3
@@ -150,29 +148,28 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     return plan
 
 
-def write_planned(reader: McapReader, writer: McapWriter, plan: EpisodePlan) -> None:
+def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> None:
     """Write the kept records to another file."""
-    standing = what_is_written(reader.path).standing
-    for record in sorted(standing, key=lambda record: not isinstance(record, Metadata)):
-        writer.announce(record)
-    for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
-        records = reader.chunk_records(chunk)
-        indexes = contents_of(records).indexes
-        actions = {
-            id_: _actions(plan, (chunk.chunk_start_offset, id_), reader.channels[id_], index)
-            for id_, index in indexes.items()
-        }
-        if all((action == RowAction.KEEP).all() for action in actions.values()):
-            writer.write_records(records, indexes)
-        else:
-            _write_some(reader, writer, records, indexes, actions)
-    if plan.new_summaries:
-        channel_id = writer.add_channel(
-            EPISODE_TOPIC, messages.EPISODE_TYPE, messages.definition(messages.EPISODE_TYPE)
-        )
-        writer.write_messages(
-            [(channel_id, one.end_time_ns, one.to_message()) for one in plan.new_summaries]
-        )
+
+    def actions_of(chunk: ChunkIndex, channel: Channel, index: NDArray[Any]) -> NDArray[np.uint8]:
+        place = (chunk.chunk_start_offset, channel.id)
+        if place in plan.actions:
+            return plan.actions[place]
+        if not channel.topic.startswith(_EPISODE_TOPICS):
+            return np.full(len(index), RowAction.KEEP, np.uint8)
+        return _is_inside(plan, index["log_time"]).astype(np.uint8)
+
+    def edit(channel: Channel, data: memoryview, action: int) -> None:
+        _end_episode(data, _message_dtype(reader.schema_of(channel)), RowAction(action))
+
+    with copy_messages(reader, target, actions_of, edit) as writer:
+        if plan.new_summaries:
+            channel_id = writer.add_channel(
+                EPISODE_TOPIC, messages.EPISODE_TYPE, messages.definition(messages.EPISODE_TYPE)
+            )
+            writer.write_messages(
+                [(channel_id, one.end_time_ns, one.to_message()) for one in plan.new_summaries]
+            )
 
 
 @dataclass(frozen=True)
@@ -292,18 +289,6 @@ def _by_place(
         start = stop
 
 
-def _actions(
-    plan: EpisodePlan, place: Place, channel: Channel, index: NDArray[Any]
-) -> NDArray[np.uint8]:
-    """Return the actions for the messages of one channel in one chunk."""
-    if place in plan.actions:
-        return plan.actions[place]
-    if not channel.topic.startswith(_EPISODE_TOPICS):
-        return np.full(len(index), RowAction.KEEP, np.uint8)
-    inside = _is_inside(plan, index["log_time"])
-    return np.where(inside, np.uint8(RowAction.KEEP), np.uint8(RowAction.DROP))
-
-
 def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.bool_]:
     """Return for each time whether it is within a kept episode."""
     if not plan.episodes:
@@ -314,36 +299,10 @@ def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.b
     return is_inside
 
 
-def _write_some(
-    reader: McapReader,
-    writer: McapWriter,
-    records: memoryview,
-    indexes: dict[int, NDArray[Any]],
-    actions: dict[int, NDArray[np.uint8]],
-) -> None:
-    """Write the messages of a chunk that are not dropped."""
-    left = {id_: action[action != RowAction.DROP] for id_, action in actions.items()}
-    kept, new_indexes = only(
-        records,
-        {
-            id_: index[actions[id_] != RowAction.DROP]
-            for id_, index in indexes.items()
-            if len(left[id_])
-        },
-    )
-    for channel_id, index in new_indexes.items():
-        for row in np.flatnonzero(left[channel_id] != RowAction.KEEP).tolist():
-            record = kept[int(index["offset"][row]) :]
-            _end_at(record, reader, reader.channels[channel_id], RowAction(left[channel_id][row]))
-    if new_indexes:
-        writer.write_records(kept, new_indexes)
-
-
-def _end_at(record: memoryview, reader: McapReader, channel: Channel, action: RowAction) -> None:
+def _end_episode(data: memoryview, dtype: np.dtype[Any] | None, action: RowAction) -> None:
     """Change a message so that its episode ends with it."""
-    dtype = _message_dtype(reader.schema_of(channel))
     assert dtype is not None, "only episodes with a known message dtype are ended"
-    message = np.frombuffer(record, dtype, 1, MESSAGE_HEADER.itemsize)
+    message = np.frombuffer(data, dtype, 1)
     if action == RowAction.TRUNCATE:
         message["truncated"] = True
         return

@@ -1,0 +1,234 @@
+"""Copies of MCAP files: the valid records of a damaged one, or selected messages of a valid one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.columns.append import what_is_written
+from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
+from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import contents_of, map_file, only, parse_record
+from mcaprl.recorder.columns.salvage import Damage, ValidRecord, intact_summary, valid_records
+from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
+
+# Unchunked messages are written in chunks of this size.
+_UNCHUNKED_BYTES = 2**20
+
+RestoreMetadata = Callable[[list[Metadata], Iterable[Channel]], list[Metadata]]
+"""Function that corrects the metadata records of a damaged file with the help of its channels."""
+
+DROP, KEEP = 0, 1
+
+
+def recover_file(
+    source: Path, target: Path, damages: list[Damage], restore: RestoreMetadata
+) -> None:
+    """Write the valid records of a damaged file in chunks with new indexes and CRCs.
+
+    Args:
+        source: Path of the damaged file.
+        target: Path of the new file; an existing one is replaced.
+        damages: List to which places and records that cannot be copied are added.
+        restore: Function that returns the metadata records to write.
+
+    Raises:
+        LogError: A file cannot be read or written.
+    """
+    view = map_file(source)
+    records = list(valid_records(view, damages))
+    with _writer_like(view, records, target) as writer:
+        topics = _Topics(view, records, damages)
+        for metadata in restore(topics.metadata, topics.channels.values()):
+            writer.announce(metadata)
+        copy = _Copy(view, writer, topics, damages)
+        for offset, opcode, content in records:
+            copy.take(offset, opcode, content)
+        copy.flush()
+        topics.announce_rest(writer)
+
+
+@contextmanager
+def copy_messages(
+    reader: McapReader,
+    target: Path,
+    actions_of: Callable[[ChunkIndex, Channel, NDArray[Any]], NDArray[np.uint8]],
+    edit: Callable[[Channel, memoryview, int], None],
+) -> Iterator[McapWriter]:
+    """Write selected messages of a valid file, sorted by the start times of their chunks.
+
+    Args:
+        reader: Reader of the file; all its messages are in chunks.
+        target: Path of the new file; an existing one is replaced.
+        actions_of: Function that returns the action for each message of one channel in one chunk,
+            given their index: `DROP`, `KEEP`, or a larger number for a message to edit.
+        edit: Function that changes a message in place, given its channel, its data (and what
+            follows it in the chunk), and the action.
+
+    Yields:
+        The writer, for more messages.
+    """
+    with _writer_like(reader.view, reader.records(len(MCAP0_MAGIC)), target) as writer:
+        standing = what_is_written(reader.path).standing
+        for record in sorted(standing, key=lambda record: not isinstance(record, Metadata)):
+            writer.announce(record)
+        for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
+            records = reader.chunk_records(chunk)
+            indexes = contents_of(records).indexes
+            actions = {
+                id_: actions_of(chunk, reader.channels[id_], index)
+                for id_, index in indexes.items()
+            }
+            if any((action != KEEP).any() for action in actions.values()):
+                masks = {id_: action != DROP for id_, action in actions.items()}
+                kept = {id_: indexes[id_][mask] for id_, mask in masks.items() if mask.any()}
+                records, indexes = only(records, kept)
+                for id_, index in indexes.items():
+                    left = actions[id_][masks[id_]]
+                    for row in np.flatnonzero(left != KEEP).tolist():
+                        data = records[int(index["offset"][row]) + MESSAGE_HEADER.itemsize :]
+                        edit(reader.channels[id_], data, int(left[row]))
+            if indexes:
+                writer.write_records(records, indexes)
+        yield writer
+
+
+@contextmanager
+def _writer_like(
+    view: memoryview, records: Iterable[ValidRecord], target: Path
+) -> Iterator[McapWriter]:
+    """Write a file with the profile of another one and the compression of its first chunk."""
+    profile, compression = "ros2", "zstd"
+    for offset, opcode, content in records:
+        if opcode == Opcode.HEADER:
+            profile = parse_record(opcode, content).profile
+        if opcode == Opcode.CHUNK:
+            compression = chunk_header(view, offset).compression or "none"
+            break
+    if compression not in COMPRESSIONS:
+        compression = "zstd"
+    writer = McapWriter(target, compression=compression, overwrite=True, profile=profile)
+    try:
+        yield writer
+        writer.close()
+    finally:
+        writer.abandon()
+
+
+class _Topics:
+    """Schemas, channels and metadata of the damaged file, each from its most reliable copy."""
+
+    def __init__(
+        self,
+        view: memoryview,
+        records: Sequence[ValidRecord],
+        damages: list[Damage],
+    ) -> None:
+        self._damages = damages
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        # Records of the summary have a CRC; those of the data section share one with all others.
+        for record in intact_summary(view):
+            self.take(record, 0)
+        self.metadata: list[Metadata] = []
+        for offset, opcode, content in records:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.take(parse_record(opcode, content), offset)
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(parse_record(opcode, content))
+
+    def take(self, record: Schema | Channel, offset: int) -> None:
+        """Add a schema or channel; of two with one id, the first is kept."""
+        known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
+        if known.setdefault(record.id, record) != record:
+            what = f"{type(record).__name__.lower()} {record.id} has two definitions"
+            self._damages.append(Damage(offset, 0, what))
+
+    def announce(self, channel_id: int, writer: McapWriter) -> bool:
+        """Write a channel and its schema unless they are written; return whether they are known."""
+        channel = self.channels.get(channel_id)
+        if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
+            return False
+        if channel_id not in writer.channels:
+            if channel.schema_id and channel.schema_id not in writer.schemas:
+                writer.announce(self.schemas[channel.schema_id])
+            writer.announce(channel)
+        return True
+
+    def announce_rest(self, writer: McapWriter) -> None:
+        """Write the channels without messages."""
+        for channel_id in self.channels:
+            self.announce(channel_id, writer)
+
+
+class _Copy:
+    """Writer of valid records that leaves out repeated chunks and unknown channels."""
+
+    def __init__(
+        self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
+    ) -> None:
+        self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
+        self._seen: set[tuple[int, int]] = set()
+        self._unchunked, self._scratch = bytearray(), Scratch()
+
+    def take(self, offset: int, opcode: int, content: memoryview) -> None:
+        """Write the content of a record."""
+        if opcode == Opcode.CHUNK:
+            self.flush()
+            self._take_chunk(offset, len(content))
+        elif opcode == Opcode.MESSAGE:
+            self._unchunked += self._view[offset : offset + RECORD_HEADER_BYTES + len(content)]
+            if len(self._unchunked) > _UNCHUNKED_BYTES:
+                self.flush()
+        elif opcode == Opcode.ATTACHMENT:
+            self._writer.announce(parse_record(opcode, content))
+
+    def flush(self) -> None:
+        """Write the unchunked messages so far as a chunk."""
+        if self._unchunked:
+            self._write(memoryview(bytes(self._unchunked)), 0, len(self._unchunked))
+            self._unchunked = bytearray()
+
+    def _take_chunk(self, offset: int, size: int) -> None:
+        try:
+            records = chunk_records(self._view, offset, self._scratch)
+        except CorruptLogError as error:
+            self._damages.append(Damage(offset, size, str(error)))
+            return
+        key = (crc32(records), len(records))
+        if key in self._seen:
+            self._damages.append(Damage(offset, size, "a chunk that is in the file twice"))
+            return
+        self._seen.add(key)
+        self._write(records, offset, size)
+
+    def _write(self, records: memoryview, offset: int, size: int) -> None:
+        try:
+            contents = contents_of(records)
+        except CorruptLogError as error:
+            self._damages.append(Damage(offset, size, str(error)))
+            return
+        for topic in contents.topics:
+            self._topics.take(topic, offset)
+        known: dict[int, NDArray[Any]] = {}
+        for channel_id, index in contents.indexes.items():
+            if self._topics.announce(channel_id, self._writer):
+                known[channel_id] = index
+            else:
+                what = f"{len(index)} messages of channel {channel_id}, which has no definition"
+                self._damages.append(Damage(offset, 0, what))
+        if len(known) < len(contents.indexes):
+            records, known = only(records, known)
+        if known:
+            self._writer.write_records(records, known)
