@@ -157,7 +157,7 @@ def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> Non
     evaluation_page(tmp_path / "page", "lane", [score], [], [], None, None, curves)
     document, console = browse(tmp_path / "page" / "index.html")
     assert console == ""
-    assert document.index("Best and worst") < document.index("How they were learnt")
+    assert document.index("Best and worst") < document.index("Learning curves")
     assert document.count("<svg") == 1 + 1 + 2 + 3, "comparison, ways, thumbnails, curves"
 
 

@@ -1,1 +1,1 @@
-"""Cameras, canvases and rendered views shared by the sims."""
+"""Scene descriptions, cameras, canvases and rendered views that the sims share."""

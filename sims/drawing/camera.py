@@ -1,9 +1,9 @@
-"""A depth camera: triangles in, distances out, on one CPU core and without a display.
+"""Software rasterizer for depth images of triangle meshes; needs one CPU core and no display.
 
-The picture is drawn with a z-buffer of inverse depths. On a plane, 1/z is linear in the picture, so
-one division per triangle does; and 0 is the natural value of a pixel that nothing hits.
+It uses a z-buffer of inverse depths. On a plane, 1/z is linear in image coordinates, so one
+division per triangle suffices; and 0 is the value of a pixel that no triangle covers.
 
-Camera axes are those of a ROS optical frame (REP 103): x right, y down, z into the picture.
+Camera axes are those of a ROS optical frame (REP 103): x right, y down, z into the image.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mcaprl.sims.geometry.compiled import compiled
 Floats = NDArray[np.float64]
 
 _NEAR_M = 0.1
-"""What is nearer than this before the lens is not seen."""
-_SURELY_M = 1e-6
-"""Further behind a triangle than that, a camera sees its back, whatever the rounding."""
+"""Distance of the near plane."""
+_BACK_M = 1e-6
+"""Distance behind a triangle from which a camera sees its back, despite rounding."""
 
 
 class Lens(NamedTuple):
-    """A pinhole camera with square pixels."""
+    """Pinhole camera with square pixels."""
 
     width_px: int
     height_px: int
@@ -34,7 +34,7 @@ class Lens(NamedTuple):
 
 
 def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
-    """Make a lens from its picture's size and its field of view.
+    """Return the lens of an image size and a horizontal field of view.
 
     >>> lens(256, 144, math.pi / 2).focal_px
     128.00000000000003
@@ -43,12 +43,12 @@ def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
 
 
 def ray_lengths(view: Lens) -> Floats:
-    """Give (height, width) lengths of the rays from the eye to the plane z = 1."""
+    """Return (height, width) lengths of the rays from the camera to the plane z = 1."""
     return lengths((view.height_px, view.width_px), view.focal_px, view.focal_px)
 
 
 def lengths(shape: tuple[int, int], focal_x_px: float, focal_y_px: float) -> Floats:
-    """Give (height, width) lengths of rays, for pixels that need not be square."""
+    """Return (height, width) lengths of the rays to the plane z = 1; pixels may be non-square."""
     height_px, width_px = shape
     x = (np.arange(width_px) + 0.5 - width_px / 2) / focal_x_px
     y = (np.arange(height_px) + 0.5 - height_px / 2) / focal_y_px
@@ -56,13 +56,13 @@ def lengths(shape: tuple[int, int], focal_x_px: float, focal_y_px: float) -> Flo
 
 
 def level_axes(yaw_rad: float) -> Floats:
-    """Give the (3, 3) axes, as rows in the map, of a level camera that looks along a yaw."""
+    """Return the (3, 3) axes, as rows in the map, of a level camera in the direction of a yaw."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Give the (T, 4) planes of triangles: unit vectors to the front, and their distance from 0."""
+    """Return the (T, 4) planes of triangles: the front's unit normal, and its distance from 0."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -77,27 +77,27 @@ def draw(
     focal_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Fill `inverse_z`, (height, width) 1/m, with what a camera sees; 0 where it sees nothing.
+    """Render a mesh into `inverse_z`, (height, width) 1/m, with 0 where no triangle is visible.
 
     Args:
-        mesh: (T, 3, 3) triangles; only the side whose corners run counter-clockwise is seen.
+        mesh: (T, 3, 3) triangles, visible from the side where their corners run counter-clockwise.
         planes: (T, 4) `fronts` of the mesh.
-        eye_m: (3,) where the camera is.
+        eye_m: (3,) position of the camera.
         axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
-        focal_px: of the lens; its axis meets the middle of the picture.
-        inverse_z: the picture to fill.
+        focal_px: Focal length; the optical axis meets the middle of the image.
+        inverse_z: Output image.
     """
     inverse_z[:] = 0.0
     corners, polygon = np.empty((3, 3)), np.empty((4, 3))
     middles, left_u, right_u = np.empty((3, inverse_z.shape[0]))
     for row in range(len(middles)):
         middles[row] = row + 0.5
-    # How far the picture reaches to each side where z is 1; a corner on its border counts as in it.
+    # Half of the image's width and height where z is 1; a corner on the border is inside.
     wide, high = 0.5 * inverse_z.shape[1] / focal_px, 0.5 * inverse_z.shape[0] / focal_px
     for face in range(len(mesh)):
         before_m = planes[face, 0] * eye_m[0] + planes[face, 1] * eye_m[1]
         before_m += planes[face, 2] * eye_m[2] - planes[face, 3]
-        if before_m < -_SURELY_M:
+        if before_m < -_BACK_M:
             continue
         behind = right = left = below = above = True
         for i in range(3):
@@ -113,7 +113,7 @@ def draw(
             left &= x < -wide * z
             below &= y > high * z
             above &= y < -high * z
-        # A triangle with all corners beyond the same border has nothing in the picture.
+        # A triangle with all corners beyond the same border is not in the image.
         if behind or right or left or below or above:
             continue
         plane = _plane(corners)
@@ -125,7 +125,7 @@ def draw(
 
 
 class _Plane(NamedTuple):
-    """The points p with x p_x + y p_y + z p_z = offset; negative when the eye is at its front."""
+    """Points p with x p_x + y p_y + z p_z = offset; negative if the camera is at the front."""
 
     x: float
     y: float
@@ -135,7 +135,7 @@ class _Plane(NamedTuple):
 
 @compiled
 def _plane(corners: Floats) -> _Plane:
-    """Give the plane through a triangle of camera coordinates."""
+    """Return the plane through a triangle in camera coordinates."""
     ux, uy, uz = _difference(corners, 1)
     vx, vy, vz = _difference(corners, 2)
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -144,7 +144,7 @@ def _plane(corners: Floats) -> _Plane:
 
 @compiled
 def _difference(corners: Floats, i: int) -> tuple[float, float, float]:
-    """Give the vector from a triangle's first corner to another one."""
+    """Return the vector from a triangle's first corner to corner i."""
     return (
         corners[i, 0] - corners[0, 0],
         corners[i, 1] - corners[0, 1],
@@ -154,7 +154,7 @@ def _difference(corners: Floats, i: int) -> tuple[float, float, float]:
 
 @compiled
 def _clip_near(corners: Floats, polygon: Floats) -> int:
-    """Copy the part of a triangle before the near plane into `polygon`; give its corner count."""
+    """Clip a triangle at the near plane into `polygon`, and return the number of its corners."""
     count = 0
     for i in range(3):
         j = (i + 1) % 3
@@ -173,7 +173,7 @@ def _clip_near(corners: Floats, polygon: Floats) -> int:
 
 @compiled
 def _project(polygon: Floats, count: int, focal_px: float, inverse_z: Floats) -> None:
-    """Turn the x and y of a polygon's corners into the picture's u and v, pixels."""
+    """Replace the x and y of a polygon's corners by image coordinates u and v, pixels."""
     height, width = inverse_z.shape
     for i in range(count):
         scale = focal_px / polygon[i, 2]
@@ -185,20 +185,21 @@ def _project(polygon: Floats, count: int, focal_px: float, inverse_z: Floats) ->
 def _spans(
     polygon: Floats, count: int, middles: Floats, left_u: Floats, right_u: Floats
 ) -> tuple[int, int]:
-    """Find the leftmost and rightmost u of a convex polygon on each row of the picture.
+    """Compute the leftmost and rightmost u of a convex polygon on each row of the image.
 
-    Neighbours walk their common edge in opposite directions. Taken from above, it has the same u
-    for both to the last bit. Edge by edge, the compiler can do several rows at once.
+    Adjacent polygons list their common edge in opposite directions. Since each edge is evaluated
+    from its upper end, both compute the same bits. The loop over edges is the outer one, so that
+    the loop over rows can be vectorized.
 
     Args:
-        polygon: (4, 3) its corners' u and v.
-        count: of them.
+        polygon: (4, 3) u and v of the corners.
+        count: Number of corners.
         middles: (height,) v of each row's middle.
-        left_u: (height,) to be filled for the rows that it is on.
-        right_u: likewise.
+        left_u: (height,) output, for the rows that the polygon covers.
+        right_u: (height,) output, for the same rows.
 
     Returns:
-        The first row that it is on, and the first one that it is no longer on.
+        First row that the polygon covers, and the row after the last one.
     """
     top, bottom = math.inf, -math.inf
     for i in range(count):
@@ -229,19 +230,19 @@ def _fill(
     focal_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw a convex polygon that lies in a plane.
+    """Fill a convex polygon that lies in a plane.
 
-    A pixel belongs to it if its middle does; a middle on a border belongs to the side at the right
-    or below, so that neighbours leave no gap. The points p = z (u/f, v/f, 1) of the plane have
-    1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the picture.
+    A pixel is filled if its middle is inside; a middle on an edge belongs to the polygon at its
+    right or below it, so that adjacent polygons leave no gap. The points p = z (u/f, v/f, 1) of the
+    plane have 1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the image.
 
     Args:
-        rows: the first that it is on, and the first that it is no longer on.
-        left_u: (height,) where it begins on each of them.
-        right_u: (height,) where it ends.
-        plane: of camera coordinates.
-        focal_px: of the lens.
-        inverse_z: the picture.
+        rows: First row that the polygon covers, and the row after the last one.
+        left_u: (height,) left end of the polygon on each row.
+        right_u: (height,) right end of the polygon on each row.
+        plane: Plane of the polygon in camera coordinates.
+        focal_px: Focal length.
+        inverse_z: Output image.
     """
     height, width = inverse_z.shape
     middle_u, middle_v = 0.5 * width, 0.5 * height
@@ -252,7 +253,7 @@ def _fill(
         at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
         at_zero = at_v / plane.offset + step * (0.5 - middle_u)
         for column in range(start, end):
-            # Without a branch, so that the compiler can do several pixels at once.
+            # Without a branch, so that the loop can be vectorized.
             inverse_z[row, column] = max(inverse_z[row, column], at_zero + step * column)
 
 
@@ -265,18 +266,18 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires over `inverse_z`, (height, width) 1/m, where they are nearer.
+    """Draw straight wires into `inverse_z`, (height, width) 1/m, where they are nearer.
 
-    However thin or far a wire is, it is one pixel wide: it takes one pixel of each column that it
-    crosses, or of each row if it is steeper than that.
+    A wire is one pixel wide at any distance: it covers one pixel of each column that it crosses,
+    or of each row if it is steeper than 45 degrees in the image.
 
     Args:
-        wires: (S, 2, 3) their ends.
-        eye_m: (3,) where the camera is.
-        axes: (3, 3) as of `draw`.
-        focal_x_px: of the lens, in widths of a pixel.
-        focal_y_px: of the lens, in heights of a pixel.
-        inverse_z: the picture to draw over.
+        wires: (S, 2, 3) ends of the wires.
+        eye_m: (3,) position of the camera.
+        axes: (3, 3) axes of the camera, as in `draw`.
+        focal_x_px: Focal length in widths of a pixel.
+        focal_y_px: Focal length in heights of a pixel.
+        inverse_z: Image to draw into.
     """
     ends = np.empty((2, 3))
     for wire in range(len(wires)):
@@ -299,7 +300,7 @@ def draw_wires(
 
 @compiled
 def _cut_near(ends: Floats) -> bool:
-    """Keep the part of a wire before the near plane; say whether there is any."""
+    """Clip a wire at the near plane, in place; return whether a part of it is in front."""
     if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
         return False
     for i in range(2):
@@ -312,12 +313,12 @@ def _cut_near(ends: Floats) -> bool:
 
 @compiled
 def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
-    """Draw a line between two points u, v, 1/z, one pixel for each step of its main direction.
+    """Draw a line, one pixel for each pixel of its main direction.
 
     Args:
-        ends: (2, 3)
-        main: 0 to take steps in u, 1 in v.
-        inverse_z: the picture, its second axis along the main direction.
+        ends: (2, 3) u, v and 1/z of both ends.
+        main: Main direction: 0 for u, 1 for v.
+        inverse_z: Image, whose second axis is the main direction.
     """
     first, last = (0, 1) if ends[0, main] <= ends[1, main] else (1, 0)
     width, length = inverse_z.shape

@@ -1,4 +1,4 @@
-"""A picture drawn with pygame, and the window that shows it."""
+"""Image drawn with pygame, and the window that shows it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from mcaprl.sims.drawing.scene import Color
 Rgb = tuple[int, int, int]
 
 _SMOOTH = 2
-"""Each pixel is the mean of this many squared, so that edges are not jagged."""
+"""Factor of supersampling in each direction, for smooth edges."""
 
 
 class Canvas:
-    """Draws one picture after the other, and shows them in a window in mode `human`.
+    """Canvas for a sequence of images, which mode `human` shows in a window.
 
-    First come polygons, then `flatten`, then what shall stay sharp, then `finish`.
+    The calls for one image are: any number of `polygon`, then `flatten`, then text and other
+    elements that are not smoothed, then `finish`.
     """
 
     def __init__(
@@ -28,28 +29,28 @@ class Canvas:
         render_mode: Literal["human", "rgb_array"],
         size_px: tuple[int, int],
         caption: str,
-        pictures_per_s: int,
+        images_per_s: int,
     ) -> None:
-        """Prepare an empty picture.
+        """Prepare an empty image.
 
         Args:
-            render_mode: `human` opens a window.
-            size_px: width and height.
-            caption: of the window.
-            pictures_per_s: how fast the window shows them.
+            render_mode: Mode; `human` opens a window.
+            size_px: Width and height.
+            caption: Title of the window.
+            images_per_s: Frame rate of the window.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
-        # Programs that print results on stdout must not find a greeting there.
+        # pygame prints a greeting to stdout, which may be reserved for results.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.pygame = import_extra("pygame", "sims")
         self.pygame.font.init()
         self._fonts: dict[int, Any] = {}
-        self._size_px, self._pictures_per_s = size_px, pictures_per_s
+        self._size_px, self._images_per_s = size_px, images_per_s
         width_px, height_px = size_px
         self._large = self.pygame.Surface((_SMOOTH * width_px, _SMOOTH * height_px))
-        self._picture = self.pygame.Surface(size_px)
+        self._image = self.pygame.Surface(size_px)
         self._window: Any = None
         if render_mode == "human":
             self.pygame.display.init()
@@ -58,48 +59,48 @@ class Canvas:
             self._clock = self.pygame.time.Clock()
 
     def polygon(self, corners_px: NDArray[np.float64], color: Color) -> None:
-        """Fill a polygon (K, 2) of picture coordinates, y down."""
+        """Fill a polygon (K, 2) in image coordinates, y down."""
         self.pygame.draw.polygon(self._large, rgb(color), (_SMOOTH * corners_px).tolist())
 
     def flatten(self) -> None:
-        """End the polygons; what follows is drawn over them."""
-        self._picture = self.pygame.transform.smoothscale(self._large, self._size_px)
+        """Finish the polygons; everything that follows is drawn over them."""
+        self._image = self.pygame.transform.smoothscale(self._large, self._size_px)
 
     def rectangle(self, box_px: tuple[int, int, int, int], color: Rgb, edge_px: int = 0) -> None:
-        """Draw a rectangle (left, top, width, height); filled, unless it has an edge."""
-        self.pygame.draw.rect(self._picture, color, box_px, edge_px)
+        """Draw a rectangle (left, top, width, height): filled, or its outline if it has an edge."""
+        self.pygame.draw.rect(self._image, color, box_px, edge_px)
 
     def arrowhead(self, middle_px: tuple[int, int], toward: tuple[int, int], color: Rgb) -> None:
-        """Draw a triangle of 16 pixels that points right (1, 0), down (0, 1), and so on."""
+        """Draw a triangle of 16 pixels that points in a direction: right is (1, 0), down (0, 1)."""
         (x, y), (dx, dy) = middle_px, toward
         tip, left, right = (dx, dy), (dy - dx, -dx - dy), (-dy - dx, dx - dy)
         corners = [(x + 8 * part[0], y + 8 * part[1]) for part in (tip, left, right)]
-        self.pygame.draw.polygon(self._picture, color, corners)
+        self.pygame.draw.polygon(self._image, color, corners)
 
     def text(self, text: str, at_px: tuple[int, int], height_px: int, color: Rgb) -> None:
-        """Write from (left, top) on."""
+        """Draw text from (left, top)."""
         if height_px not in self._fonts:
             self._fonts[height_px] = self.pygame.font.Font(None, height_px)
-        self._picture.blit(self._fonts[height_px].render(text, True, color), at_px)
+        self._image.blit(self._fonts[height_px].render(text, True, color), at_px)
 
     def strip(self, box_px: tuple[int, int, int, int], color: Rgb) -> Any:
-        """A part of the picture (left, top, width, height) with a background of its own.
+        """Fill a part of the image (left, top, width, height) with a background color.
 
         Returns:
-            A pygame surface; what is drawn on it is in the picture.
+            Pygame surface that shares its pixels with this part of the image.
         """
-        part = self._picture.subsurface(box_px)
+        part = self._image.subsurface(box_px)
         part.fill(color)
         return part
 
     def finish(self) -> NDArray[np.uint8]:
-        """Show the picture, if there is a window, and give it: (height, width, 3)."""
+        """Show the image if there is a window, and return it, (height, width, 3)."""
         if self._window is not None:
-            self._window.blit(self._picture, (0, 0))
+            self._window.blit(self._image, (0, 0))
             self.pygame.event.pump()
             self.pygame.display.flip()
-            self._clock.tick(self._pictures_per_s)
-        pixels = self.pygame.surfarray.array3d(self._picture)
+            self._clock.tick(self._images_per_s)
+        pixels = self.pygame.surfarray.array3d(self._image)
         return np.ascontiguousarray(pixels.transpose(1, 0, 2))
 
     def close(self) -> None:
@@ -110,6 +111,6 @@ class Canvas:
 
 
 def rgb(color: Color) -> Rgb:
-    """Give a colour as pygame wants it, without its opacity."""
+    """Return a color as three bytes, without its opacity."""
     red, green, blue = (round(255 * part) for part in color[:3])
     return red, green, blue

@@ -1,8 +1,8 @@
-"""A scene in perspective, from behind the body that it is about; drawn with pygame, back to front.
+"""Perspective view of a scene from behind a body, drawn with pygame from back to front.
 
-What lies flat on the ground is drawn first, in the order of heights; then all else, the farthest
-first. Distances are those of the faces' middles, so a large face beside a small one may be on the
-wrong side of it: a picture for people, not a measurement (that is `sims.camera`).
+Faces that lie flat on the ground are drawn first, in the order of their heights, then all others,
+the farthest first. The order uses the distances of the faces' middles and can be wrong for a large
+face beside a small one. The image is for people; `sims.drawing.camera` measures depth.
 """
 
 from __future__ import annotations
@@ -23,49 +23,49 @@ Floats = NDArray[np.float64]
 
 SIZE_PX = (960, 540)
 BEHIND_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
-"""Where the eye is from the body, and how far before it the eye looks."""
+"""Position of the camera relative to the body, and the distance of its target in front of it."""
 FAR_M = 400.0
 _FOCAL_PX = 0.9 * SIZE_PX[0]
 _NEAR_M = 0.3
 _WIDEST_PX = 24.0
-"""Of a stroke: what passes close by the eye would hide all else."""
+"""Maximum width of a stroke, so that one close to the camera does not hide everything."""
 _SKY: Color = (0.55, 0.68, 0.80, 1.0)
 _SUN = (0.36, 0.28, 0.89)
 _FLAT_M = 0.15
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
-"""A stroke so short that it is drawn round."""
+"""A stroke so short that it is drawn as a dot."""
 _ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
 
 
 class Pose(NamedTuple):
-    """Where a frame is in the map."""
+    """Pose of a frame in the map."""
 
     axes: Floats
-    """(3, 3) its axes as columns."""
+    """(3, 3) axes of the frame as columns."""
     at_m: Floats
-    """(3,)"""
+    """(3,) position."""
 
 
 class _Piece(NamedTuple):
-    """A polygon, or a stroke between two points, in the map."""
+    """Polygon, or stroke between two points, in the map."""
 
     corners_m: Floats
-    """(K, 3)"""
+    """(K, 3) corners."""
     color: Color
     width_m: float = 0.0
-    """Of a stroke; a polygon has none."""
+    """Width of a stroke; 0 for a polygon."""
     text: str = ""
 
 
 class ChaseView:
-    """Draws one picture after the other; parts that do not move are prepared once."""
+    """Renderer of a sequence of images; static shapes are prepared once."""
 
     def __init__(self) -> None:
-        """Prepare an empty picture.
+        """Prepare an empty image.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
         self._canvas = Canvas("rgb_array", SIZE_PX, "", 1)
         self._prepared: tuple[Sequence[Shape], list[_Piece], Floats] | None = None
@@ -78,21 +78,21 @@ class ChaseView:
         follow: str,
         lines: Sequence[str],
     ) -> NDArray[np.uint8]:
-        """Draw one moment, (height, width, 3).
+        """Render the image of one moment, (height, width, 3).
 
         Args:
-            static: shapes that do not change; those of the map are prepared while they are the
-                same list.
-            moving: those that do.
-            frames: where all frames are.
-            follow: the frame of the body; empty looks at the map's origin.
-            lines: of text, in the corner.
+            static: Shapes that do not change; those in the map are prepared again only if this is
+                not the same list as in the last call.
+            moving: Shapes that change.
+            frames: All frames.
+            follow: Frame of the body; if empty, the camera faces the map's origin.
+            lines: Lines of text in the corner.
         """
         poses = poses_of(frames)
         eye = eye_behind(poses.get(follow, Pose(np.eye(3), np.zeros(3))))
-        pieces = self._standing(static, eye)
-        loose = [shape for shape in static if shape.frame != "map"]
-        for shape in (*loose, *moving):
+        pieces = self._visible_in_map(static, eye)
+        on_bodies = [shape for shape in static if shape.frame != "map"]
+        for shape in (*on_bodies, *moving):
             pieces += _pieces(shape, poses)
         pieces.sort(key=lambda piece: _order(piece, eye.at_m))
         width_px, height_px = SIZE_PX
@@ -107,11 +107,11 @@ class ChaseView:
         return self._canvas.finish()
 
     def close(self) -> None:
-        """Let the canvas go."""
+        """Release the canvas."""
         self._canvas.close()
 
-    def _standing(self, static: Sequence[Shape], eye: Pose) -> list[_Piece]:
-        """The pieces of the map that are near enough and before the eye."""
+    def _visible_in_map(self, static: Sequence[Shape], eye: Pose) -> list[_Piece]:
+        """Return the pieces of the map that are near enough to be drawn."""
         if self._prepared is None or self._prepared[0] is not static:
             pieces = [p for s in static if s.frame == "map" for p in _pieces(s, {})]
             middles = np.array([p.corners_m.mean(axis=0) for p in pieces]).reshape(-1, 3)
@@ -135,7 +135,7 @@ class ChaseView:
 
 
 def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
-    """Where each frame is in the map, its parents' places included.
+    """Return the pose of each frame in the map, with its parents' poses applied.
 
     >>> car = Frame("car", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     >>> lamp = Frame("lamp", (1.0, 0.0, 2.0), (0.0, 0.0, 0.0, 1.0), parent="car")
@@ -150,7 +150,7 @@ def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
             return found[name]
         if name not in by_name:
             return Pose(np.eye(3), np.zeros(3))
-        # Popped, so that frames that hang on each other come to an end.
+        # Popped, so that a cycle of frames terminates.
         frame = by_name.pop(name)
         parent = place(frame.parent)
         axes = parent.axes @ rotation_matrix(frame.rotation)
@@ -163,7 +163,7 @@ def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
 
 
 def rotation_matrix(xyzw: tuple[float, float, float, float]) -> Floats:
-    """(3, 3) of a quaternion."""
+    """Return the (3, 3) rotation matrix of a quaternion."""
     x, y, z, w = np.array(xyzw) / math.hypot(*xyzw)
     return np.array(
         [
@@ -175,7 +175,7 @@ def rotation_matrix(xyzw: tuple[float, float, float, float]) -> Floats:
 
 
 def eye_behind(body: Pose) -> Pose:
-    """The camera behind a body, level: its x to the right, y down, z along the view."""
+    """Return the pose of the camera behind a body: x right and level, y down, z along the view."""
     forward = body.axes[:, 0] * [1.0, 1.0, 0.0]
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
@@ -187,7 +187,7 @@ def eye_behind(body: Pose) -> Pose:
 
 
 def _pieces(shape: Shape, poses: Mapping[str, Pose]) -> list[_Piece]:
-    """A shape's faces and strokes, in the map."""
+    """Return the faces and strokes of a shape in the map."""
     cos, sin = math.cos(shape.yaw_rad), math.sin(shape.yaw_rad)
     turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     pose = poses.get(shape.frame, Pose(np.eye(3), np.zeros(3)))
@@ -204,7 +204,7 @@ def _pieces(shape: Shape, poses: Mapping[str, Pose]) -> list[_Piece]:
 
 
 def _outlines(shape: Shape) -> tuple[list[Floats], float]:
-    """The polygons (K, 3) of a shape in its own place, or its strokes (2, 3) and their width."""
+    """Return a shape's polygons (K, 3), or its strokes (2, 3) and their width, before placement."""
     points, size = shape.points, shape.size
     match shape.kind:
         case "box":
@@ -239,7 +239,7 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
 
 
 def _seen(piece: _Piece, eye: Pose) -> Floats | None:
-    """The piece as a polygon of the picture; None if it is behind the eye or edge-on."""
+    """Return a piece as a polygon of the image; None if it is behind the camera or edge-on."""
     corners = _before_eye((piece.corners_m - eye.at_m) @ eye.axes, closed=piece.width_m == 0)
     if len(corners) < 2:
         return None
@@ -250,7 +250,7 @@ def _seen(piece: _Piece, eye: Pose) -> Floats | None:
 
 
 def _before_eye(corners: Floats, *, closed: bool) -> Floats:
-    """Clip to what is before the near plane."""
+    """Clip corners at the near plane."""
     if (corners[:, 2] >= _NEAR_M).all():
         return corners
     kept: list[Floats] = []
@@ -272,7 +272,7 @@ def _projected(corners: Floats) -> Floats:
 
 
 def _stroke(ends: Floats, widths_px: Floats) -> Floats:
-    """A line between two points as a polygon, as wide at each end as it is near; or a dot."""
+    """Return a line between two points as a polygon with the width of each end, or as a dot."""
     along = ends[1] - ends[0]
     length = float(np.hypot(*along))
     half_px = np.clip(widths_px, 1.0, _WIDEST_PX)[:, None] / 2
@@ -284,12 +284,12 @@ def _stroke(ends: Floats, widths_px: Floats) -> Floats:
 
 
 def _lit(piece: _Piece) -> Color:
-    """The colour of a face by how it stands to the sun."""
+    """Return the color of a face, shaded by its angle to the sun."""
     if piece.width_m:
         return piece.color
     corners = piece.corners_m
     (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-    # Written out: for one pair of vectors NumPy's cross product takes longer than all the rest.
+    # Written out, since NumPy's cross product is slow for a single pair of vectors.
     normal = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     length = math.hypot(*normal)
     light = (

@@ -1,4 +1,4 @@
-"""Depth pictures: shrinking them, and packing them into one byte a pixel."""
+"""Depth images: rendering, averaging to a smaller size, and encoding as one byte per pixel."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mcaprl.sims.geometry.compiled import compiled
 Floats = NDArray[np.float64]
 
 NEAREST_M = 0.5
-"""Distance of code 0, and of all that is nearer."""
+"""Distance of code 0; smaller distances have the same code."""
 FARTHEST_M = 100.0
-"""Distance of code 255, and of all that is farther, nothing included."""
+"""Distance of code 255; larger distances and infinity have the same code."""
 _CODES_PER_E = 255.0 / math.log(FARTHEST_M / NEAREST_M)
 _NO_WIRES: Floats = np.empty((0, 2, 3))
 
 
 def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Pack metres into bytes: 255 ln(d / 0.5 m) / ln(100 m / 0.5 m), rounded, within 0 to 255.
+    """Encode meters as bytes: 255 ln(d / 0.5 m) / ln(100 m / 0.5 m), rounded, within 0 to 255.
 
-    One code is a step of 2.1 % at any distance. Infinity is 255.
+    Adjacent codes differ by 2.1 % at any distance. Infinity is 255.
     """
     codes = np.asarray(np.clip(depth_m, NEAREST_M, FARTHEST_M))
     codes /= NEAREST_M
@@ -35,31 +35,31 @@ def encode_depth(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Unpack bytes into metres; 255 becomes infinity. `encode_depth` gives the same codes again."""
+    """Decode bytes to meters; 255 becomes infinity. `encode_depth` of the result equals `codes`."""
     depth_m = NEAREST_M * np.exp(codes.astype(np.float64) / _CODES_PER_E)
     return np.where(codes == 255, np.inf, depth_m).astype(np.float32)
 
 
 def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Pack metres into bytes as AirSim's examples do: 255 / max(1, d), rounded down; infinity is 0.
+    """Encode meters as bytes as AirSim's examples do: 255 / max(1, d), rounded down.
 
-    Half of the codes go to distances of 1 to 2 m.
+    Infinity is 0. Half of the codes are distances of 1 to 2 m.
     """
     codes: NDArray[np.uint8] = (255.0 / np.maximum(1.0, depth_m)).astype(np.uint8)
     return codes
 
 
 class Overlaps(NamedTuple):
-    """Which of a row of old pixels lie in each of a shorter row of new ones."""
+    """Overlaps of a row of old pixels with a shorter row of new pixels."""
 
     first: NDArray[np.int64]
-    """(new,) the first old pixel that counts."""
+    """(new,) index of the first old pixel that overlaps each new one."""
     weights: Floats
-    """(new, K) shares of the new pixel's area, of that old pixel and of those after it."""
+    """(new, K) shares of the new pixel's area that the K old pixels from the first one cover."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
-    """Lay `new_size` equal pixels over `old_size` pixels.
+    """Return the overlaps of `new_size` equal pixels with `old_size` pixels.
 
     >>> overlaps(3, 2).weights.round(2).tolist()
     [[0.67, 0.33, 0.0], [0.0, 0.33, 0.67]]
@@ -76,17 +76,18 @@ def overlaps(old_size: int, new_size: int) -> Overlaps:
 def shrink(
     inverse: Floats, rows: Overlaps, columns: Overlaps, depth_m: NDArray[np.float32]
 ) -> None:
-    """Average a picture of inverse distances down to one of metres.
+    """Average an image of inverse distances to a smaller image of distances.
 
-    Where at least half of a new pixel's area hits something, it gets the mean inverse of that part,
-    where not, infinity. So the sky never mixes into a distance; and since inverse depth is linear
-    on a plane, the mean is the plane's own distance near the middle of the area.
+    If at least half of a new pixel's area is covered by surfaces, the pixel's inverse distance is
+    the mean over that part of the area, otherwise its distance is infinite. Thus the sky never
+    changes a distance; and since inverse depth is linear on a plane, the mean is the distance of
+    the plane near the middle of the area.
 
     Args:
-        inverse: (H, W) 1/m, 0 where nothing is hit.
-        rows: H to h pixels.
-        columns: W to w pixels.
-        depth_m: (h, w), to be filled.
+        inverse: (H, W) 1/m, 0 where there is no surface.
+        rows: Overlaps of H with h pixels.
+        columns: Overlaps of W with w pixels.
+        depth_m: (h, w) output, meters.
     """
     width = inverse.shape[1]
     sums, hits = np.empty(width), np.empty(width)
@@ -94,7 +95,7 @@ def shrink(
         sums[:], hits[:] = 0.0, 0.0
         for k in range(rows.weights.shape[1]):
             line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
-            # Many rows overlap with fewer others than there is room for.
+            # Most new rows overlap fewer than K old ones; their last weights are 0.
             if weight > 0.0:
                 for column in range(width):
                     sums[column] += weight * line[column]
@@ -109,18 +110,18 @@ def shrink(
 
 
 class DepthCamera:
-    """A camera in a world that does not change."""
+    """Depth camera in a static world."""
 
     def __init__(
         self, mesh: Floats, view: Lens, small: tuple[int, int], wires: Floats = _NO_WIRES
     ) -> None:
-        """Look at a mesh, (T, 3, 3) metres, through a lens.
+        """Prepare the rendering of a mesh.
 
         Args:
-            mesh: triangles; see `draw`.
-            view: the lens, and the size at which pictures are drawn.
-            small: (h, w) pixels, the size to which they are averaged down.
-            wires: (S, 2, 3) metres, drawn into the small picture, one pixel wide.
+            mesh: (T, 3, 3) triangles, meters; see `draw`.
+            view: Lens, and the size at which images are rendered.
+            small: (h, w) pixels, the size to which images are averaged.
+            wires: (S, 2, 3) meters, drawn into the small image, one pixel wide.
         """
         self._mesh, self._planes = mesh, fronts(mesh)
         self._wires = wires
@@ -136,14 +137,14 @@ class DepthCamera:
         self._small_lengths = lengths(small, *self._small_focal_px)
 
     def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:
-        """Draw the whole picture, without wires.
+        """Render the image at full size, without wires.
 
         Args:
-            position_m: of the camera.
-            axes: (3, 3) its x, y and z axes as rows, in the mesh's coordinates.
+            position_m: Position of the camera.
+            axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
 
         Returns:
-            (height, width) 1/m along each ray, 0 where nothing is hit.
+            (height, width) inverse distance along each ray, 1/m, 0 where there is no surface.
         """
         inverse = np.empty((self._view.height_px, self._view.width_px))
         eye_m = np.array(position_m)
@@ -152,7 +153,7 @@ class DepthCamera:
         return inverse
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Draw the small picture: (h, w) metres along each ray, infinity where nothing is hit."""
+        """Render the small image: (h, w) meters along each ray, infinity without a surface."""
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
         if len(self._wires):

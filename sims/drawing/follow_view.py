@@ -1,4 +1,4 @@
-"""A picture of a scene from straight above, drawn with pygame: a body stays in the middle."""
+"""Top view of a scene, drawn with pygame, with a body in the middle of the image."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ _PLATE = (20, 22, 26)
 
 
 class Body(NamedTuple):
-    """Where the body is that the picture follows."""
+    """Pose of the body that the image follows."""
 
     frame: str
-    """Shapes of this frame turn with the body; those of others than `map` only move with it."""
+    """Frame whose shapes rotate with the body; shapes of other frames only move with it, and
+    shapes of `map` do neither."""
     x_m: float
     y_m: float
     yaw_rad: float
     height_m: float = 0.0
-    """Added to the heights of the body's shapes, which decide what covers what."""
+    """Height of the body, added to its shapes' heights for the order of drawing."""
 
 
 class FollowView:
-    """Draws one picture for each step, and shows it in a window in mode `human`."""
+    """Renderer of one image for each step, which mode `human` shows in a window."""
 
     def __init__(
         self,
@@ -42,18 +43,18 @@ class FollowView:
         frames_per_s: int,
         floor: Iterable[Shape] = (),
     ) -> None:
-        """Prepare the parts of the picture that never change.
+        """Prepare the shapes that never change.
 
         Args:
-            render_mode: whether there is a window.
-            name: of the sim, for the window's title.
-            static: the shapes that never change.
-            width_m: of the ground in the picture.
-            frames_per_s: of the window.
-            floor: shapes that never change and lie under all others, however high they are.
+            render_mode: Mode; `human` opens a window.
+            name: Name of the sim, for the window's title.
+            static: Shapes that never change.
+            width_m: Width of the ground in the image.
+            frames_per_s: Frame rate of the window.
+            floor: Static shapes that are drawn below all others, whatever their height.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
         self.canvas = Canvas(render_mode, (SIDE_PX, SIDE_PX), f"mcaprl {name}", frames_per_s)
         lowest = [patch._replace(top_m=-math.inf) for patch in patches(floor)]
@@ -64,12 +65,12 @@ class FollowView:
         self._width_m = width_m
 
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
-        """Draw what is around the body; `canvas` takes more, and `show` ends the picture.
+        """Draw the surroundings of the body; more can be drawn on `canvas` before `show`.
 
         Args:
-            moving: the shapes that change.
-            body: stays in the middle.
-            text: the line at the bottom.
+            moving: Shapes that change.
+            body: Body in the middle of the image.
+            text: Line of text at the bottom.
         """
         lifted = [
             patch._replace(top_m=patch.top_m + body.height_m) if patch.frame != "map" else patch
@@ -82,7 +83,7 @@ class FollowView:
         self.canvas.text(text, (12, SIDE_PX - 26), 26, _INK)
 
     def show(self) -> NDArray[np.uint8]:
-        """Show the picture in the window, if there is one, and give it as (600, 600, 3)."""
+        """Show the image if there is a window, and return it, (600, 600, 3)."""
         return self.canvas.finish()
 
     def close(self) -> None:
@@ -90,9 +91,9 @@ class FollowView:
         self.canvas.close()
 
     def _near(self, body: Body) -> list[Patch]:
-        """Give the static patches that are on the body or may be in the picture."""
-        here, reach_m = np.array([body.x_m, body.y_m]), self._width_m / 2
-        seen = np.all((self._low - here <= reach_m) & (self._high - here >= -reach_m), axis=1)
+        """Return the static patches that are on the body or near enough to be in the image."""
+        here, half_m = np.array([body.x_m, body.y_m]), self._width_m / 2
+        seen = np.all((self._low - here <= half_m) & (self._high - here >= -half_m), axis=1)
         return [self._static[i] for i in np.flatnonzero(seen | self._on_body)]
 
     def _fill(self, patch: Patch, body: Body) -> None:

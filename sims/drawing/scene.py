@@ -1,7 +1,8 @@
-"""What there is to be seen of a sim, in terms that belong to no viewer.
+"""Viewer-independent description of what is visible in a sim.
 
 A sim describes its world with two frozen types, `Shape` and `Frame`. Axes are those of ROS
-(REP 103): right-handed, z up, x forward in a body's own frame, y to its left; metres and radians.
+(REP 103): right-handed, z up; in a body's frame, x forward and y left. Units are meters and
+radians.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ Color = tuple[float, float, float, float]
 Kind = Literal[
     "box", "sphere", "cylinder", "line", "segments", "points", "triangles", "arrow", "text"
 ]
-"""How a shape's `points` and `size` are to be read; see `Shape`."""
+"""Kind of a shape, which decides the meaning of its `points` and `size`; see `Shape`."""
 
 
 def no_points() -> NDArray[np.float64]:
-    """Give the `points` of a shape that has none: an array of shape (0, 3)."""
+    """Return an empty (0, 3) array, the `points` of a shape without points."""
     return np.empty((0, 3))
 
 
@@ -32,8 +33,9 @@ def no_points() -> NDArray[np.float64]:
 class Shape:
     """One thing to draw.
 
-    `box`, `sphere`, `cylinder` (axis along z) and `text` stand at `position`, turned by `yaw_rad`,
-    with edges `size`. The others are drawn through `points`, which `position` and `yaw_rad` move.
+    `box`, `sphere`, `cylinder` (axis along z) and `text` are at `position`, rotated by `yaw_rad`,
+    with edges `size`. The others are drawn through `points`, which `yaw_rad` rotates and `position`
+    moves.
     """
 
     name: str
@@ -41,34 +43,34 @@ class Shape:
     kind: Kind
     color: Color
     points: NDArray[np.float64] = field(default_factory=no_points)
-    """(N, 3) metres. `line`: a strip; `segments`: pairs; `triangles`: triples; `arrow`: start and
+    """(N, 3) meters. `line`: a strip; `segments`: pairs; `triangles`: triples; `arrow`: start and
     end; empty for the others."""
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Metres. `line`, `segments` and `points`: the width is the first; `arrow`: shaft diameter,
+    """Meters. `line`, `segments` and `points`: the width is the first; `arrow`: shaft diameter,
     head diameter, head length; `text`: the height is the last."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Metres, in `frame`."""
+    """Meters, in `frame`."""
     yaw_rad: float = 0.0
     """Turn about z, counter-clockwise seen from above."""
     frame: str = "map"
-    """The frame that the shape is fixed to."""
+    """Frame that the shape is fixed to."""
     text: str = ""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Where one coordinate frame is in another."""
+    """Position and rotation of one coordinate frame in another."""
 
     name: str
     position: tuple[float, float, float]
-    """Metres, of the origin in `parent`."""
+    """Meters, of the origin in `parent`."""
     rotation: tuple[float, float, float, float]
-    """Unit quaternion (x, y, z, w) that takes vectors of this frame to `parent`."""
+    """Unit quaternion (x, y, z, w) that transforms vectors of this frame to `parent`."""
     parent: str = "map"
 
 
 def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
-    """Give the quaternion (x, y, z, w) of a turn about z.
+    """Return the quaternion (x, y, z, w) of a rotation about z.
 
     >>> yaw_rotation(0.0)
     (0.0, 0.0, 0.0, 1.0)
@@ -77,11 +79,11 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
-    """Give places as the points of a line, which needs two: a single place comes twice."""
+    """Return positions as the points of a line; a single position is repeated."""
     return np.array(points if len(points) > 1 else [*points, *points])
 
 
 def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
-    """Give points of shape (..., 2) as (N, 3) at one height."""
+    """Return points (..., 2) as (N, 3) points at one height."""
     flat = points_m.reshape(-1, 2)
     return np.column_stack([flat, np.full(len(flat), z_m)])

@@ -1,4 +1,4 @@
-"""A scene seen from straight above: shapes become flat patches, in the order of their heights."""
+"""Projection of shapes to flat patches, as seen from above, in the order of their heights."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _CIRCLE = 0.5 * np.array([[math.cos(a), math.sin(a)] for a in np.arange(16) * ma
 
 
 class Patch(NamedTuple):
-    """A convex polygon of one colour."""
+    """Convex polygon of one color."""
 
     top_m: float
-    """The height of the shape that it comes from."""
+    """Height of the shape's top."""
     color: Color
     corners_m: Floats
-    """(K, 2)"""
+    """(K, 2) corners."""
     frame: str
 
 
 def patches(shapes: Iterable[Shape]) -> list[Patch]:
-    """Flatten shapes, the lowest first; `text` is left out."""
+    """Return the patches of shapes, the lowest first; `text` has none."""
     flat = [
         Patch(_top(shape), shape.color, corners, shape.frame)
         for shape in shapes
@@ -40,7 +40,7 @@ def patches(shapes: Iterable[Shape]) -> list[Patch]:
 
 
 def placed(corners_m: Floats, x_m: float, y_m: float, yaw_rad: float) -> Floats:
-    """Turn points of shape (..., 2) by a yaw, then move them."""
+    """Rotate points (..., 2) by a yaw, then translate them."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     moved: Floats = corners_m @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
     return moved
@@ -53,7 +53,7 @@ def _top(shape: Shape) -> float:
 
 
 def _outlines(shape: Shape) -> list[Floats]:
-    """Give the polygons (K, 2) of a shape, in its frame."""
+    """Return the polygons (K, 2) of a shape in its frame."""
     flat, width_m = shape.points[:, :2], shape.size[0]
     match shape.kind:
         case "box":
@@ -75,7 +75,7 @@ def _outlines(shape: Shape) -> list[Floats]:
 
 
 def _stroke(start: Floats, end: Floats, width_m: float) -> Floats:
-    """Give the rectangle (4, 2) around a straight line, longer by half its width at each end."""
+    """Return the rectangle (4, 2) of a line, which extends it by half its width at each end."""
     along = end - start
     length_m = float(np.hypot(along[0], along[1]))
     yaw_rad = math.atan2(along[1], along[0])

@@ -1,4 +1,4 @@
-"""Scores policies on the same episodes, with intervals that say how sure one can be."""
+"""Scores of policies on the same episodes, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.evaluation.batch_rollout import batch_rollout
 from mcaprl.sims.evaluation.rollout import (
     EpisodeResult,
     EpsilonGreedy,
     Policy,
+    batch_rollout,
     episode_seed,
     rollout,
 )
@@ -31,16 +31,16 @@ from mcaprl.sims.evaluation.statistics import (
 
 @dataclass(frozen=True)
 class PolicyScore:
-    """What one policy reached.
+    """Evaluation result of one policy.
 
     Attributes:
-        policy: its name.
-        results: episodes of each training seed; scripted policies have one "seed".
-        mean_return: over seeds and episodes.
+        policy: Name of the policy.
+        results: Episodes of each training seed; a scripted policy counts as one seed.
+        mean_return: Mean over seeds and episodes.
         interval: 95 % bootstrap interval of the mean, over seeds and episodes.
-        normalized_score: 0 as random, 1 as the pilot; None without a pilot.
-        normalized_interval: the interval on that scale.
-        successes: ends that count as success; None if the environment does not tell.
+        normalized_score: Score on the scale random = 0, pilot = 1; None without a pilot.
+        normalized_interval: Interval on the same scale.
+        successes: Reasons that count as success; None if the environment does not define them.
     """
 
     policy: str
@@ -53,23 +53,23 @@ class PolicyScore:
 
     @property
     def returns(self) -> NDArray[np.float64]:
-        """(seeds, episodes)."""
+        """Returns, (seeds, episodes)."""
         return np.array([[episode.total_reward for episode in seed] for seed in self.results])
 
     @property
     def ends(self) -> dict[str, int]:
-        """Episodes by the reason they ended."""
+        """Number of episodes by the reason why they ended."""
         return dict(Counter(e.reason for seed in self.results for e in seed).most_common())
 
     @property
     def success_rate(self) -> float | None:
-        """The share of episodes that ended well; None if the environment does not tell."""
+        """Share of successful episodes; None if the environment does not define success."""
         if self.successes is None:
             return None
         return sum(self.ends.get(reason, 0) for reason in self.successes) / self.returns.size
 
     def to_json(self) -> dict[str, Any]:
-        """As `mcaprl evaluate --json` prints it."""
+        """Return the fields that `mcaprl evaluate --json` prints."""
         returns = self.returns
         middle = {"median": median, "interquartile_mean": interquartile_mean}
         return {
@@ -106,15 +106,15 @@ def evaluate(
     """Run one policy, or one per training seed, greedily through the same episodes.
 
     Args:
-        env: to run in.
-        policies: of the training seeds; [None] acts at random.
-        name: for tables.
-        episodes: for each of `policies`; the same starts for all.
-        seed: of the episodes.
-        envs: `episodes` of the same environment, to be stepped together instead; for policies that
-            act on batches.
-        on_policy: called with each policy's own name before its first episode.
-        on_episode: called after each episode.
+        env: Environment.
+        policies: Policies of the training seeds; [None] acts at random.
+        name: Name for tables.
+        episodes: Number of episodes of each policy; all policies have the same starts.
+        seed: Seed of the episodes.
+        envs: `episodes` copies of the environment that are stepped together, to be used in place of
+            `env`; only for policies that act on batches.
+        on_policy: Function that is called with each policy's own name before its first episode.
+        on_episode: Function that is called after each episode.
     """
     results = []
     for policy in policies:
@@ -138,7 +138,7 @@ def evaluate(
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
-    """Add the score on the scale random = 0, pilot = 1; as it is if there is no pilot."""
+    """Add the score on the scale random = 0, pilot = 1; return it unchanged without a pilot."""
     if pilot is None or pilot.mean_return == random.mean_return:
         return score
     span = pilot.mean_return - random.mean_return
@@ -156,13 +156,13 @@ def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None
 
 @dataclass(frozen=True)
 class Improvement:
-    """How often an episode of one policy returns more than one of another.
+    """Probability that an episode of one policy has a higher return than one of another.
 
     Attributes:
-        better: the policy that may be better.
-        than: the other.
-        probability: 0.5 for equals.
-        interval: its 95 % bootstrap interval.
+        better: Policy with the higher mean return.
+        than: Policy with the lower mean return.
+        probability: Probability of improvement; 0.5 for equal policies.
+        interval: 95 % bootstrap interval of the probability.
     """
 
     better: str
@@ -171,12 +171,12 @@ class Improvement:
     interval: tuple[float, float]
 
     def to_json(self) -> dict[str, Any]:
-        """As `mcaprl evaluate --json` prints it."""
+        """Return the fields that `mcaprl evaluate --json` prints."""
         return {**vars(self), "interval": list(self.interval)}
 
 
 def improvements(scores: Sequence[PolicyScore]) -> list[Improvement]:
-    """Compare each policy with all that have a lower mean."""
+    """Compare each policy with all policies that have a lower mean return."""
     ordered = sorted(scores, key=lambda score: -score.mean_return)
     return [
         Improvement(

@@ -1,4 +1,4 @@
-"""An evaluation at a glance: how policies compare, where they went, what to look at next.
+"""HTML report of an evaluation: comparison of policies, trajectories, and episodes to watch.
 
 Extra: `report`.
 """
@@ -19,9 +19,12 @@ from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.sims.evaluation.statistics import interquartile_mean, median
 
 _MAX_PATHS = 30
-_PAIRS = "How often an episode of one policy returns more than one of another; ties count half."
-# What is lower than this is ground, not something to drive around.
+_PAIRS = (
+    "Probability that an episode of one policy has a higher return than one of another;"
+    " ties count half."
+)
 _FLAT_M = 1.0
+"""Boxes up to this height are ground and are not drawn."""
 
 
 def comparison_figure(
@@ -30,16 +33,16 @@ def comparison_figure(
     behavior: tuple[float, float, float] | None,
     width: float = 8.0,
 ) -> Any:
-    """Mean returns with their intervals, a dot for each training seed.
+    """Draw mean returns with their intervals, and a dot for each training seed.
 
     Args:
-        scores: from top to bottom.
-        title: over the picture.
-        behavior: mean, low and high of the logged episodes' returns, drawn as a band.
-        width: inches.
+        scores: Scores from top to bottom.
+        title: Title of the figure.
+        behavior: Mean, low and high of the logged episodes' returns, drawn as a band.
+        width: Width of the figure in inches.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
+        MissingExtraError: Matplotlib is not installed.
     """
     figure, axes = new_figure((width, 0.62 * len(scores) + 1.8))
     if behavior is not None:
@@ -57,10 +60,10 @@ def comparison_figure(
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
-        # Behind the longest of bar, interval and dots.
+        # The label follows the longest of bar, interval and dots.
         end = max(high, 0.0, float(means.max()))
         text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
-        # The line of the behavior in the log may run through it.
+        # The line of the logged behavior may cross the label.
         text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
     axes.set_yticks(range(len(scores)), [score.policy for score in scores])
     axes.invert_yaxis()
@@ -73,14 +76,17 @@ def comparison_figure(
 
 
 def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> Any:
-    """Where each policy went, on the map seen from above; a cross where an episode ended early.
+    """Draw the trajectories of each policy on the map; a cross marks an episode that ended early.
 
     Args:
-        scores: a panel each; those without positions are left out. None if none has any.
-        world: what stands still, to be drawn beneath.
+        scores: Scores, one panel for each that has positions.
+        world: Static shapes of the map.
+
+    Returns:
+        Figure, or None if no score has positions.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
+        MissingExtraError: Matplotlib is not installed.
     """
     shown = [score for score in scores if score.results[0][0].positions.size]
     if not shown:
@@ -90,25 +96,25 @@ def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> 
     figure, panels = new_figure((4.2 * columns, 5.6 * rows), rows, columns, grid=True)
     panels = panels.ravel()
     for row, (axes, score) in enumerate(zip(panels, shown, strict=False)):
-        _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+        _draw_trajectories(axes, score, world, COLORS[row % len(COLORS)])
         axes.set_title(f"{score.policy}\n{_ends(score)}")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     return figure
 
 
-def _ways(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
-    """The same for pages: a figure for each policy, which a phone shows below each other."""
+def _trajectories(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
+    """Draw one figure for each policy, so that a narrow page can show them below each other."""
     figures = []
     for row, score in enumerate(scores):
         if score.results[0][0].positions.size:
             figure, axes = new_figure((4.2, 4.8))
-            _draw_ways(axes, score, world, COLORS[row % len(COLORS)])
+            _draw_trajectories(axes, score, world, COLORS[row % len(COLORS)])
             figures.append(Figure.of(f"{score.policy}: {_ends(score)}", figure))
     return figures
 
 
-def _draw_ways(axes: Any, score: PolicyScore, world: Sequence[Shape], color: str) -> None:
+def _draw_trajectories(axes: Any, score: PolicyScore, world: Sequence[Shape], color: str) -> None:
     _draw_world(axes, world)
     episodes = [episode for seed in score.results for episode in seed]
     stride = -(-len(episodes) // _MAX_PATHS)
@@ -139,36 +145,36 @@ def evaluation_page(
     """Write FOLDER/index.html, comparison.png and trajectories.png.
 
     Args:
-        folder: made if it is not there.
-        title: of the page.
-        scores: of the policies.
-        compared: the policies with each other.
-        world: what stands still.
-        behavior: mean, low and high of the logged episodes' returns, if there are such.
-        recorded: the log with the episodes, and of how many of the first `scores` it has them.
-        curves: how the policies were learnt.
+        folder: Output folder, created if it does not exist.
+        title: Title of the page.
+        scores: Scores of the policies.
+        compared: Comparisons of pairs of policies.
+        world: Static shapes of the map.
+        behavior: Mean, low and high of the logged episodes' returns, if there is a log.
+        recorded: Log with the episodes of the first policies, and the number of those policies.
+        curves: Learning curves of the policies.
 
     Raises:
-        MissingExtraError: matplotlib or jinja2 is not installed.
-        ReportError: a file cannot be written.
+        MissingExtraError: Matplotlib or jinja2 is not installed.
+        ReportError: A file cannot be written.
     """
     save_png(comparison_figure(scores, "mean return", behavior), folder / "comparison.png")
-    ways = trajectory_figure(scores, world)
-    if ways is not None:
-        save_png(ways, folder / "trajectories.png")
+    trajectories = trajectory_figure(scores, world)
+    if trajectories is not None:
+        save_png(trajectories, folder / "trajectories.png")
     comparison = comparison_figure(scores, "", behavior, width=5.6)
     figures = [Figure.of("Mean returns", comparison)]
     sections = [
         Section("Scores", figures=figures, table=_score_table(scores)),
-        Section("Against each other", _PAIRS, table=_improvement_table(compared)),
+        Section("Probability of improvement", _PAIRS, table=_improvement_table(compared)),
     ]
-    if ways is not None:
-        text = "A cross is an early end."
-        sections.append(Section("Where they went", text, figures=_ways(scores, world)))
+    if trajectories is not None:
+        text = "A cross marks an early end."
+        sections.append(Section("Trajectories", text, figures=_trajectories(scores, world)))
     cards = _cards(scores, world, recorded)
     sections.append(Section("Best and worst episodes", cards=cards))
     if curves:
-        sections.append(Section("How they were learnt", figures=curves))
+        sections.append(Section("Learning curves", figures=curves))
     episodes = sum(score.returns.size for score in scores)
     write_page(folder / "index.html", title, f"{episodes} episodes, greedy actions", sections)
 
@@ -191,7 +197,7 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
         "policy",
         "mean return",
         "95 % interval",
-        "middle half",
+        "interquartile mean",
         "median",
         "score",
         "success",
@@ -216,7 +222,7 @@ def _improvement_table(compared: Sequence[Improvement]) -> Table:
 def _cards(
     scores: Sequence[PolicyScore], world: Sequence[Shape], recorded: tuple[Path, int] | None
 ) -> list[Card]:
-    """The best and the worst episode of each policy."""
+    """Return cards of the best and the worst episode of each policy."""
     cards, first = [], 0
     for row, score in enumerate(scores):
         episodes = [episode for seed in score.results for episode in seed]
@@ -233,7 +239,7 @@ def _cards(
 
 
 def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
-    """An episode's way on the map as a small SVG; empty if it has no positions."""
+    """Return an episode's trajectory as a small SVG; empty if it has no positions."""
     if not episode.positions.size:
         return ""
     figure, axes = new_figure((3.2, 2.2))
@@ -246,7 +252,7 @@ def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
 
 
 def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
-    """Lines and boxes that are fixed to the map."""
+    """Draw the lines and boxes that are fixed to the map."""
     for shape in world:
         if shape.frame != "map":
             continue
@@ -254,7 +260,7 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
             axes.plot(shape.points[:, 0], shape.points[:, 1], color=PALE, lw=1, zorder=0)
         elif shape.kind == "segments":
             pairs = shape.points[:, :2].reshape(-1, 2, 2)
-            # Not-a-number ends a stroke.
+            # NaN separates the segments.
             strokes = np.pad(pairs, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
             axes.plot(*strokes.reshape(-1, 2).T, color=PALE, lw=1, zorder=0)
         elif shape.kind == "box" and shape.size[2] > _FLAT_M:

@@ -1,44 +1,45 @@
-"""Runs a policy in an environment, one episode after the other, each from a seed of its own."""
+"""Episodes of a policy in an environment, or in many that are stepped together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import PolicyError
 
 
 class Policy(Protocol):
-    """Whatever chooses actions: a scripted pilot, a trained network.
+    """Scripted or trained policy.
 
-    One that remembers what it saw has a method `begin`, called where an episode begins.
+    A policy with memory has a method `begin`, which is called at the start of each episode.
     """
 
     @property
     def name(self) -> str:
-        """What to call it in logs and tables."""
+        """Name in logs and tables."""
 
     def act(self, observations: Any) -> NDArray[Any]:
-        """(B, *action shape) actions for observations of shape (B, *shape) or dicts of such."""
+        """Return actions (B, *action shape) for observations (B, *shape) or a dict of such."""
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """How one episode went.
+    """Result of one episode.
 
     Attributes:
-        seed: that it was reset with.
-        total_reward: undiscounted return.
-        length: transitions.
-        reason: why it ended; `interrupted` if the caller's budget of steps was used up.
-        positions: (length + 1, 2) x and y in metres, where the environment tells them; else (0, 2).
+        seed: Seed of the reset.
+        total_reward: Undiscounted return.
+        length: Number of transitions.
+        reason: Reason of the end; `interrupted` if the caller's budget of steps was used up.
+        positions: (length + 1, 2) x and y, meters; (0, 2) if the environment does not report them.
     """
 
     seed: int
@@ -49,7 +50,7 @@ class EpisodeResult:
 
 
 class EpsilonGreedy:
-    """A policy's actions, now and then replaced by random ones; knows their probabilities."""
+    """Epsilon-greedy exploration around a policy, with the probabilities of its actions."""
 
     def __init__(
         self, policy: Policy | None, epsilon: float, action_space: spaces.Space[Any]
@@ -57,9 +58,9 @@ class EpsilonGreedy:
         """Explore around `policy`.
 
         Args:
-            policy: None acts at random.
-            epsilon: probability of a random action, 0 to 1; 1 where there is no policy.
-            action_space: to draw random actions from.
+            policy: Policy, or None for random actions.
+            epsilon: Probability of a random action, 0 to 1; taken as 1 if there is no policy.
+            action_space: Space of the random actions.
         """
         self.policy = policy
         self.epsilon = 1.0 if policy is None else epsilon
@@ -69,18 +70,18 @@ class EpsilonGreedy:
         self.begin(0)
 
     def begin(self, seed: int) -> None:
-        """Make what follows depend on `seed` alone: an episode begins."""
-        forget = getattr(self.policy, "begin", None)
-        if forget is not None:
-            forget()
+        """Start an episode: reset the policy's memory and seed the exploration."""
+        reset_memory = getattr(self.policy, "begin", None)
+        if reset_memory is not None:
+            reset_memory()
         self._random = np.random.default_rng([seed, 1])
         self._space.seed(seed)
 
     def choose(self, observation: Any) -> tuple[Any, float]:
-        """The action for one observation, and the probability with which it is chosen.
+        """Return the action for one observation, and the probability of that action.
 
-        The probability is epsilon/A, and 1 - epsilon more for the policy's own of A actions; NaN
-        where actions are not discrete.
+        Each of A actions has the probability epsilon / A, plus 1 - epsilon if it is the policy's
+        own. It is NaN if actions are not discrete.
         """
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
@@ -96,7 +97,7 @@ class EpsilonGreedy:
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """The seed of an episode: as good as independent of all others', whoever runs it."""
+    """Return the seed of an episode, which depends on nothing but the two arguments."""
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
@@ -111,11 +112,11 @@ def run_episode(
     """Run one episode to its end.
 
     Args:
-        env: to run in; it is reset here.
-        behavior: chooses the actions.
-        seed: for the environment and for the exploration.
-        max_steps: break off after so many.
-        on_action: called with each action's probability before it is taken.
+        env: Environment; this function resets it.
+        behavior: Exploration policy.
+        seed: Seed of the environment and of the exploration.
+        max_steps: Number of steps after which the episode is interrupted.
+        on_action: Function that is called with each action's probability before the step.
     """
     observation, info = env.reset(seed=seed)
     behavior.begin(seed)
@@ -148,23 +149,23 @@ def rollout(
     on_action: Callable[[float], None] | None = None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Run episodes until so many, or so many steps, are done.
+    """Run a number of episodes, or a number of steps.
 
     Args:
-        env: to run in.
-        behavior: chooses the actions.
-        seed: episode k is reset with `episode_seed(seed, k)`.
-        episodes: how many, or None to count steps.
-        steps: how many in all; the last episode is broken off.
-        first_episode: k of the first one.
-        on_action: called with each action's probability before it is taken.
-        on_episode: called after each episode.
+        env: Environment.
+        behavior: Exploration policy.
+        seed: Base seed; episode k is reset with `episode_seed(seed, k)`.
+        episodes: Number of episodes, or None to count steps.
+        steps: Number of steps in total; the last episode is interrupted.
+        first_episode: Index k of the first episode.
+        on_action: Function that is called with each action's probability before the step.
+        on_episode: Function that is called after each episode.
 
     Raises:
-        ValueError: neither or both of `episodes` and `steps` are given.
+        ValueError: Neither or both of `episodes` and `steps` are given.
     """
     if (episodes is None) == (steps is None):
-        raise ValueError("give either episodes or steps")
+        raise ValueError("pass either episodes or steps")
     results: list[EpisodeResult] = []
     done = 0
     while (episodes is not None and len(results) < episodes) or (
@@ -184,11 +185,53 @@ def rollout(
     return results
 
 
+def batch_rollout(
+    envs: gym.vector.VectorEnv[Any, Any, Any],
+    policy: Policy,
+    seeds: Sequence[int],
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+    """Run one greedy episode from each seed, all together; the results equal `run_episode`'s.
+
+    Environments whose episode has ended are stepped on, and their further episodes are ignored.
+
+    Args:
+        envs: One environment for each seed, in autoreset mode `NextStep`.
+        policy: Policy that acts on batches of observations.
+        seeds: Seeds of the episodes.
+        on_episode: Function that is called after each episode, in the order of their ends.
+    """
+    assert envs.num_envs == len(seeds)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    # The base class is typed for a single seed, but vector environments accept a list.
+    all_seeds: Any = list(seeds)
+    observations, infos = envs.reset(seed=all_seeds)
+    results: list[EpisodeResult | None] = [None] * len(seeds)
+    running = np.ones(len(seeds), dtype=np.bool_)
+    totals, length = np.zeros(len(seeds)), 0
+    places = [_places(envs)]
+    while running.any():
+        actions = policy.act(observations)
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        totals[running] += rewards[running]
+        length += 1
+        places.append(_places(envs))
+        for i in np.flatnonzero(running & (terminated | truncated)).tolist():
+            reason = _reason(infos, i) or ("terminated" if terminated[i] else "time_limit")
+            path = np.array([place[i] for place in places if place is not None])
+            result = EpisodeResult(seeds[i], float(totals[i]), length, reason, path.reshape(-1, 2))
+            results[i] = result
+            if on_episode is not None:
+                on_episode(result)
+        running &= ~(terminated | truncated)
+    return [result for result in results if result is not None]
+
+
 def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
-    """Make sure that a trained policy has the spaces of the environment it is to act in.
+    """Validate that a trained policy has the spaces of an environment.
 
     Raises:
-        PolicyError: it was trained on others.
+        PolicyError: The policy was trained on other spaces.
     """
     for role in ("observation_space", "action_space"):
         trained, actual = getattr(policy, role, None), getattr(env, role)
@@ -210,3 +253,14 @@ def _batch(observation: Any) -> Any:
 def _position(telemetry: Callable[[], dict[str, float]] | None) -> tuple[float, float] | None:
     values = telemetry() if telemetry is not None else {}
     return (values["x_m"], values["y_m"]) if "x_m" in values and "y_m" in values else None
+
+
+def _places(envs: gym.vector.VectorEnv[Any, Any, Any]) -> NDArray[np.float64] | None:
+    """Return (N, 2) x and y of all vehicles, meters; None if the sim does not report them."""
+    places = getattr(envs.unwrapped, "places", None)
+    return None if places is None else places()
+
+
+def _reason(infos: dict[str, Any], i: int) -> str:
+    reasons = infos.get("reason")
+    return str(reasons[i]) if reasons is not None and infos["_reason"][i] else ""

@@ -1,8 +1,8 @@
-"""What can be said of returns, and how surely: robust means, comparisons, bootstrap intervals.
+"""Statistics of returns: robust means, comparisons of policies, and bootstrap intervals.
 
-Everything here takes returns (S, E) of S training seeds and E episodes each. Intervals draw seeds
-with replacement, and episodes within each, so that they cover both what another training run and
-what other episodes would have given.
+Returns have the shape (S, E): S training seeds, E episodes of each. Bootstrap samples draw seeds
+with replacement, then episodes within each, so that an interval covers the variation between
+training runs and between episodes.
 
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
     https://arxiv.org/abs/2108.13264
@@ -24,22 +24,22 @@ _PAIRS_AT_ONCE = 1 << 22
 
 
 def mean(returns: Floats) -> Floats:
-    """(...) the mean of returns (..., S, E)."""
+    """Return the means (...) of returns (..., S, E)."""
     means: Floats = returns.mean(axis=(-2, -1))
     return means
 
 
 def median(returns: Floats) -> Floats:
-    """(...) the median of returns (..., S, E)."""
+    """Return the medians (...) of returns (..., S, E)."""
     medians: Floats = np.median(returns, axis=(-2, -1))
     return medians
 
 
 def interquartile_mean(returns: Floats) -> Floats:
-    """(...) the mean of the middle half of returns (..., S, E).
+    """Return the interquartile means (...) of returns (..., S, E).
 
-    A quarter of them is left out on each side, rounded down: less swayed by a few wild episodes
-    than the mean, and less wasteful than the median.
+    A quarter of the returns, rounded down, is dropped at each end. The result is more robust to
+    outliers than the mean, and has less variance than the median.
     """
     ordered = np.sort(returns.reshape(*returns.shape[:-2], -1), axis=-1)
     count = ordered.shape[-1]
@@ -51,30 +51,31 @@ def interquartile_mean(returns: Floats) -> Floats:
 def bootstrap_interval(
     returns: Floats, statistic: Callable[[Floats], Floats] = mean, *, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % percentile interval of a statistic.
+    """Return the 95 % percentile bootstrap interval of a statistic.
 
     Args:
-        returns: (S, E).
-        statistic: of (..., S, E), such as `mean`, `median` or `interquartile_mean`.
-        seed: of the resampling.
+        returns: (S, E) returns.
+        statistic: Function of (..., S, E), such as `mean`, `median` or `interquartile_mean`.
+        seed: Seed of the resampling.
     """
     return _interval(statistic(_resampled(returns, np.random.default_rng(seed))))
 
 
 def improvement_probability(first: Floats, second: Floats) -> float:
-    """How often an episode of one policy returns more than one of another; ties count half.
+    """Return the probability that an episode of one policy has a higher return than of another.
 
-    The Mann-Whitney statistic over the number of pairs: 0.5 for equals.
+    Ties count half: this is the Mann-Whitney statistic divided by the number of pairs, 0.5 for
+    equal policies.
 
     Args:
-        first: (S, E) returns of the policy that may be better.
-        second: (S', E') returns of the other.
+        first: (S, E) returns of the one policy.
+        second: (S', E') returns of the other policy.
     """
     return float(_improvement(first.reshape(1, -1), second.reshape(1, -1))[0])
 
 
 def improvement_interval(first: Floats, second: Floats, *, seed: int = 0) -> tuple[float, float]:
-    """95 % bootstrap interval of `improvement_probability`."""
+    """Return the 95 % bootstrap interval of `improvement_probability`."""
     random = np.random.default_rng(seed)
     firsts, seconds = (
         _resampled(returns, random).reshape(RESAMPLES, -1) for returns in (first, second)
@@ -83,7 +84,7 @@ def improvement_interval(first: Floats, second: Floats, *, seed: int = 0) -> tup
 
 
 def _improvement(firsts: Floats, seconds: Floats) -> Floats:
-    """(R,) for R pairs of returns (R, N) and (R, M)."""
+    """Return the probabilities (R,) of improvement for returns (R, N) and (R, M)."""
     pairs = firsts.shape[1] * seconds.shape[1]
     parts = []
     step = max(1, _PAIRS_AT_ONCE // pairs)
@@ -95,7 +96,7 @@ def _improvement(firsts: Floats, seconds: Floats) -> Floats:
 
 
 def _resampled(returns: Floats, random: np.random.Generator) -> Floats:
-    """(RESAMPLES, S, E) draws of seeds with replacement, and of episodes within each."""
+    """Return (RESAMPLES, S, E) bootstrap samples of seeds, and of episodes within each seed."""
     seeds, episodes = returns.shape
     rows = random.integers(seeds, size=(RESAMPLES, seeds, 1))
     columns = random.integers(episodes, size=(RESAMPLES, seeds, episodes))

@@ -1,1 +1,1 @@
-"""Paths, vectors, meshes and kinematics shared by the sims."""
+"""Paths, vectors, meshes and kinematics that the sims share."""

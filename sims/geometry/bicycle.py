@@ -1,4 +1,4 @@
-"""The kinematic bicycle: a car whose wheels never slip."""
+"""Kinematic bicycle model: a car whose wheels never slip."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Motion(NamedTuple):
     yaw_rad: float
     speed_m_s: float
     heading: Heading
-    """Of the yaw, turned with it step by step; `moving` computes it anew."""
+    """Direction of the yaw. Each step turns it with the yaw; `moving` computes it from the yaw."""
 
 
 @inlined
 def moving(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Motion:
-    """Make a motion."""
+    """Return the motion of a car, its heading computed from its yaw."""
     return Motion(x_m, y_m, yaw_rad, speed_m_s, heading_of(yaw_rad))
 
 
@@ -34,13 +34,13 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step, in which it turns by at most 90 degrees.
+    """Advance a bicycle by one explicit Euler step; the step may turn it by at most 90 degrees.
 
     With slip angle beta, half the wheelbase l and speed v: x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, v' = acceleration. Polack, Altche,
     d'Andrea-Novel and de La Fortelle, "The kinematic bicycle model: a consistent model for planning
-    feasible trajectories for autonomous vehicles?", IEEE IV 2017, eq. 1. The sums of angles are
-    written out as products, since beta is known by its sine alone.
+    feasible trajectories for autonomous vehicles?", IEEE IV 2017, eq. 1. cos(yaw + beta) and
+    sin(yaw + beta) are expanded into products, since only the sine of beta is given.
     """
     cos, sin = motion.heading
     slip_cosine = math.sqrt(1.0 - slip_sine * slip_sine)
@@ -57,7 +57,7 @@ def roll(
 
 @inlined
 def slip_of(steering_rad: float) -> float:
-    """Give sin(beta) for an angle of the front wheels of at most 45 degrees.
+    """Return sin(beta) for an angle of the front wheels of at most 45 degrees.
 
     tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)).
     """
@@ -67,16 +67,16 @@ def slip_of(steering_rad: float) -> float:
 
 @inlined
 def steering_of(slip_sine: float) -> float:
-    """Give the front wheels' angle, radians, for sin(beta): what `slip_of` turns back."""
+    """Return the front wheels' angle, radians, for sin(beta): the inverse of `slip_of`."""
     return math.atan2(2.0 * slip_sine, math.sqrt(1.0 - slip_sine * slip_sine))
 
 
 @inlined
 def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
-    """Give sin(beta) of the turn that makes a sideways acceleration at a speed.
+    """Return sin(beta) of the turn that causes a lateral acceleration at a speed.
 
-    The car turns on a radius of l / sin(beta), so v^2 sin(beta) / l = lateral; at low speed no turn
-    reaches it and the answer is 1.
+    The radius of the turn is l / sin(beta), so v^2 sin(beta) / l = lateral. At low speed no turn
+    causes that much, and the result is 1.
     """
     least = 0.5 * wheelbase_m * lateral_m_s2
     return least / max(speed_m_s * speed_m_s, least)

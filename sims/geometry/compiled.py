@@ -1,4 +1,4 @@
-"""One decorator for every equation that runs as machine code."""
+"""Decorators that compile the equations of the sims to machine code."""
 
 from __future__ import annotations
 
@@ -15,27 +15,26 @@ Result = TypeVar("Result")
 
 
 def compiled(function: AnyFunction) -> AnyFunction:
-    """Compile a function with numba at its first call, and keep the result on disk.
+    """Compile a function with numba at its first call, and cache the machine code on disk.
 
-    Without `fastmath`: sums keep the order they are written in, so the same input gives the same
-    bits. A division by 0 gives inf or NaN, as in NumPy: a check before each would keep the compiler
-    from doing several at once. The decorator says to a type checker that the signature stays as
-    written.
+    `fastmath` is off: sums are computed in the order in which they are written, so the same input
+    always has the same bits as its result. A division by 0 results in inf or NaN, as in NumPy,
+    because a check before each division would prevent vectorization. For a type checker, the
+    function keeps its signature.
 
-    The result is kept in `__pycache__` beside the source; where that cannot be written, in the
-    user's cache folder; where NUMBA_CACHE_DIR is set, there. Where nothing can be written, it lasts
-    as long as the process.
+    The cache is `$NUMBA_CACHE_DIR` if that is set, else `__pycache__` beside the source, else, if
+    that cannot be written, the user's cache folder. Without any of them, each process compiles.
 
-    The cache notices an edit of the function's own file only. After an edit of a function that is
-    called from other files, delete the `__pycache__` folder.
+    The cache is invalidated by an edit of the function's own file only. After an edit of a function
+    that other files call, delete the `__pycache__` folder.
     """
     return _compiled(function)
 
 
 def inlined(function: AnyFunction) -> AnyFunction:
-    """Compile a function into each that calls it, however long it is.
+    """Compile a function and inline it into each compiled function that calls it.
 
-    A loop over vehicles can then do several of them at once; by itself the compiler inlines short
+    Loops over vehicles can then be vectorized. Without this decorator, the compiler inlines short
     functions only.
     """
     return _compiled(function, forceinline=True)
@@ -44,16 +43,16 @@ def inlined(function: AnyFunction) -> AnyFunction:
 def ready(
     function: Callable[..., Result], *arguments: Any, examples: tuple[Any, ...] = ()
 ) -> Callable[..., Result]:
-    """Bind a compiled function to arguments that stay the same objects: arrays, and constants.
+    """Bind a compiled function to arguments that stay the same objects: arrays and constants.
 
-    A call by name looks at the type of each argument first, which for a single vehicle takes as
-    long as the step itself. Here that is done once; the arrays' contents may change, and nothing
-    else of them.
+    A normal call first inspects the type of each argument, which for a single vehicle takes as long
+    as the step itself. Here the types are inspected once. The arrays' contents may change; their
+    shape and memory may not.
 
     Args:
-        function: to be called.
-        *arguments: its first ones.
-        examples: of the types of the others, which are given in each call.
+        function: Compiled function.
+        *arguments: First arguments, which are bound.
+        examples: Values with the types of the remaining arguments, which each call passes.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)
@@ -73,20 +72,20 @@ def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:
 
 
 class _Announcer(event.Listener):  # type: ignore[misc]
-    """Tells whoever waits, once, that something of ours is compiled and not read from the cache."""
+    """Listener that reports the first compilation of a sim, since the user has to wait for it."""
 
     lasts: ClassVar[str] = "once"
     is_silent: ClassVar[bool] = False
 
     def on_start(self, event: Any) -> None:
-        """Say it at the first compilation."""
+        """Print one line to stderr at the first compilation."""
         ours = event.data["dispatcher"].py_func.__module__.startswith("mcaprl.")
         if ours and not _Announcer.is_silent:
             _Announcer.is_silent = True
             print(f"compiling the sim for this machine, {self.lasts}", file=sys.stderr)
 
     def on_end(self, event: Any) -> None:
-        """Say nothing."""
+        """Do nothing."""
 
 
 event.register("numba:compile", _Announcer())

@@ -1,4 +1,4 @@
-"""Solids as triangles, for the depth camera."""
+"""Triangle meshes of solids, for the depth camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Vector = tuple[float, float, float]
 
 # The corners of a unit cube are numbered 4 x + 2 y + z. Each face lists its corners
-# counter-clockwise as seen from outside; its diagonal makes two triangles of it.
+# counter-clockwise as seen from outside; its diagonal splits it into two triangles.
 _FACES = (
     (0, 1, 3, 2),
     (4, 6, 7, 5),
@@ -22,7 +22,7 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 
 
 def box_mesh(middle_m: Vector, size_m: Vector) -> NDArray[np.float64]:
-    """Give a box, its edges along the axes, as (12, 3, 3) triangles: corner, then x, y, z; metres.
+    """Return the triangles of an axis-aligned box, (12 triangles, 3 corners, xyz), meters.
 
     Seen from outside, the corners of each triangle run counter-clockwise.
     """
@@ -32,7 +32,7 @@ def box_mesh(middle_m: Vector, size_m: Vector) -> NDArray[np.float64]:
 
 
 def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
-    """Give a square of ground at z = 0 around the origin, (2, 3, 3) metres, seen from above."""
+    """Return a square of ground at z = 0 around the origin, (2, 3, 3) meters, facing up."""
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     triangles: NDArray[np.float64] = half_side_m * corners[[[0, 1, 2], [0, 2, 3]]]
     return triangles
@@ -41,9 +41,9 @@ def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
 def frustum_mesh(
     foot_m: Vector, foot_side_m: float, top_side_m: float, height_m: float
 ) -> NDArray[np.float64]:
-    """Give an upright block on a square foot, narrower at its top, without its base; (10, 3, 3).
+    """Return an upright square frustum without its base, (10, 3, 3) meters.
 
-    With a top of 0 it is a pyramid, (4, 3, 3).
+    With a top side of 0 it is a pyramid, (4, 3, 3).
     """
     height = _CORNERS[:, 2:] + 0.5
     level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)

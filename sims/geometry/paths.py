@@ -1,4 +1,4 @@
-"""Plane geometry of a closed path: where its points are, and which one is nearest."""
+"""Plane geometry: closed paths, the nearest point of a path, angles and directions."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mcaprl.sims.geometry.compiled import compiled, inlined
 
 
 class Path(NamedTuple):
-    """A closed polyline of N legs, addressed by the distance along it."""
+    """A closed polyline of N legs; places on it are given by the distance along it."""
 
     points_m: NDArray[np.float64]
-    """(N + 1, 2) corners; the last one is the first again."""
+    """(N + 1, 2) corners; the last one equals the first."""
     along_m: NDArray[np.float64]
     """(N + 1,) distance of each corner from the start, along the path."""
     yaw_rad: NDArray[np.float64]
     """(N,) direction of each leg, counter-clockwise from x."""
     forward: NDArray[np.float64]
-    """(N, 2) the same as unit vectors."""
+    """(N, 2) direction of each leg as a unit vector."""
     length_m: float
 
 
@@ -30,16 +30,16 @@ class Projection(NamedTuple):
 
     along_m: float
     offset_m: float
-    """Distance from it, positive to the left of the path's direction."""
+    """Distance of the position from the path, positive to the left of its direction."""
     yaw_rad: float
     """Direction of the path there."""
 
 
 def closed_path(corners: ArrayLike) -> Path:
-    """Make a path through corners of shape (N + 1, 2), metres, the last equal to the first.
+    """Return the path through corners (N + 1, 2), meters, of which the last equals the first.
 
     Raises:
-        ValueError: the corners do not form a closed polyline of legs longer than 0.
+        ValueError: The corners do not form a closed polyline of legs longer than 0.
     """
     points = np.array(corners, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
@@ -49,7 +49,7 @@ def closed_path(corners: ArrayLike) -> Path:
     legs = np.diff(points, axis=0)
     lengths = np.hypot(legs[:, 0], legs[:, 1])
     if not np.all(lengths > 0):
-        raise ValueError("two neighbouring corners are the same point")
+        raise ValueError("two neighboring corners are the same point")
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     yaw_rad = np.arctan2(legs[:, 1], legs[:, 0])
     return Path(points, along, yaw_rad, legs / lengths[:, np.newaxis], float(along[-1]))
@@ -57,19 +57,19 @@ def closed_path(corners: ArrayLike) -> Path:
 
 @inlined
 def wrap_angle(angle_rad: float) -> float:
-    """Bring an angle into [-pi, pi)."""
+    """Return the equivalent of an angle in [-pi, pi)."""
     turns = np.floor((angle_rad + math.pi) / (2.0 * math.pi))
     wrapped = max(angle_rad - 2.0 * math.pi * turns, -math.pi)
-    # Rounding may leave it a hair outside on the other side.
+    # Rounding may move it just outside the other end.
     return wrapped if wrapped < math.pi else -math.pi
 
 
 @inlined
 def sine(angle_rad: float) -> float:
-    """Give the sine of an angle of at most 45 degrees, to the last bit or two.
+    """Return the sine of an angle of at most 45 degrees, accurate to about one bit.
 
-    Without a branch or a call, so that the compiler can do those of several vehicles at once. The
-    series x - x^3/3! + x^5/5! - ...: the first term left out is below 6e-17 of the sine.
+    Without branches and calls, so that the compiler can vectorize it. The series is
+    x - x^3/3! + x^5/5! - ...; the first omitted term is below 6e-17 of the sine.
     """
     square = angle_rad * angle_rad
     rest = 1.0 / 6227020800.0 - square * (1.0 / 1307674368000.0)
@@ -83,9 +83,9 @@ def sine(angle_rad: float) -> float:
 
 @inlined
 def cosine(angle_rad: float) -> float:
-    """Give the cosine of an angle of at most 45 degrees, as `sine` gives the sine.
+    """Return the cosine of an angle of at most 45 degrees, computed as in `sine`.
 
-    1 - x^2/2! + x^4/4! - ...: the first term left out is below 2e-18.
+    The series is 1 - x^2/2! + x^4/4! - ...; the first omitted term is below 2e-18.
     """
     square = angle_rad * angle_rad
     rest = 1.0 / 87178291200.0 - square * (1.0 / 20922789888000.0)
@@ -98,11 +98,11 @@ def cosine(angle_rad: float) -> float:
 
 
 _QUARTER_RAD, _QUARTER_REST_RAD = math.pi / 2, 6.123233995736766e-17
-"""A quarter turn, and what float64 lacks of it."""
+"""A quarter turn, and the rounding error of its float64 value."""
 
 
 class Heading(NamedTuple):
-    """The direction of a yaw, as a unit vector."""
+    """Direction of a yaw angle as a unit vector."""
 
     cos: float
     sin: float
@@ -110,15 +110,16 @@ class Heading(NamedTuple):
 
 @inlined
 def heading_of(yaw_rad: float) -> Heading:
-    """Give the direction of a yaw, to the last bit or two.
+    """Return the direction of a yaw angle, accurate to about one bit.
 
-    Without a branch or a call, as `sine`: the sine of what is left of the nearest quarter turn, and
-    its cosine, trade places from quarter to quarter.
+    Without branches and calls, as in `sine`. The angle is reduced to its distance from the nearest
+    quarter turn; the number of quarter turns decides which of that distance's sine and cosine is
+    the result's cosine, and their signs.
     """
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
     sin, cos = sine(rest_rad), cosine(rest_rad)
-    # 0 to 3.
+    # quarters modulo 4
     quarter = quarters - 4.0 * np.floor(0.25 * quarters)
     is_odd = (quarter == 1.0) | (quarter == 3.0)
     size_of_cos, size_of_sin = (sin, cos) if is_odd else (cos, sin)
@@ -130,9 +131,9 @@ def heading_of(yaw_rad: float) -> Heading:
 
 @inlined
 def turned(heading: Heading, angle_rad: float) -> Heading:
-    """Turn a direction to the left, by at most 90 degrees either way.
+    """Turn a direction to the left by an angle of at most 90 degrees, positive or negative.
 
-    The sum formulas need the angle's own sine and cosine; 1 - cos is 2 sin^2 of half the angle.
+    Uses the angle addition formulas; the angle's cosine is 1 - 2 sin^2 of half of it.
     """
     half = sine(0.5 * angle_rad)
     cos = 1.0 - 2.0 * half * half
@@ -141,7 +142,7 @@ def turned(heading: Heading, angle_rad: float) -> Heading:
 
 
 class Spot(NamedTuple):
-    """A place on a path: on which leg, and how far from the leg's start."""
+    """A place on a path: the index of its leg, and the distance from the leg's start."""
 
     leg: int
     rest_m: float
@@ -149,7 +150,7 @@ class Spot(NamedTuple):
 
 @compiled
 def spot_at(path: Path, along_m: float) -> Spot:
-    """Find the place at a distance along the path; any lap will do."""
+    """Return the place at a distance along the path, which may be on any lap."""
     rest_m = along_m % path.length_m
     leg, beyond = 0, len(path.yaw_rad)
     while beyond - leg > 1:
@@ -163,7 +164,7 @@ def spot_at(path: Path, along_m: float) -> Spot:
 
 @compiled
 def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
-    """Go on from a place by a distance of 0 or more, metres."""
+    """Return the place that is a distance of 0 or more further along the path."""
     leg, rest_m = spot.leg, spot.rest_m + ahead_m
     length_m = path.along_m[leg + 1] - path.along_m[leg]
     while rest_m >= length_m:
@@ -175,29 +176,29 @@ def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
 
 @compiled
 def point_of(path: Path, spot: Spot) -> tuple[float, float]:
-    """Give the coordinates (x, y) of a place, metres."""
+    """Return the coordinates (x, y) of a place, meters."""
     start, forward = path.points_m[spot.leg], path.forward[spot.leg]
     return start[0] + spot.rest_m * forward[0], start[1] + spot.rest_m * forward[1]
 
 
 @compiled
 def leg_at(path: Path, along_m: float) -> int:
-    """Give the index of the leg that holds a distance along the path; any lap will do."""
+    """Return the index of the leg at a distance along the path, which may be on any lap."""
     return spot_at(path, along_m).leg
 
 
 @compiled
 def point_at(path: Path, along_m: float) -> tuple[float, float]:
-    """Give the point (x, y) at a distance along the path, metres; any lap will do."""
+    """Return the point (x, y), meters, at a distance along the path, which may be on any lap."""
     return point_of(path, spot_at(path, along_m))
 
 
 @compiled
 def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Find the nearest of the path points between two distances along it.
+    """Return the nearest of the path points between two distances along the path.
 
-    The window [from_m, to_m] keeps a traveller on its own pass where the path meets itself. It may
-    begin on any lap, and the result's `along_m` lies inside it.
+    Where the path meets itself, the window [from_m, to_m] selects the pass that a vehicle is on. It
+    may begin on any lap; the result's `along_m` is inside it.
     """
     leg, rest_m = spot_at(path, from_m)
     leg_start_m = from_m - rest_m
@@ -221,5 +222,5 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
 
 @inlined
 def in_body_frame(dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
-    """Turn a map vector into a body's frame: (forward, left), metres."""
+    """Transform a map vector into a body's frame: (forward, left), meters."""
     return dx_m * cos_yaw + dy_m * sin_yaw, dy_m * cos_yaw - dx_m * sin_yaw

@@ -1,4 +1,4 @@
-"""Vectors and rotations of space, compiled."""
+"""Compiled functions of vectors and rotations in three dimensions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mcaprl.sims.geometry.compiled import inlined
 
 
 class Vector(NamedTuple):
-    """Three coordinates; the unit is in the name of what holds it."""
+    """Three coordinates; the name of a variable or field says their unit."""
 
     x: float
     y: float
@@ -17,7 +17,7 @@ class Vector(NamedTuple):
 
 
 class Quaternion(NamedTuple):
-    """A rotation w + x i + y j + z k, of length 1."""
+    """A rotation as a unit quaternion w + x i + y j + z k."""
 
     w: float
     x: float
@@ -27,43 +27,43 @@ class Quaternion(NamedTuple):
 
 @inlined
 def plus(a: Vector, b: Vector) -> Vector:
-    """Give a + b."""
+    """Return a + b."""
     return Vector(a.x + b.x, a.y + b.y, a.z + b.z)
 
 
 @inlined
 def minus(a: Vector, b: Vector) -> Vector:
-    """Give a - b."""
+    """Return a - b."""
     return Vector(a.x - b.x, a.y - b.y, a.z - b.z)
 
 
 @inlined
 def times(factor: float, a: Vector) -> Vector:
-    """Give a vector, made longer by a factor."""
+    """Return factor a."""
     return Vector(factor * a.x, factor * a.y, factor * a.z)
 
 
 @inlined
 def dot(a: Vector, b: Vector) -> float:
-    """Give the scalar product."""
+    """Return the dot product."""
     return a.x * b.x + a.y * b.y + a.z * b.z
 
 
 @inlined
 def cross(a: Vector, b: Vector) -> Vector:
-    """Give the vector product."""
+    """Return the cross product."""
     return Vector(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
 
 
 @inlined
 def norm(a: Vector) -> float:
-    """Give the length."""
+    """Return the length."""
     return math.sqrt(dot(a, a))
 
 
 @inlined
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Give the rotation that turns by q first, then by p."""
+    """Return the rotation by q followed by the rotation by p."""
     return Quaternion(
         p.w * q.w - p.x * q.x - p.y * q.y - p.z * q.z,
         p.w * q.x + p.x * q.w + p.y * q.z - p.z * q.y,
@@ -74,19 +74,19 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 @inlined
 def inverse(q: Quaternion) -> Quaternion:
-    """Give the rotation back."""
+    """Return the inverse rotation."""
     return Quaternion(q.w, -q.x, -q.y, -q.z)
 
 
 @inlined
 def unit(q: Quaternion) -> Quaternion:
-    """Bring a quaternion to length 1."""
+    """Normalize a quaternion to length 1."""
     scale = 1.0 / math.sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
     return Quaternion(scale * q.w, scale * q.x, scale * q.y, scale * q.z)
 
 
 @inlined
 def rotate(q: Quaternion, a: Vector) -> Vector:
-    """Turn a vector: a + 2 u x (u x a + w a), with u the imaginary part of q."""
+    """Rotate a vector: a + 2 u x (u x a + w a), where u is the imaginary part of q."""
     axis = Vector(q.x, q.y, q.z)
     return plus(a, times(2.0, cross(axis, plus(cross(axis, a), times(q.w, a)))))

@@ -1,1 +1,12 @@
-"""The roads of highway-env, `mcaprl/HighwayLane-v0`."""
+"""Lane keeping and racetracks of highway-env, `mcaprl/HighwayLane-v0`."""
+
+from mcaprl.sims.spec import SimSpec
+
+SPEC = SimSpec(
+    name="highway-lane",
+    env_id="mcaprl/HighwayLane-v0",
+    entry_point="mcaprl.sims.highway.env:HighwayLaneEnv",
+    max_episode_steps=700,
+    pilot="mcaprl.sims.highway.pilot:HighwayPilot",
+    engine="highway_env",
+)

@@ -1,7 +1,7 @@
-"""Where one can drive on a road of highway-env: its lanes, strung together, in ROS axes.
+"""Courses of a road of highway-env: its consecutive lanes joined, in ROS axes.
 
-highway-env's y points down on its pictures. Here y and all angles change sign, so that z is up,
-angles grow counter-clockwise, and left is positive.
+highway-env's y points down in its images. Here y and all angles have the opposite sign, so that z
+is up, angles are counter-clockwise, and left is positive.
 """
 
 from __future__ import annotations
@@ -17,40 +17,40 @@ Floats = NDArray[np.float64]
 
 SAMPLE_M = 1.0
 FLIP = np.array([1.0, -1.0])
-"""Turns (x, y) of highway-env into that of ROS, and back."""
+"""Factors that transform (x, y) of highway-env to ROS axes and back."""
 
 
 class Place(NamedTuple):
-    """The point of a course nearest to a position."""
+    """Nearest point of a course to a position."""
 
     along_m: float
     offset_m: float
-    """Distance from it, positive to the left of the course's direction."""
+    """Distance of the position from the course, positive to the left of its direction."""
     yaw_rad: float
     """Direction of the course there."""
 
 
 class Course(NamedTuple):
-    """The middle of a lane from one end of the road to the other, or around it."""
+    """Middle of a lane from one end of the road to the other, or around a closed road."""
 
     points_m: Floats
-    """(N + 1, 2), about 1 m apart; of a closed one, the last is the first again."""
+    """(N + 1, 2) points about 1 m apart; if it is closed, the last equals the first."""
     along_m: Floats
     """(N + 1,) distance of each point from the first."""
     lengths_m: Floats
-    """(N,) of the legs from each point to the next."""
+    """(N,) lengths of the legs from each point to the next."""
     directions: Floats
-    """(2, N) of the legs: cosines, sines."""
+    """(2, N) cosines and sines of the legs' directions."""
     half_width_m: float
     is_closed: bool
 
     @property
     def length_m(self) -> float:
-        """From the first point to the last."""
+        """Distance from the first point to the last, along the course."""
         return float(self.along_m[-1])
 
     def nearest(self, x_m: float, y_m: float) -> Place:
-        """Find the point nearest to a position."""
+        """Return the nearest point of the course to a position."""
         dx_m, dy_m = x_m - self.points_m[:-1, 0], y_m - self.points_m[:-1, 1]
         cos, sin = self.directions
         along_m = np.clip(dx_m * cos + dy_m * sin, 0.0, self.lengths_m)
@@ -64,7 +64,10 @@ class Course(NamedTuple):
         )
 
     def point(self, along_m: float) -> tuple[float, float]:
-        """Give the point (x, y) at a distance along the course; beyond an open end, straight on."""
+        """Return the point (x, y) at a distance along the course.
+
+        Beyond an open end, the course continues straight.
+        """
         x_m, y_m = self.points_m.T
         if self.is_closed:
             along_m %= self.length_m
@@ -77,10 +80,10 @@ class Course(NamedTuple):
 
 
 def courses_of(network: Any) -> tuple[Course, ...]:
-    """String the lanes of a road together: a course for each of the lanes side by side.
+    """Join the consecutive lanes of a road to courses, one for each of the parallel lanes.
 
     Args:
-        network: a `highway_env.road.road.RoadNetwork` without forks.
+        network: A `highway_env.road.road.RoadNetwork` without forks.
     """
     edges = list(_edges(network.graph))
     return tuple(
@@ -90,7 +93,10 @@ def courses_of(network: Any) -> tuple[Course, ...]:
 
 
 def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
-    """Walk from the node that nothing leads to, or around from the first one: node, node, lanes."""
+    """Yield start node, end node and lanes of each edge, in the direction of travel.
+
+    A closed road begins at its first node, another one at the node without a predecessor.
+    """
     reached = {end for ends in graph.values() for end in ends}
     first = next((node for node in graph if node not in reached), next(iter(graph)))
     node, is_new = first, True
@@ -103,13 +109,13 @@ def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, l
 def _course(lanes: list[Any], is_closed: bool) -> Course:
     points: list[Floats] = []
     for lane in lanes:
-        # A lane may begin beside an earlier one's end, and is entered there.
+        # A lane may overlap the end of the previous one; sampling continues where that one ended.
         first_m = lane.local_coordinates(points[-1] * FLIP)[0] if points else 0.0
         count = int(np.ceil((lane.length - first_m) / SAMPLE_M))
         sampled = np.linspace(max(0.0, first_m), lane.length, count + 1)
         points += [lane.position(along_m, 0.0) * FLIP for along_m in sampled[bool(points) :]]
     if is_closed:
-        # The last lane's end may lie beyond the first one's start.
+        # The end of the last lane may be beyond the start of the first one.
         while lanes[0].local_coordinates(points[-1] * FLIP)[0] > -SAMPLE_M / 2:
             points.pop()
         points.append(points[0])

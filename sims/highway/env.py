@@ -1,4 +1,4 @@
-"""highway-env's lane keeping and racetracks, with the actions, names and scene of our sims."""
+"""Gymnasium environment of the highway-lane sim, a wrapper around roads of highway-env."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ ROADS: Final[dict[str, type]] = {
     "racetrack-v0": RacetrackEnv,
     "racetrack-oval-v0": RacetrackEnvOval,
 }
-"""highway-env's own ids."""
+"""Classes of highway-env's environments, by their ids."""
 
 ACTION_MEANINGS = ("straight", "right", "left", "slightly right", "slightly left")
 STEERING_RAD = np.radians([0.0, -24.0, 24.0, -6.0, 6.0])
-"""Of the front wheels; left is positive."""
+"""Angle of the front wheels for each action; left is positive."""
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 SEEN_AHEAD_M = 50.0
 OBSERVATION_NAMES = (
@@ -55,28 +55,28 @@ OBSERVATION_NAMES = (
 )
 OBSERVATION_LIMIT = 4.0
 TRAIL_LENGTH = 40
-# No observation of theirs is made: its noise and its tables are not ours.
+# highway-env's own observation, which is not used, is made empty to save time.
 _NO_OBSERVATION = {"type": "AttributesObservation", "attributes": []}
 
 
 class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
-    """A car that keeps its lane on a road of highway-env.
+    """Lane keeping on a road of highway-env.
 
     ## Description
 
-    The roads, the cars and the rewards are highway-env's, unchanged: `lane-keeping-v0`, where a car
-    whose tyres slip follows a straight road and then a winding one, 480 m in all; and two closed
-    racetracks of several lanes with another car on them, which is slower. The speed is given;
-    the agent steers. Edouard Leurent, "An environment for autonomous driving decision-making",
+    The agent steers a car whose speed is fixed. Roads, cars and rewards are those of highway-env:
+    `lane-keeping-v0`, where a car with tire slip follows a straight and then a winding road, 480 m
+    in total; and two closed racetracks with several lanes and a slower car. Edouard Leurent, "An
+    environment for autonomous driving decision-making",
     https://github.com/Farama-Foundation/HighwayEnv, 2018.
 
-    The car decides each 0.1 s of simulated time, on racetracks each 0.2 s. The same seed and
-    actions give the same bits. Axes are right-handed with z up, x and y in metres; y and angles
-    have the opposite sign of highway-env's, so left is positive.
+    A decision lasts 0.1 s of simulated time, on racetracks 0.2 s. The same seed and actions result
+    in the same bits. Axes are right-handed with z up, x and y in meters; y and angles have the
+    opposite sign of highway-env's, so left is positive.
 
     ## Action Space
 
-    `Discrete(5)`, the angle of the front wheels.
+    `Discrete(5)`: the angle of the front wheels.
 
     | Action | Meaning | Steering |
     |---|---|---|
@@ -88,15 +88,15 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
 
     ## Observation Space
 
-    `observation="state"`: `Box(-4, 4)` of 15 float32; what is beyond is clipped.
+    `observation="state"`: `Box(-4, 4)` of 15 float32; values beyond are clipped.
 
     | Index | Observation | Unit |
     |---|---|---|
     | 0 | distance from the middle of the lane, left positive | half the lane's width |
     | 1 | heading error, left positive | pi / 2 rad |
     | 2 | speed | 10 m/s |
-    | 3 | speed sideways, by slipping, left positive | 5 m/s |
-    | 4 | yaw rate of a slipping car, left positive | 2 rad/s |
+    | 3 | lateral speed of a car with tire slip, left positive | 5 m/s |
+    | 4 | yaw rate of a car with tire slip, left positive | 2 rad/s |
     | 5, 6 | the lane's middle 5 m ahead: forward, left of the car | 5 m |
     | 7, 8 | 10 m ahead | 10 m |
     | 9, 10 | 20 m ahead | 20 m |
@@ -105,29 +105,29 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
 
     ## Rewards
 
-    highway-env's. Lane keeping: 1 - (d / 10 m)^2 at distance d from the middle of the lane that is
-    to be followed. Racetracks: 1 / (1 + 4 d^2) less 0.3 for full steering, scaled to 0 to 1; 0 off
-    the road.
+    Those of highway-env. Lane keeping: 1 - (d / 10 m)^2 at distance d from the middle of the lane
+    to be followed. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for full steering, scaled to 0 to 1; 0
+    off the road.
 
     ## Starting State
 
-    `start="line"`: highway-env's own, which is always the same in lane keeping.
-    `start="anywhere"`: from there the car is put anywhere on its road, but for the last 60 m of one
-    that ends and 20 m around another car; up to 1.5 m and 0.2 rad off.
-    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, or with a fourth number for the speed in m/s,
-    puts it there.
+    `start="line"`: the start of highway-env, which is constant in lane keeping.
+    `start="anywhere"`: a random place on the road, except the last 60 m of an open road and 20 m
+    around another car, with an offset of up to 1.5 m and 0.2 rad.
+    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
+    number, starts at that pose.
 
     ## Episode End
 
     Terminated with `info["reason"]` = `off_lane` (the car's middle is on no lane), `collision`, or
-    `finished` (5 m before the end of a road that has one). Truncated after 700 steps, and on
-    racetracks with `time_limit` after highway-env's own 300 s.
+    `finished` (5 m before the end of an open road). Truncated after 700 steps, and on racetracks
+    with `time_limit` after highway-env's limit of 300 s.
 
-    `info` has lateral_offset_m, heading_error_rad, speed_m_s and progress_m (along the road since
-    the start; on a racetrack along its first lane, growing over the laps).
+    `info` contains lateral_offset_m, heading_error_rad, speed_m_s and progress_m (distance along
+    the road since the start; on a racetrack along its first lane, over all laps).
 
-    What differs from highway-env: lane keeping there never terminates, is cut after 200 steps,
-    166 m, and observes with noise.
+    In highway-env itself, lane keeping never terminates, is truncated after 200 steps or 166 m, and
+    has noisy observations.
 
     ## Arguments
 
@@ -155,10 +155,10 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         start: str = "anywhere",
         render_mode: Literal["human", "rgb_array"] | None = None,
     ) -> None:
-        """See "Arguments" above.
+        """Make the environment; see "Arguments" of the class.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
+            UnknownNameError: An argument has a value that is not in its list.
         """
         check_name("road", road, tuple(ROADS))
         check_name("rules", rules, RULES)
@@ -186,23 +186,23 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
 
     @property
     def car(self) -> Car:
-        """The car that is driven."""
+        """Car that the agent drives."""
         return self._car
 
     @property
     def others(self) -> tuple[Car, ...]:
-        """The other cars."""
+        """Other cars."""
         own = self._inner.vehicle
         return tuple(_car_of(each) for each in self._inner.road.vehicles if each is not own)
 
     @property
     def course(self) -> Course:
-        """The lane that the car is on, from end to end."""
+        """Course of the car's lane."""
         return self.courses[self._lane]
 
     @property
     def place(self) -> Place:
-        """Where the car is on its lane."""
+        """Nearest point of the lane to the car."""
         return self._place
 
     def reset(
@@ -211,13 +211,14 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         """Start an episode; see "Starting State".
 
         Raises:
-            UsageError: `options` has an unknown key, or a pose that is not free and on a lane.
+            UsageError: `options` has an unknown key, or a pose that is invalid, occupied or not on
+                a lane.
         """
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         self._inner.reset(seed=seed)
-        # It keeps all states since it was made.
+        # Otherwise this list of all states grows without limit.
         getattr(self._inner, "trajectory", []).clear()
         self._locate()
         car, others = self._car, self.others
@@ -227,19 +228,19 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
             self._put(drawn_pose(self.np_random, self.courses, others, car.speed_m_s))
         self._progress_m, self._last_action, self._reward = 0.0, 0, 0.0
         self._trail_m.clear()
-        return self._seen(), self._info()
+        return self._observe(), self._info()
 
     def step(
         self, action: int | np.integer[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Drive on for one decision.
+        """Advance the car by one decision.
 
         Raises:
-            UsageError: the action is not 0 to 4.
+            UsageError: The action is not 0 to 4.
         """
         check_action(action, len(ACTION_MEANINGS))
         self._last_action = int(action)
-        # Their angles grow clockwise.
+        # highway-env's angles are clockwise.
         share = -STEERING_RAD[action] / self._steering_range_rad
         _, reward, _, is_over, _ = self._inner.step(np.array([share]))
         before_m = self._along_m
@@ -250,10 +251,10 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         info = self._info()
         if reason or is_over:
             info["reason"] = reason or "time_limit"
-        return self._seen(), self._reward, bool(reason), bool(is_over and not reason), info
+        return self._observe(), self._reward, bool(reason), bool(is_over and not reason), info
 
     def _reason(self) -> str:
-        """Say why the car cannot drive on; empty if it can."""
+        """Return the reason of a termination; empty if the episode goes on."""
         if self._inner.vehicle.crashed:
             return "collision"
         if abs(self._place.offset_m) > self.course.half_width_m:
@@ -262,29 +263,29 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         return "finished" if not self.course.is_closed and left_m < LOOKAHEADS_M[0] else ""
 
     def _locate(self) -> None:
-        """Find the car on the courses; the nearest one is its lane."""
+        """Update the car and its place; the nearest course is its lane."""
         self._car = _car_of(self._inner.vehicle)
         places = [course.nearest(self._car.x_m, self._car.y_m) for course in self.courses]
         self._lane = int(np.argmin([abs(place.offset_m) for place in places]))
         self._place, self._along_m = places[self._lane], places[0].along_m
 
     def _moved_m(self, before_m: float) -> float:
-        """Give the way along the first lane since it was at `before_m`."""
+        """Return the distance along the first lane since the position `before_m`."""
         moved_m, length_m = self._along_m - before_m, self.courses[0].length_m
         if self.courses[0].is_closed:
             moved_m = (moved_m + length_m / 2) % length_m - length_m / 2
         return moved_m
 
     def _put(self, pose: Pose) -> None:
-        """Move the car of the inner environment."""
+        """Move the car of the inner environment to a pose."""
         vehicle = self._inner.vehicle
         vehicle.position = np.array([pose.x_m, pose.y_m]) * FLIP
         vehicle.heading, vehicle.speed = -pose.yaw_rad, pose.speed_m_s
         vehicle.on_state_update()
         self._locate()
 
-    def _seen(self) -> NDArray[np.float32]:
-        """Give the observation, and take note of the place for what is drawn."""
+    def _observe(self) -> NDArray[np.float32]:
+        """Return the observation; append the position to the trail, and show it in mode `human`."""
         self._trail_m.append((self._car.x_m, self._car.y_m))
         if self.render_mode == "human":
             self.render()
@@ -318,17 +319,17 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         }
 
     def telemetry(self) -> dict[str, float]:
-        """Give the car's state by name; the units are in the names."""
+        """Return the state of the car by name; names include the units."""
         steering_rad = float(STEERING_RAD[self._last_action])
         place = {"x_m": self._car.x_m, "y_m": self._car.y_m, "yaw_rad": self._car.yaw_rad}
         return {**place, **self._info(), "steering_rad": steering_rad}
 
     def static_scene(self) -> Sequence[Shape]:
-        """Give the shapes that never change, those of the car's body in the frame `car`."""
+        """Return the shapes that never change; those of the car are in the frame `car`."""
         return highway_scene.static_shapes(self._inner.road.network, self.courses)
 
     def scene(self) -> Sequence[Shape]:
-        """Give the shapes that change with each step."""
+        """Return the shapes that change with each step."""
         aims_m = [self.course.point(self._place.along_m + ahead) for ahead in LOOKAHEADS_M]
         steering_rad = float(STEERING_RAD[self._last_action])
         return highway_scene.moving_shapes(
@@ -336,15 +337,15 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         )
 
     def static_frames(self) -> Sequence[Frame]:
-        """Give no frames: nothing is fixed to the car but its body."""
+        """Return no frames: there is no sensor frame."""
         return ()
 
     def frames(self) -> Sequence[Frame]:
-        """Give the car's frame in the map."""
+        """Return the car's frame in the map."""
         return (highway_scene.car_frame(self._car),)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the car from above: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
+        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
         if self._render_mode is None:
             return None
         if self._view is None:

@@ -1,4 +1,4 @@
-"""What a 3D viewer shows of a road of highway-env: asphalt, lines, cars, and where one looks.
+"""Scene of the highway-lane sim: asphalt, lines, cars, and what the agent observes.
 
 Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's middle, x
 forward, y left).
@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.car_parts import part, wheel
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, raised, yaw_rotation
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
+from mcaprl.sims.drawing.shapes import car_part, ground, label, steering_arrow, wheels
 from mcaprl.sims.highway.course import FLIP, Course
 
 Floats = NDArray[np.float64]
@@ -31,16 +31,16 @@ TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 
 MARGIN_M = 60.0
-"""Of grass around the road."""
+"""Width of the grass around the road."""
 CAR_HEIGHT_M = 1.4
 DASH_SAMPLES, DASH_PERIOD = 3, 6
-"""A dashed line is drawn for 3 of 6 pieces of about 1 m."""
+"""Segments of about 1 m that are drawn of a dashed line, and in one period of it."""
 STRIPED, CONTINUOUS = 1, 2
-"""Numbers of highway-env's `LineType`; its other kinds are drawn as they are named."""
+"""Values of highway-env's `LineType`."""
 
 
 class Car(NamedTuple):
-    """A car on the road, by its middle."""
+    """State and size of a car; the position is that of its middle."""
 
     x_m: float
     y_m: float
@@ -50,30 +50,23 @@ class Car(NamedTuple):
     width_m: float
 
     def sees(self, point_m: tuple[float, float]) -> tuple[float, float]:
-        """Give where a point of the map is from here: (forward, left), metres."""
+        """Transform a point of the map into this car's frame: (forward, left), meters."""
         dx_m, dy_m = point_m[0] - self.x_m, point_m[1] - self.y_m
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin
 
 
 def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
-    """Give what never changes: the world in `map`, and the car's parts in `car`.
+    """Return the shapes that never change: the world in `map`, the car's parts in `car`.
 
     Args:
-        network: the `highway_env.road.road.RoadNetwork`.
-        courses: along it.
+        network: The `highway_env.road.road.RoadNetwork`.
+        courses: Courses of the road.
     """
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M
-    middle = (low + high) / 2
     return (
-        Shape(
-            name="ground",
-            kind="box",
-            color=GRASS,
-            size=(float(high[0] - low[0]), float(high[1] - low[1]), 0.1),
-            position=(float(middle[0]), float(middle[1]), -0.1),
-        ),
+        ground(GRASS, (low + high) / 2, high - low),
         Shape("road", "triangles", ASPHALT, raised(_asphalt(network), 0.0)),
         Shape("lines", "segments", WHITE, raised(_lines(network), 0.02), size=(0.15, 0.0, 0.0)),
         *_own_car(),
@@ -81,11 +74,11 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
 
 def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
-    """Give each lane with its left and right edge, (N, 2) in the map, samples about 1 m apart."""
+    """Yield each lane with its left and right edge, (N, 2) points about 1 m apart in the map."""
     for lane in network.lanes_list():
         along_m = np.linspace(0.0, lane.length, 2 + int(lane.length))
         half_m = [lane.width_at(each) / 2 for each in along_m]
-        # Their left is on the negative side.
+        # In highway-env, left is the negative side.
         sides = [
             np.array([lane.position(s, sign * h) for s, h in zip(along_m, half_m, strict=True)])
             for sign in (-1.0, 1.0)
@@ -94,7 +87,7 @@ def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
 
 
 def _asphalt(network: Any) -> Floats:
-    """Cover the lanes with triangles, (T, 3, 2)."""
+    """Return triangles that cover the lanes, (T, 3, 2)."""
     strips = []
     for _, left, right in _edges(network):
         first = np.stack([right[:-1], right[1:], left[1:]], axis=1)
@@ -104,7 +97,7 @@ def _asphalt(network: Any) -> Floats:
 
 
 def _lines(network: Any) -> Floats:
-    """Give the painted lines as pairs of points, (S, 2, 2)."""
+    """Return the painted lines as pairs of points, (S, 2, 2)."""
     pieces = []
     for lane, *sides in _edges(network):
         for line, points in zip(lane.line_types, sides, strict=True):
@@ -117,19 +110,13 @@ def _lines(network: Any) -> Floats:
 
 
 def _own_car() -> list[Shape]:
-    wheels = {
-        "front_left": (1.5, 0.85),
-        "front_right": (1.5, -0.85),
-        "rear_left": (-1.5, 0.85),
-        "rear_right": (-1.5, -0.85),
-    }
     return [
-        part("body", PAINT, (5.0, 1.9, 0.55), (0.0, 0.0, 0.6)),
-        part("cabin", GLASS, (2.5, 1.65, 0.45), (-0.35, 0.0, 1.1)),
-        part("roof", PAINT, (2.0, 1.6, 0.08), (-0.4, 0.0, CAR_HEIGHT_M - 0.04)),
-        part("lamp_left", LAMP, (0.08, 0.4, 0.16), (2.5, 0.68, 0.66)),
-        part("lamp_right", LAMP, (0.08, 0.4, 0.16), (2.5, -0.68, 0.66)),
-        *(wheel(name, RUBBER, (x_m, y_m, 0.34), 0.34, 0.26) for name, (x_m, y_m) in wheels.items()),
+        car_part("body", PAINT, (5.0, 1.9, 0.55), (0.0, 0.0, 0.6)),
+        car_part("cabin", GLASS, (2.5, 1.65, 0.45), (-0.35, 0.0, 1.1)),
+        car_part("roof", PAINT, (2.0, 1.6, 0.08), (-0.4, 0.0, CAR_HEIGHT_M - 0.04)),
+        car_part("lamp_left", LAMP, (0.08, 0.4, 0.16), (2.5, 0.68, 0.66)),
+        car_part("lamp_right", LAMP, (0.08, 0.4, 0.16), (2.5, -0.68, 0.66)),
+        *wheels(RUBBER, 1.5, -1.5, 0.85, 0.34, 0.26),
     ]
 
 
@@ -140,31 +127,20 @@ def moving_shapes(
     aims_m: Sequence[tuple[float, float]],
     steering_rad: float,
 ) -> tuple[Shape, ...]:
-    """Give what changes with each step.
+    """Return the shapes that change with each step.
 
     Args:
-        car: that is driven.
-        others: that are not.
-        trail_m: the last positions of the car, (x, y) in the map; at least one.
-        aims_m: points of the lane ahead that the agent sees.
-        steering_rad: of the front wheels, left positive.
+        car: Car that the agent drives.
+        others: Other cars.
+        trail_m: Last positions of the car, (x, y) in the map; at least one.
+        aims_m: Points of the lane ahead that the agent observes.
+        steering_rad: Angle of the front wheels, left positive.
     """
-    trail = np.array([*trail_m, trail_m[-1]])
-    axle = np.array([1.5, 0.0, 1.0])
-    tip = axle + 2.0 * np.array([math.cos(steering_rad), math.sin(steering_rad), 0.0])
     return (
-        Shape("trail", "line", TRAIL, raised(trail, 0.06), size=(0.25, 0.0, 0.0)),
+        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
         Shape("lookahead", "points", LOOK, raised(np.array(aims_m), 0.3), size=(0.6, 0.6, 0.6)),
-        Shape("steering", "arrow", LOOK, np.array([axle, tip]), size=(0.12, 0.3, 0.4), frame="car"),
-        Shape(
-            name="speed",
-            kind="text",
-            color=WHITE,
-            size=(1.0, 1.0, 0.8),
-            position=(0.0, 0.0, 2.4),
-            frame="car",
-            text=f"{car.speed_m_s:.1f} m/s",
-        ),
+        steering_arrow(LOOK, 1.5, steering_rad),
+        label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
         *(_other_car(f"other_{number}", other) for number, other in enumerate(others)),
     )
 
@@ -181,5 +157,5 @@ def _other_car(name: str, car: Car) -> Shape:
 
 
 def car_frame(car: Car) -> Frame:
-    """Give the car's frame in the map."""
+    """Return the car's frame in the map."""
     return Frame("car", (car.x_m, car.y_m, 0.0), yaw_rotation(car.yaw_rad))

@@ -1,4 +1,4 @@
-"""Where the episodes of the highway-lane sim start, when not where highway-env's do."""
+"""Starts of the highway-lane sim's episodes that differ from highway-env's."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mcaprl.sims.vehicle.arguments import Pose, pose_from
 
 FASTEST_M_S = 15.0
 FREE_M = 20.0
-"""Random starts are at least this far from other cars."""
+"""Minimum distance of random starts from other cars."""
 LAST_START_M = 60.0
-"""Random starts are at least this far from the end of a road."""
+"""Minimum distance of random starts from the end of a road."""
 
 
 def drawn_pose(
     random: np.random.Generator, courses: Sequence[Course], others: Sequence[Car], speed_m_s: float
 ) -> Pose:
-    """Draw a start that is clear of other cars: up to 1.5 m and 0.2 rad off a lane's middle."""
+    """Draw a start away from other cars, with an offset of up to 1.5 m and 0.2 rad from a lane."""
     course = courses[int(random.integers(len(courses)))]
     last_m = course.length_m - (0.0 if course.is_closed else LAST_START_M)
     while True:
@@ -40,10 +40,10 @@ def drawn_pose(
 def pose_from_options(
     options: dict[str, Any], courses: Sequence[Course], others: Sequence[Car], own: Car
 ) -> Pose:
-    """Read a start from the options of `reset`; without a speed, it is the car's own.
+    """Read a start from the options of `reset`; the speed defaults to the car's current one.
 
     Raises:
-        UsageError: there is another option, no such pose, or it is not free and on a lane.
+        UsageError: There is another option, or the pose is malformed, occupied, or not on a lane.
     """
     pose = pose_from(options, 0.0, FASTEST_M_S)
     if len(options["pose"]) < len(Pose._fields):
@@ -53,10 +53,10 @@ def pose_from_options(
     if offset_m > half_width_m:
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {offset_m:.1f} m from the middle of a lane:"
-            f" at most {half_width_m} m is on it"
+            f" the lane ends at {half_width_m} m"
         )
     if not _is_free(pose.x_m, pose.y_m, others, own.length_m):
-        raise UsageError(f"pose ({pose.x_m}, {pose.y_m}) is where another car is: choose another")
+        raise UsageError(f"pose ({pose.x_m}, {pose.y_m}) is occupied by another car")
     return pose
 
 

@@ -1,4 +1,4 @@
-"""A road of highway-env from above: the car stays in the middle, north is up."""
+"""Top view of the highway-lane sim, with the car in the middle and north up."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VIEW_M = 80.0
 
 
 class HighwayView:
-    """Draws one picture for each step, and shows it in a window in mode `human`."""
+    """Renderer of one image for each step, which mode `human` shows in a window."""
 
     def __init__(
         self,
@@ -24,23 +24,23 @@ class HighwayView:
         static: Iterable[Shape],
         frames_per_s: int,
     ) -> None:
-        """Prepare the parts of the picture that never change.
+        """Prepare the shapes that never change.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
         self._view = FollowView(render_mode, "highway-lane", static, VIEW_M, frames_per_s)
 
     def draw(
         self, car: Car, moving: Iterable[Shape], offset_m: float, reward: float
     ) -> NDArray[np.uint8]:
-        """Draw the car where it is, and give the picture, (600, 600, 3).
+        """Render the car and its surroundings, (600, 600, 3).
 
         Args:
-            car: that stays in the middle.
-            moving: the shapes that change.
-            offset_m: of the car from the middle of its lane.
-            reward: of the last step.
+            car: Car in the middle of the image.
+            moving: Shapes that change with each step.
+            offset_m: Distance of the car from the middle of its lane, left positive.
+            reward: Reward of the last step.
         """
         text = f"{car.speed_m_s:4.1f} m/s   offset {offset_m:+.2f} m   reward {reward:+.2f}"
         self._view.draw(moving, Body("car", car.x_m, car.y_m, car.yaw_rad), text)

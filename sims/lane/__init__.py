@@ -1,1 +1,13 @@
 """The lane-keeping car, `mcaprl/LaneKeeping-v0`."""
+
+from mcaprl.sims.spec import SimSpec
+
+SPEC = SimSpec(
+    name="lane",
+    env_id="mcaprl/LaneKeeping-v0",
+    entry_point="mcaprl.sims.lane.env:LaneKeepingEnv",
+    vector_entry_point="mcaprl.sims.lane.env:BatchedLaneKeepingEnv",
+    max_episode_steps=400,
+    pilot="mcaprl.sims.lane.pilot:LanePilot",
+    engine="numba",
+)

@@ -1,4 +1,4 @@
-"""What the camera of the lane sim's car can see: the ground, the rails and the buildings."""
+"""Depth camera of the lane sim's car; it sees the ground, the rails and the buildings."""
 
 from __future__ import annotations
 
@@ -8,14 +8,22 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.camera import lens
+from mcaprl.sims.drawing.camera import lens, level_axes
 from mcaprl.sims.drawing.depth import DepthCamera
 from mcaprl.sims.geometry.mesh import box_mesh, ground_mesh
-from mcaprl.sims.lane.course import GROUND_HALF_SIDE_M, Box, buildings, rails
+from mcaprl.sims.lane.course import (
+    CAMERA_FORWARD_M,
+    CAMERA_HEIGHT_M,
+    GROUND_HALF_SIDE_M,
+    Box,
+    buildings,
+    rails,
+)
+from mcaprl.sims.lane.rules import Car
 
 LENS = lens(256, 144, math.pi / 2)
 IMAGE_SHAPE = (84, 84)
-"""The whole picture, squashed: a small pixel is 3.05 pixels wide and 1.71 high."""
+"""Size of the averaged image; one of its pixels covers 3.05 x 1.71 rendered pixels."""
 
 
 def _solid(box: Box) -> NDArray[np.float64]:
@@ -25,11 +33,20 @@ def _solid(box: Box) -> NDArray[np.float64]:
 
 @functools.cache
 def lane_mesh() -> NDArray[np.float64]:
-    """Give the course's surfaces as (T, 3, 3) triangles, metres; treat them as read-only."""
+    """Return the surfaces of the course as (T, 3, 3) triangles, meters; do not modify them."""
     solids = [_solid(box) for box in (*rails(), *buildings())]
     return np.concatenate([ground_mesh(GROUND_HALF_SIDE_M), *solids])
 
 
-def lane_camera() -> DepthCamera:
-    """Make the front camera: 256 x 144 pixels, 90 degrees wide, averaged down to 84 x 84."""
-    return DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
+class CarCamera:
+    """Level camera at the front of the car: 90 degrees wide, 84 x 84 pixels."""
+
+    def __init__(self) -> None:
+        """Prepare the rendering of the course."""
+        self._camera = DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
+
+    def image_m(self, car: Car) -> NDArray[np.float32]:
+        """Return (84, 84) distances along each ray, meters; infinity without a surface."""
+        x_m = car.x_m + CAMERA_FORWARD_M * math.cos(car.yaw_rad)
+        y_m = car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad)
+        return self._camera.image_m((x_m, y_m, CAMERA_HEIGHT_M), level_axes(car.yaw_rad))

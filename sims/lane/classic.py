@@ -1,7 +1,7 @@
-"""The published rules of the lane sim, their faults included; they are listed in `LaneKeepingEnv`.
+"""Published rules of the lane sim with their faults, which `LaneKeepingEnv` lists.
 
-Two ends were published: the text's, which is over when the car is too slow, and the code's, which
-is over when it drives into something.
+The published text and code differ: by the text an episode ends if the car is too slow, by the code
+if it hits something.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ STRAIGHT = 1
 
 @compiled
 def classic_distance(x_m: float, y_m: float) -> float:
-    """Give the distance to the nearest of the endless straight lines through the legs, metres."""
+    """Return the distance to the nearest of the infinite lines through the legs, meters."""
     nearest_m = math.inf
     for leg in range(len(COURSE.yaw_rad)):
         dx, dy = x_m - COURSE.points_m[leg, 0], y_m - COURSE.points_m[leg, 1]
@@ -52,7 +52,7 @@ def classic_distance(x_m: float, y_m: float) -> float:
 
 @compiled
 def classic_reward(distance_m: float, speed_m_s: float) -> float:
-    """Pay a decision: (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5); -3 beyond 3.5 m."""
+    """Return the reward (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5); -3 beyond 3.5 m."""
     if distance_m > CLASSIC_LANE_M:
         return CLASSIC_OFF_LANE_REWARD
     nearness = math.exp(-NEARNESS_PER_M * distance_m) - 0.5
@@ -61,14 +61,14 @@ def classic_reward(distance_m: float, speed_m_s: float) -> float:
 
 @compiled
 def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_code: bool) -> int:
-    """Say whether an episode is over: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
+    """Return the end of a decision: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
 
     Args:
-        distance_m: to the nearest endless line.
-        speed_m_s: after the decision.
-        action: that was taken.
-        hit: whether the car's body touched something.
-        by_code: end as the published code does, not as the text says.
+        distance_m: Distance to the nearest infinite line.
+        speed_m_s: Speed after the decision.
+        action: Action of the decision.
+        hit: Whether the car's body touched something.
+        by_code: Whether to follow the published code instead of the text.
     """
     if distance_m > CLASSIC_LANE_M:
         return OFF_LANE
@@ -81,9 +81,9 @@ def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_
 
 @compiled
 def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
-    """Drive for a second; give the car, and whether its body touched something on the way.
+    """Drive for a second; return the car, and whether its body touched something meanwhile.
 
-    Nothing stops the car: it drives through.
+    Obstacles do not stop the car.
     """
     hit = False
     for _ in range(CLASSIC_SUBSTEPS):
@@ -101,7 +101,7 @@ def step_classic(
     observations: NDArray[np.float32],
     by_code: bool,
 ) -> None:
-    """Advance N cars by one decision each, in place; arguments as of `step_cars`."""
+    """Advance N cars by one decision each, in place; arguments as in `step_cars`."""
     for i in range(len(cars)):
         after, hit = classic_decide(car_at(cars[i]), actions[i])
         distance_m = classic_distance(after.x_m, after.y_m)

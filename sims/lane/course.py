@@ -1,9 +1,9 @@
-"""The course of the lane sim: its path, its streets, and what stands beside them.
+"""Course of the lane sim: its path, its streets, and the rails and houses beside them.
 
-The path is two squares of about 130 m that share a leg, 1,026 m in all: the first square is driven
-clockwise, the second counter-clockwise. Coordinates are right-handed with z up, so y is mirrored
-against the published course, whose y points right; turning right in one is turning right in the
-other. Nothing here is random: the same course stands on every machine.
+The path consists of two squares of about 130 m that share a leg, 1,026 m in total: the first square
+is driven clockwise, the second counter-clockwise. Coordinates are right-handed with z up; y has the
+opposite sign of the published course's, so that right turns remain right turns. Nothing is random:
+the course is the same on every machine.
 """
 
 from __future__ import annotations
@@ -31,26 +31,26 @@ CORNERS_M = (
 )
 COURSE = closed_path(CORNERS_M)
 NEXT_TURN: NDArray[np.float64] = np.sign(np.sin(np.roll(COURSE.yaw_rad, -1) - COURSE.yaw_rad))
-"""(N,) which way the course turns at the end of each leg: 1 left, -1 right."""
+"""(N,) direction of the turn at the end of each leg: 1 left, -1 right."""
 
 LANE_HALF_WIDTH_M = 3.5
 RAIL_OFFSET_M = 4.0
-"""Distance of the rails' inner faces from the centre line."""
+"""Distance of the rails' inner faces from the center line."""
 RAIL_HEIGHT_M = 0.7
 RAIL_THICKNESS_M = 0.12
 GROUND_HALF_SIDE_M = 1000.0
-"""The ground reaches beyond the last row of pixels under the horizon."""
+"""Half of the ground's side, so that it extends to the last row of pixels below the horizon."""
 
 CAMERA_FORWARD_M = 0.4
-"""Of the middle of the wheelbase, on which the car's own frame stands."""
+"""Distance of the camera from the middle of the wheelbase, the origin of the car's frame."""
 CAMERA_HEIGHT_M = 1.4
 
 HOUSE_GAP_M = 1.0
-"""At least as much grass all around a house."""
+"""Minimum distance between houses."""
 
 
 class Box(NamedTuple):
-    """An upright box on the ground, its edges along x, y and z; metres."""
+    """Box on the ground with edges along x, y and z, meters; x and y are those of its middle."""
 
     x_m: float
     y_m: float
@@ -60,30 +60,30 @@ class Box(NamedTuple):
 
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Give each leg's two ends (2,), metres; the leg that the path takes twice comes once."""
+    """Return the two ends (2,) of each leg, meters, without the repetition of the shared leg."""
     legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 
 
 def street_bounds(half_width_m: float) -> NDArray[np.float64]:
-    """Give (K, 4) rectangles x0, y0, x1, y1 around the streets, square ends included; metres."""
+    """Return (K, 4) rectangles x0, y0, x1, y1 around the streets, square ends included; meters."""
     ends = np.array(streets())
     return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
 
 
 class Pavement(NamedTuple):
-    """The union of the streets, cut into cells by the lines through all rectangles' edges."""
+    """Union of the streets, divided into cells by the lines through all rectangles' edges."""
 
     x_m: NDArray[np.float64]
     """(M + 1,) cell borders."""
     y_m: NDArray[np.float64]
     """(N + 1,) cell borders."""
     paved: NDArray[np.bool_]
-    """(M, N)"""
+    """(M, N) whether each cell is on a street."""
 
 
 def pavement(half_width_m: float) -> Pavement:
-    """Cut the union of the streets into cells; the cells show where it ends."""
+    """Divide the union of the streets into cells."""
     bounds = street_bounds(half_width_m)
     x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
     middle_x, middle_y = (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
@@ -95,7 +95,7 @@ def pavement(half_width_m: float) -> Pavement:
 
 
 def outline(half_width_m: float) -> NDArray[np.float64]:
-    """Give the edge of the streets' union as (M, 2, 2) segments: start and end, x and y, metres."""
+    """Return the outline of the streets' union as segments (M, start and end, x and y), meters."""
     x_m, y_m, paved = pavement(half_width_m)
     padded = np.pad(paved, 1)
     across_x = np.argwhere(padded[1:, 1:-1] != padded[:-1, 1:-1])
@@ -106,7 +106,7 @@ def outline(half_width_m: float) -> NDArray[np.float64]:
 
 
 def rails() -> list[Box]:
-    """Give the guard rails: thin boxes around the streets, open where streets meet."""
+    """Return the guard rails: thin boxes along the outline of the streets."""
     boxes = []
     for (x0, y0), (x1, y1) in outline(RAIL_OFFSET_M + RAIL_THICKNESS_M / 2):
         length_m, width_m = x1 - x0 + RAIL_THICKNESS_M, y1 - y0 + RAIL_THICKNESS_M
@@ -115,7 +115,7 @@ def rails() -> list[Box]:
 
 
 def _spread(index: int, low: float, high: float) -> float:
-    """Give the index-th number of an evenly spread sequence (multiples of the golden ratio)."""
+    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
     return low + (high - low) * (index * 0.6180339887498949 % 1.0)
 
 
@@ -128,11 +128,11 @@ def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
 def _house(
     index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
 ) -> Box:
-    """Build the index-th house, its front beginning at `at` on the centre line.
+    """Return house number `index`.
 
     Args:
-        index: picks its size and its distance from the street.
-        at: (2,) metres.
+        index: Number that decides its size and its distance from the street.
+        at: (2,) point on the center line at which its front begins, meters.
         forward: (2,) unit vector along the street.
         left: (2,) unit vector from the street to the house.
     """
@@ -145,7 +145,7 @@ def _house(
 
 
 def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, int]]:
-    """Give each side of each street: its start (2,), direction (2,), length in metres and side."""
+    """Yield each side of each street: start (2,), direction (2,), length in meters, and side."""
     for start, end in streets():
         length_m = float(np.hypot(*(end - start)))
         for side in (1, -1):
@@ -154,7 +154,7 @@ def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], 
 
 @functools.cache
 def buildings() -> tuple[Box, ...]:
-    """Give the houses along both sides of each street; none stands on a street or another."""
+    """Return the houses on both sides of each street, without overlaps."""
     taken = street_bounds(RAIL_OFFSET_M + 2.0)
     boxes: list[Box] = []
     index = 0

@@ -1,8 +1,7 @@
-"""N cars of the lane sim as arrays: starts, steps and observations."""
+"""Fleet of the lane sim: starts, steps and observations of N cars."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
@@ -11,16 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.camera import level_axes
-from mcaprl.sims.drawing.depth import DepthCamera, encode_depth, encode_nearness
+from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
 from mcaprl.sims.geometry.compiled import ready
-from mcaprl.sims.lane.block import step_cars, step_only_car, tell_cars
-from mcaprl.sims.lane.camera import IMAGE_SHAPE, lane_camera
-from mcaprl.sims.lane.classic import (
-    CLASSIC_DECISION_S,
-    step_classic,
-)
-from mcaprl.sims.lane.course import CAMERA_FORWARD_M, CAMERA_HEIGHT_M, COURSE, NEXT_TURN
+from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
+from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
+from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, step_classic
+from mcaprl.sims.lane.course import COURSE, NEXT_TURN
 from mcaprl.sims.lane.rays import (
     RAY_OBSERVATION_LIMIT,
     RAY_OBSERVATION_NAMES,
@@ -46,13 +41,13 @@ STARTS = ("anywhere", "line")
 OBSERVATIONS = ("state", "depth", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
-"""Where in a car's row begins what is told of it."""
+"""Index of the first number in a car's row that `info` uses."""
 MOTION = slice(2, 4)
-"""Speed and steering in a state."""
+"""Indices of speed and steering in the observed state."""
 
 
 class LaneFleet(Fleet):
-    """N cars on the course; see `LaneKeepingEnv`, whose arguments it has."""
+    """N cars on the course; arguments as in `LaneKeepingEnv`."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
@@ -64,10 +59,10 @@ class LaneFleet(Fleet):
         observation: str = "state",
         start: str | None = None,
     ) -> None:
-        """Make N cars; each is to be started by `begin`.
+        """Allocate N cars; `begin` starts them.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
+            UnknownNameError: An argument has a value that is not in its list.
         """
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
@@ -83,20 +78,20 @@ class LaneFleet(Fleet):
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._draws = Draws(count, 4)
-        # By what chance a car is started by itself.
+        # Random numbers of a single start.
         self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
         self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
-        self._has_pictures = observation == "depth" or self._has_dashboard
+        self._has_images = observation == "depth" or self._has_dashboard
         self._seen = self._rays if self._has_rays else self._states
-        self._is_told_at_once = observation == "state" and not self._classic
+        self._has_fast_step = observation == "state" and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
-        self._camera: DepthCamera | None = None
+        self._camera: CarCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
 
     def car(self, i: int) -> Car:
-        """Give the whole state of a car."""
+        """Return the state of a car."""
         return Car._make(self._cars[i, :STARTED_AT].tolist())
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
@@ -130,7 +125,7 @@ class LaneFleet(Fleet):
                 self._depth_m.pop(i, None)
 
     def advance(self) -> None:
-        """Drive on for a decision."""
+        """Advance all cars by a decision."""
         self._step()
         if self._has_rays:
             observe_all_rays(self._cars, self._rays)
@@ -138,13 +133,13 @@ class LaneFleet(Fleet):
             self._depth_m.clear()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Drive on with the only car: all that is told of its state comes in one call."""
-        if not self._is_told_at_once:
+        """Advance the only car; where possible, one call returns reward, end and `info`."""
+        if not self._has_fast_step:
             return super().step_one(action)
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
         if self._depth_m:
             self._depth_m.clear()
-        # As `_named`, which would be one more call.
+        # As in `_named`, without the cost of a call.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -162,7 +157,7 @@ class LaneFleet(Fleet):
         kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
         return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
-    # Of a fleet of one, what its steps call.
+    # The following functions serve a fleet of one car.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
@@ -175,60 +170,56 @@ class LaneFleet(Fleet):
         return copy
 
     def observation(self, i: int) -> Any:
-        """Give the numbers or the picture that car i sees."""
-        if not self._has_pictures:
+        """Return the numbers or the image that car i observes."""
+        if not self._has_images:
             return self._seen[i].copy()
         depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]
         return {"depth": depth, "motion": self._motions()[i]} if self._has_dashboard else depth
 
     def observations(self) -> Any:
-        """Give what all cars see."""
-        if not self._has_pictures:
+        """Return the observations of all cars."""
+        if not self._has_images:
             return self._seen.copy()
         images_m = np.stack([self.depth_image_m(i) for i in range(self.count)])
         depth = self._encode(images_m)[..., np.newaxis]
         return {"depth": depth, "motion": self._motions()} if self._has_dashboard else depth
 
     def _motions(self) -> NDArray[np.float32]:
-        """Give (N, 3) speed, last steering and next turn of all cars."""
+        """Return (N, 3) speed, last steering command and next turn of all cars."""
         along_m = self._cars[:, ALONG] % COURSE.length_m
         legs = np.searchsorted(COURSE.along_m, along_m, side="right") - 1
         turns = NEXT_TURN[np.minimum(legs, len(NEXT_TURN) - 1)]
         return np.column_stack([self._states[:, MOTION], turns]).astype(np.float32)
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Give car i's (84, 84) distances along each ray, metres; inf is nothing."""
+        """Return car i's (84, 84) distances along each ray, meters, or infinity."""
         if i not in self._depth_m:
             if self._camera is None:
-                self._camera = lane_camera()
-            x_m, y_m, yaw_rad, *_ = self._cars[i].tolist()
-            x_m += CAMERA_FORWARD_M * math.cos(yaw_rad)
-            y_m += CAMERA_FORWARD_M * math.sin(yaw_rad)
-            position_m = (x_m, y_m, CAMERA_HEIGHT_M)
-            self._depth_m[i] = self._camera.image_m(position_m, level_axes(yaw_rad))
+                self._camera = CarCamera()
+            self._depth_m[i] = self._camera.image_m(self.car(i))
         return self._depth_m[i]
 
     def places(self) -> NDArray[np.float64]:
-        """Give where all are, (N, 2) x and y in the map, metres."""
+        """Return the positions of all cars, (N, 2) x and y in the map, meters."""
         return self._cars[:, :2].copy()
 
     def info(self, i: int) -> dict[str, Any]:
-        """Give the `info` of car i."""
+        """Return the `info` of car i."""
         car = self._cars[i, SPEED:].tolist()
         speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
         return _named(offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
 
     def infos(self) -> dict[str, NDArray[Any]]:
-        """Give the `info` of all cars."""
-        told = np.empty((4, self.count))
-        tell_cars(self._cars, told)
-        return _named(*told)
+        """Return the `info` of all cars."""
+        values = np.empty((4, self.count))
+        car_info(self._cars, values)
+        return _named(*values)
 
 
 def _named(
     offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any
 ) -> dict[str, Any]:
-    """Name what is told of a car, or of all."""
+    """Return the `info` of one car or of all cars."""
     return {
         "lateral_offset_m": offset_m,
         "heading_error_rad": heading_error_rad,

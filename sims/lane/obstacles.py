@@ -1,4 +1,4 @@
-"""What a car of the lane sim can touch, and measure its distance to: the rails and the houses."""
+"""Obstacles of the lane sim, rails and houses: contact with the car, and distances along rays."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from mcaprl.sims.lane.rules import Car
 
 BODY_LENGTH_M, BODY_WIDTH_M = 4.3, 1.75
 BODY_FORWARD_M = 0.05
-"""Of the body's middle, from the middle of the wheelbase."""
+"""Distance of the body's middle from the middle of the wheelbase."""
 
 BOXES_M: NDArray[np.float64] = np.array(
     [(box.x_m, box.y_m, box.length_m / 2, box.width_m / 2) for box in (*rails(), *buildings())]
 )
-"""(K, 4) the middle x and y of each obstacle, and half of its edges along x and y."""
+"""(K, 4) x and y of the middle of each obstacle, and half of its edges along x and y."""
 _HUGE = 1e12
-"""Stands for one divided by nothing."""
+"""Finite replacement for 1 / 0."""
 
 
 @compiled
 def touches(car: Car) -> bool:
-    """Say whether the car's body touches a rail or a house.
+    """Return whether the car's body touches a rail or a house.
 
-    Two rectangles are apart if, and only if, they are so along an edge of one of them.
+    Separating axis theorem: two rectangles are disjoint if and only if their projections on the
+    direction of an edge of one of them are.
     """
     cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
@@ -49,11 +50,11 @@ def touches(car: Car) -> bool:
 
 @compiled
 def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
-    """Give the distance from a point to the nearest obstacle in a direction, at most 100 m.
+    """Return the distance from a point to the nearest obstacle in a direction, at most 100 m.
 
-    A ray is inside a box where it is between both pairs of its sides.
+    Slab method: a ray is inside a box where it is between both pairs of parallel sides.
     """
-    per_x, per_y = _per_metre(math.cos(angle_rad)), _per_metre(math.sin(angle_rad))
+    per_x, per_y = _per_meter(math.cos(angle_rad)), _per_meter(math.sin(angle_rad))
     nearest_m = FAR_M
     for i in range(len(BOXES_M)):
         box = BOXES_M[i]
@@ -66,6 +67,6 @@ def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
 
 
 @compiled
-def _per_metre(share: float) -> float:
-    """Give how long a ray is for each metre along an axis, with the sign of its direction."""
+def _per_meter(share: float) -> float:
+    """Return the length of a ray per meter along an axis, with the sign of its direction."""
     return 1.0 / share if abs(share) * _HUGE > 1.0 else math.copysign(_HUGE, share)

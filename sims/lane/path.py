@@ -1,8 +1,8 @@
-"""Places on the lane sim's course, found without a branch.
+"""Branch-free geometry of the lane sim's course, which the compiler can vectorize over cars.
 
-`geometry` finds the same on any path, with searches and loops that end when they are done. Here
-they are sums and choices of one length, so that the compiler can do several cars at once. It counts
-on what is particular to the course: few legs, all longer than any car looks in one step.
+`mcaprl.sims.geometry.paths` computes the same on any path, with searches and loops of variable
+length. This module relies on properties of the course: there are eight legs, each longer than the
+distance that a car looks ahead.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from mcaprl.sims.geometry.paths import Projection
 from mcaprl.sims.lane.course import COURSE
 
 LONGEST_LOOK_M: Final = float(np.diff(COURSE.along_m).min())
-"""Who looks less far along the path sees at most one corner."""
+"""Length of the shortest leg; a shorter stretch of the path contains at most one corner."""
 _LENGTH_M: Final = COURSE.length_m
 _LAST_LEG: Final = 7.0
 assert len(COURSE.yaw_rad) == _LAST_LEG + 1
 Eight = tuple[float, float, float, float, float, float, float, float]
-# Tuples of numbers are constants to the compiler, and arrays are not.
+# Tuples of numbers are compile-time constants; arrays are not.
 _ALONG_M: Final[Eight] = tuple(COURSE.along_m[:-1].tolist())
 _LEG_M: Final[Eight] = tuple(np.diff(COURSE.along_m).tolist())
 _X_M: Final[Eight] = tuple(COURSE.points_m[:-1, 0].tolist())
@@ -32,28 +32,26 @@ _YAW_RAD: Final[Eight] = tuple(COURSE.yaw_rad.tolist())
 
 
 class CourseSpot(NamedTuple):
-    """A place on the course: on which leg, and how far from the leg's start."""
+    """A place on the course: a leg, and the distance from the leg's start."""
 
     leg: float
-    """Its number; numbers of which to choose are sooner compared as floats."""
+    """Index of the leg; as a float, it can be compared without a conversion."""
     rest_m: float
 
 
 class Leg(NamedTuple):
-    """A straight part of the course."""
+    """Straight leg of the course: its start, its direction as a unit vector, and its length."""
 
     x_m: float
     y_m: float
-    """Where it starts."""
     cos: float
     sin: float
-    """Its direction."""
     length_m: float
 
 
 @inlined
 def course_spot_at(along_m: float) -> CourseSpot:
-    """Find the place at a distance along the course, as `geometry.spot_at` does."""
+    """Return the place at a distance along the course, as `paths.spot_at` does."""
     rest_m = along_m - _LENGTH_M * np.floor(along_m / _LENGTH_M)
     leg = 1.0 if rest_m >= _ALONG_M[1] else 0.0
     leg = 2.0 if rest_m >= _ALONG_M[2] else leg
@@ -67,13 +65,13 @@ def course_spot_at(along_m: float) -> CourseSpot:
 
 @inlined
 def course_leg(leg: float) -> Leg:
-    """Give a leg by its number."""
+    """Return the leg with an index."""
     return Leg(_of(leg, _X_M), _of(leg, _Y_M), _of(leg, _COS), _of(leg, _SIN), _of(leg, _LEG_M))
 
 
 @inlined
 def course_next(leg: float) -> float:
-    """Give the number of the leg behind one."""
+    """Return the index of the leg after another."""
     return leg + 1.0 if leg < _LAST_LEG else 0.0
 
 
@@ -81,7 +79,7 @@ def course_next(leg: float) -> float:
 def course_point_ahead(
     leg: Leg, following: Leg, rest_m: float, ahead_m: float
 ) -> tuple[float, float]:
-    """Give the point (x, y), metres, less than `LONGEST_LOOK_M` ahead of a place on a leg."""
+    """Return the point (x, y), meters, less than `LONGEST_LOOK_M` ahead of a place on a leg."""
     on_leg_m = rest_m + ahead_m
     is_beyond = on_leg_m >= leg.length_m
     on_leg_m = on_leg_m - leg.length_m if is_beyond else on_leg_m
@@ -92,9 +90,9 @@ def course_point_ahead(
 
 @inlined
 def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Find the nearest of the course's points between two distances along it.
+    """Return the nearest of the course's points between two distances along it.
 
-    As `geometry.project` does; less than `LONGEST_LOOK_M` may lie between the two.
+    As in `paths.project`; the distances must differ by less than `LONGEST_LOOK_M`.
     """
     here = course_spot_at(from_m)
     leg, after = course_leg(here.leg), course_next(here.leg)
@@ -115,7 +113,11 @@ def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projec
 def _on_leg(
     leg: Leg, x_m: float, y_m: float, first_m: float, last_m: float
 ) -> tuple[float, float, float]:
-    """The nearest point of a part of a leg: where, how far squared, and how far to the left."""
+    """Return the nearest point of a part of a leg.
+
+    Returns:
+        Distance along the leg, squared distance from the point, and signed distance to the left.
+    """
     dx, dy = x_m - leg.x_m, y_m - leg.y_m
     along_m = min(max(dx * leg.cos + dy * leg.sin, first_m), last_m)
     off_x, off_y = dx - along_m * leg.cos, dy - along_m * leg.sin
@@ -124,7 +126,7 @@ def _on_leg(
 
 @inlined
 def _of(leg: float, numbers: Eight) -> float:
-    """Choose a leg's number: to look it up would be one load for each car, and not for several."""
+    """Select a leg's number; an array lookup could not be vectorized over cars."""
     number = numbers[1] if leg >= 1.0 else numbers[0]
     number = numbers[2] if leg >= 2.0 else number
     number = numbers[3] if leg >= 3.0 else number

@@ -1,12 +1,8 @@
-"""The scripted driver of the lane sim: pursue a point ahead, slow down for corners, think twice."""
+"""Pilot of the lane sim: pure pursuit that slows down for corners, with a short search."""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.bicycle import steering_of
 from mcaprl.sims.geometry.compiled import compiled
@@ -26,26 +22,26 @@ from mcaprl.sims.lane.rules import (
     reward_of,
     wheel_angle,
 )
-from mcaprl.sims.vehicle.arguments import check_one
+from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 PURSUIT_M = 8.0
 PURSUIT_S = 0.4
-"""The point pursued lies 8 m ahead along the path, and 0.4 s at the present speed."""
+"""The pursued point is 8 m plus 0.4 s at the current speed ahead on the path."""
 CORNER_SPEED_M_S = 7.0
 CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
-"""The car is down to the corner speed 2 m before a corner, having slowed by at most 1.5 m/s^2."""
+"""The car brakes with at most 1.5 m/s^2 to have the corner speed 2 m before a corner."""
 HORIZON = 12
-"""Decisions (3 s by default) that a plan must survive."""
+"""Number of decisions (3 s by default) that a plan must survive."""
 
 
 @compiled
 def pursue(car: Car) -> int:
     """Choose an action by pure pursuit, or brake for the next corner.
 
-    The circle through the car, along its heading, and a point at distance d and l to its left has
-    radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path tracking algorithm",
-    CMU-RI-TR-92-01, 1992.
+    The circle that is tangent to the car's heading and passes through a point at distance d, l to
+    the left, has the radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path tracking
+    algorithm", CMU-RI-TR-92-01, 1992.
     """
     leg = leg_at(COURSE, car.along_m)
     corner_m = COURSE.along_m[leg + 1] - car.along_m % COURSE.length_m
@@ -69,7 +65,7 @@ def pursue(car: Car) -> int:
 
 @compiled
 def worth(car: Car, substeps: int = SUBSTEPS) -> float:
-    """Value pursuing from here: decisions survived, up to the horizon, and a little the reward."""
+    """Return the value of pursuit: the number of survived decisions, plus 0.1 of the reward."""
     total = 0.0
     for survived in range(HORIZON):
         after = drive(car, pursue(car), substeps)
@@ -82,11 +78,11 @@ def worth(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Pursue while that survives; else try all pairs of actions before pursuing.
+    """Choose pursuit if it survives, else the first action of the best pair before pursuit.
 
     Args:
-        car: now.
-        substeps: of 0.05 s that a decision lasts.
+        car: State of the car.
+        substeps: Number of substeps of 0.05 s in a decision.
     """
     if worth(car, substeps) >= HORIZON:
         return pursue(car)
@@ -103,21 +99,9 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
     return best
 
 
-class LanePilot:
-    """Drives the car of one environment, whose state it reads."""
+class LanePilot(ScriptedPilot[LaneKeepingEnv]):
+    """Driver of one lane sim's car."""
 
-    name: ClassVar[str] = "pilot"
-
-    def __init__(self, sim: LaneKeepingEnv) -> None:
-        """Take the wheel of `sim`."""
-        self._sim = sim
-        self._substeps = round(sim.step_duration_s / SUBSTEP_S)
-
-    def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
-        """Give the action, shape (1,), for the car as it is now.
-
-        Raises:
-            ValueError: there are observations of more than one environment.
-        """
-        check_one(observations)
-        return np.array([choose(self._sim.car, self._substeps)], dtype=np.int64)
+    def choose(self) -> int:
+        """Choose the action for the current state of the car."""
+        return choose(self.sim.car, round(self.sim.step_duration_s / SUBSTEP_S))

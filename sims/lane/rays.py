@@ -1,4 +1,4 @@
-"""What a car of the lane sim sees with `observation="rays"`: how far the rails are, and the way."""
+"""Ray observation of the lane sim: distances to obstacles, and a point of the path ahead."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RAYS_DEG = (0, 10, -10, 20, -20, 30, -30, 45, -45, 60, -60, 90, -90, 135, -135, 
 RAYS_RAD = tuple(math.radians(angle) for angle in RAYS_DEG)
 RAYS = len(RAYS_DEG)
 WAY_M = 20.0
-"""At a crossing, rays cannot tell which street to take: a path point ahead does."""
+"""Distance of the observed path point, which shows the street to take at a crossing."""
 WAY_LIMIT = 4.0
 
 
@@ -55,13 +55,13 @@ def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
 
 @compiled
 def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
-    """Write what N cars, (N, 10) rows that begin with `Car`, observe: (N, 20)."""
+    """Write the observations (N, 20) of N cars, (N, 10) rows that begin with `Car`."""
     for i in range(len(cars)):
         observe_rays(car_at(cars[i]), observations[i])
 
 
 def ray_lines(car: Car) -> NDArray[np.float64]:
-    """Give the rays as lines (16, 2, 2) from the car's middle to what they hit, metres."""
+    """Return the rays as lines (16, 2, 2) from the car's middle to their ends, meters."""
     lines = np.empty((RAYS, 2, 2))
     lines[:, 0] = car.x_m, car.y_m
     for line, turn_rad in zip(lines, RAYS_RAD, strict=True):

@@ -1,4 +1,4 @@
-"""The equations of the lane sim: one decision of a car that keeps its lane, for one car or many."""
+"""Equations of the lane sim's default rules: motion, rewards, ends and observations of a car."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mcaprl.sims.lane.path import (
 
 ACTION_MEANINGS = ("brake", "straight", "right", "left", "slightly right", "slightly left")
 STEERING = (0.0, 0.0, -0.5, 0.5, -0.25, 0.25)
-"""Of the largest steering angle, left positive; action 0 brakes and keeps the last one."""
+"""Shares of the maximum steering angle, left positive; action 0 brakes and keeps the last one."""
 BRAKE = 0
 
 DECISION_S = 0.25
@@ -43,23 +43,23 @@ MAX_SPEED_M_S = 30.0
 MAX_STEERING_RAD = math.radians(40.0)
 MAX_LATERAL_M_S2 = 9.0
 STEERING_CURVE_M_S = (20 / 3.6, 60 / 3.6, 120 / 3.6)
-"""The steering angle falls linearly with speed, through these knots, to these shares."""
+"""Knots of the maximum steering angle as a piecewise linear function of speed, and its shares."""
 STEERING_CURVE = (0.9, 0.8, 0.7)
 _FALL_1 = (1.0 - STEERING_CURVE[0]) / STEERING_CURVE_M_S[0]
 _FALL_2 = (STEERING_CURVE[0] - STEERING_CURVE[1]) / (STEERING_CURVE_M_S[1] - STEERING_CURVE_M_S[0])
 _FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STEERING_CURVE_M_S[1])
-"""How much the share falls with each m/s, before each knot."""
+"""Decrease of the share per m/s before each knot."""
 
 BEHIND_M = 4.0
 AHEAD_M = 8.0
-"""How far behind and ahead of the last nearest path point the next one is looked for."""
+"""Search window of the nearest path point, relative to the last one."""
 
 STALL_SPEED_M_S = 1.0
 STALL_TIME_S = 3.0
 FAILURE_REWARD = -5.0
 DRIVING, OFF_LANE, STALL, LOW_REWARD, SLOW, COLLISION = range(6)
 REASONS = ("", "off_lane", "stall", "low_reward", "slow", "collision")
-"""The last three are the classic rules' own."""
+"""Reasons by end; the last three occur in the classic rules only."""
 
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 OBSERVATION_NAMES = (
@@ -77,28 +77,28 @@ OBSERVATION_NAMES = (
     "ahead_40m_left",
 )
 OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
-# Of a tuple, the compiler knows the numbers.
+# A tuple is a compile-time constant.
 _LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
 
 class Car(NamedTuple):
-    """The whole state of one car on the course; a row of a (cars, 9) array holds the same."""
+    """State of one car on the course, stored as a row of a (cars, 9) array."""
 
     x_m: float
     y_m: float
     yaw_rad: float
-    """In [-pi, pi), counter-clockwise from x."""
+    """Yaw counter-clockwise from x, in [-pi, pi)."""
     speed_m_s: float
     steering: float
-    """Last steering command, a share of the largest angle, left positive."""
+    """Last steering command, a share of the maximum angle, left positive."""
     along_m: float
-    """Distance of the nearest path point along the path; grows beyond one lap."""
+    """Distance of the nearest path point along the path, counted over all laps."""
     offset_m: float
     """Distance from the path, left positive."""
     heading_error_rad: float
     """Yaw relative to the path, left positive, in [-pi, pi)."""
     slow_s: float
-    """How long the car has been slower than the stall speed."""
+    """Time for which the car has been slower than the stall speed."""
 
 
 @compiled
@@ -116,12 +116,12 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 
 @inlined
 def slip(steering: float, speed_m_s: float) -> float:
-    """Give the sine of the car's slip angle: that of the steering command, less at high speed.
+    """Return the sine of the car's slip angle for a steering command at a speed.
 
-    The command counts for 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at 120 km/h; and
-    the car never turns so sharply that it would feel more than 9 m/s^2 sideways.
+    The maximum steering angle is 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at
+    120 km/h; the slip is limited to a lateral acceleration of 9 m/s^2.
     """
-    # The curve flattens, so it is the highest of its straight lines.
+    # The curve is convex, so it is the maximum of its straight lines.
     share = max(
         max(
             1.0 - _FALL_1 * speed_m_s,
@@ -135,13 +135,13 @@ def slip(steering: float, speed_m_s: float) -> float:
 
 @compiled
 def wheel_angle(steering: float, speed_m_s: float) -> float:
-    """Give the front wheels' angle, radians, for a steering command at a speed; see `slip`."""
+    """Return the front wheels' angle, radians, for a steering command at a speed; see `slip`."""
     return steering_of(slip(steering, speed_m_s))
 
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Make a car from its motion, looking for its place on the path around `near_m`."""
+    """Return the car with a motion, its place on the path searched around `near_m`."""
     place = course_project(motion.x_m, motion.y_m, near_m - BEHIND_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
@@ -158,9 +158,9 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 
 @inlined
 def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
-    """Drive on for a sub-step of 0.05 s.
+    """Advance a motion by a substep of 0.05 s.
 
-    Without a branch, so that the compiler can do several cars at once.
+    Without branches, so that the compiler can vectorize it over cars.
     """
     speed_m_s = motion.speed_m_s
     throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
@@ -171,13 +171,13 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
 
 @inlined
 def steering_for(action: int, last: float) -> float:
-    """Give the steering command of an action: the brake keeps the last one."""
+    """Return the steering command of an action; braking keeps the last one."""
     return last if action == BRAKE else STEERING[action]
 
 
 @compiled
 def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
-    """Carry out an action for so many sub-steps of 0.05 s."""
+    """Return the car after an action of a number of substeps of 0.05 s."""
     motion = moving(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
     steering = steering_for(action, car.steering)
     for _ in range(substeps):
@@ -187,23 +187,24 @@ def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
 
 @inlined
 def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
-    """Make a car of where so many sub-steps led it."""
+    """Return the car after a number of substeps that ended in a motion."""
     slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, before.along_m, slow_s)
 
 
 @inlined
 def end_of(car: Car) -> int:
-    """Say whether a car has failed: DRIVING, OFF_LANE or STALL."""
+    """Return the end of a decision: DRIVING, OFF_LANE or STALL."""
     stalled = STALL if car.slow_s >= STALL_TIME_S else DRIVING
     return OFF_LANE if abs(car.offset_m) > LANE_HALF_WIDTH_M else stalled
 
 
 @inlined
 def reward_of(before: Car, after: Car) -> float:
-    """Pay a decision: progress ds along the path, less for driving beside its middle.
+    """Return the reward of a decision.
 
-    ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) at distance d from the path, and -5 for a failure.
+    ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from
+    it, and -5 for a failure.
     """
     progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
     paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
@@ -212,7 +213,7 @@ def reward_of(before: Car, after: Car) -> float:
 
 @compiled
 def observe(car: Car, observation: NDArray[np.float32]) -> None:
-    """Write the 12 observed numbers; see the table of `LaneKeepingEnv`."""
+    """Write the 12 observed numbers; see "Observation Space" of `LaneKeepingEnv`."""
     for i, number in enumerate(seen_from(car)):
         observation[i] = number
 
@@ -222,7 +223,7 @@ Numbers = tuple[float, float, float, float, float, float, float, float, float, f
 
 @inlined
 def seen_from(car: Car) -> Numbers:
-    """Give the 12 observed numbers, each within its limit."""
+    """Return the 12 observed numbers, clipped to their limits."""
     here = course_spot_at(car.along_m)
     leg, after = course_leg(here.leg), course_leg(course_next(here.leg))
     heading = heading_of(car.yaw_rad)
@@ -250,7 +251,7 @@ def seen_from(car: Car) -> Numbers:
 def _ahead(
     car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
 ) -> tuple[float, float]:
-    """Where the path is so far ahead, seen from the car, in units of that."""
+    """Return the path point at a lookahead in the car's frame, divided by the lookahead."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
     forward, left = forward_m / lookahead_m, left_m / lookahead_m

@@ -1,4 +1,4 @@
-"""What a 3D viewer shows of the lane sim: streets, rails, houses, the car and what it looks at.
+"""Scene of the lane sim: streets, rails, houses, the car and what it observes.
 
 Frames: `map` (x and y on the ground, z up), `car` (on the ground under the middle of the wheelbase,
 x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the view).
@@ -7,14 +7,13 @@ x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.car_parts import part, wheel
 from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
+from mcaprl.sims.drawing.shapes import car_part, ground, label, steering_arrow, wheels
 from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.lane import course
 from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
@@ -48,7 +47,7 @@ DASH_M = 3.0
 
 
 def _asphalt() -> NDArray[np.float64]:
-    """Cover each paved cell with two triangles, (6 cells, 3)."""
+    """Return two triangles for each paved cell, (6 cells, 3)."""
     x_m, y_m, paved = course.pavement(course.RAIL_OFFSET_M)
     corners = []
     for i, j in np.argwhere(paved):
@@ -59,7 +58,7 @@ def _asphalt() -> NDArray[np.float64]:
 
 
 def _dashes() -> NDArray[np.float64]:
-    """Give the centre line's dashes as pairs of points, (N, 3)."""
+    """Return the dashes of the center line as pairs of points, (N, 3)."""
     pairs = []
     for start, end in course.streets():
         length_m = float(np.hypot(*(end - start)))
@@ -73,13 +72,7 @@ def _road() -> list[Shape]:
     side_m = 420.0
     middle = course.COURSE.points_m.mean(axis=0)
     return [
-        Shape(
-            name="ground",
-            kind="box",
-            color=GRASS,
-            size=(side_m, side_m, 0.1),
-            position=(float(middle[0]), float(middle[1]), -0.1),
-        ),
+        ground(GRASS, middle, (side_m, side_m)),
         Shape("road", "triangles", ASPHALT, _asphalt()),
         Shape(
             name="lane_borders",
@@ -88,11 +81,11 @@ def _road() -> list[Shape]:
             points=raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02),
             size=(0.15, 0.0, 0.0),
         ),
-        Shape("centre_line", "segments", YELLOW, _dashes(), size=(0.12, 0.0, 0.0)),
+        Shape("center_line", "segments", YELLOW, _dashes(), size=(0.12, 0.0, 0.0)),
     ]
 
 
-def _standing(name: str, box: course.Box, color: Color) -> Shape:
+def _upright(name: str, box: course.Box, color: Color) -> Shape:
     return Shape(
         name=name,
         kind="box",
@@ -103,71 +96,53 @@ def _standing(name: str, box: course.Box, color: Color) -> Shape:
 
 
 def _surroundings() -> list[Shape]:
-    shapes = [_standing(f"rail_{i}", box, STEEL) for i, box in enumerate(course.rails())]
+    shapes = [_upright(f"rail_{i}", box, STEEL) for i, box in enumerate(course.rails())]
     for i, box in enumerate(course.buildings()):
-        shapes.append(_standing(f"building_{i}", box, WALLS[i % len(WALLS)]))
+        shapes.append(_upright(f"building_{i}", box, WALLS[i % len(WALLS)]))
     return shapes
-
-
-def _wheel(name: str, forward_m: float, left_m: float) -> Shape:
-    hub = (forward_m, left_m, WHEEL_RADIUS_M)
-    return wheel(name, RUBBER, hub, WHEEL_RADIUS_M, WHEEL_WIDTH_M)
 
 
 def _car() -> list[Shape]:
     axle_m, side_m = WHEELBASE_M / 2, TRACK_M / 2
     return [
-        part("body", PAINT, (BODY_LENGTH_M, BODY_WIDTH_M, 0.5), (BODY_FORWARD_M, 0.0, 0.58)),
-        part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
-        part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
-        part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
-        part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
-        part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
-        part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
-        part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
-        _wheel("front_left", axle_m, side_m),
-        _wheel("front_right", axle_m, -side_m),
-        _wheel("rear_left", -axle_m, side_m),
-        _wheel("rear_right", -axle_m, -side_m),
+        car_part("body", PAINT, (BODY_LENGTH_M, BODY_WIDTH_M, 0.5), (BODY_FORWARD_M, 0.0, 0.58)),
+        car_part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
+        car_part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
+        car_part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
+        car_part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
+        car_part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
+        car_part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
+        car_part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
+        *wheels(RUBBER, axle_m, -axle_m, side_m, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Give what never changes: the world in `map`, and the car's parts in `car`."""
+    """Return the shapes that never change: the world in `map`, the car's parts in `car`."""
     return (*_road(), *_surroundings(), *_car())
 
 
 def moving_shapes(
     car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
 ) -> tuple[Shape, ...]:
-    """Give what changes with each step.
+    """Return the shapes that change with each step.
 
     Args:
-        car: now.
-        trail_m: the last positions of the car, (x, y) in the map; at least one.
-        has_rays: whether the car sees by rays.
+        car: State of the car.
+        trail_m: Last positions of the car, (x, y) in the map; at least one.
+        has_rays: Whether rays are observed.
     """
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
     link = np.array([(car.x_m, car.y_m), nearest])
     wheel_rad = wheel_angle(car.steering, car.speed_m_s)
-    axle = np.array([WHEELBASE_M / 2, 0.0, 1.0])
-    tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
     return (
         Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
         Shape("lookahead", "points", LOOK, raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
         Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
-        Shape("steering", "arrow", LOOK, np.array([axle, tip]), size=(0.12, 0.3, 0.4), frame="car"),
-        Shape(
-            name="speed",
-            kind="text",
-            color=WHITE,
-            size=(1.0, 1.0, 0.8),
-            position=(0.0, 0.0, 2.4),
-            frame="car",
-            text=f"{car.speed_m_s:.1f} m/s",
-        ),
+        steering_arrow(LOOK, WHEELBASE_M / 2, wheel_rad),
+        label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
         *(_rays(car) if has_rays else ()),
     )
 
@@ -181,11 +156,11 @@ def _rays(car: Car) -> tuple[Shape, ...]:
 
 
 def car_frame(car: Car) -> Frame:
-    """Give the car's frame in the map."""
+    """Return the car's frame in the map."""
     return Frame("car", (car.x_m, car.y_m, 0.0), yaw_rotation(car.yaw_rad))
 
 
 def camera_frame() -> Frame:
-    """Give the front camera in the car: optical axes, level, looking forward."""
+    """Return the front camera's frame in the car: optical axes, level, facing forward."""
     at = (course.CAMERA_FORWARD_M, 0.0, course.CAMERA_HEIGHT_M)
     return Frame("camera", at, (-0.5, 0.5, -0.5, 0.5), parent="car")

@@ -1,4 +1,4 @@
-"""Where the episodes of the lane sim start."""
+"""Starts of the lane sim's episodes."""
 
 from __future__ import annotations
 
@@ -23,49 +23,46 @@ from mcaprl.sims.lane.rules import (
     store_car,
 )
 from mcaprl.sims.vehicle.arguments import pose_from
-from mcaprl.sims.vehicle.draws import take
+from mcaprl.sims.vehicle.draws import spread, take
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
-"""Where a row has how far a car is along the path, and, behind what `Car` has, how far it was."""
+"""Indices in a row of a car's distance along the path, and of that distance at its start."""
 LINE_M = 2.0
-"""Of the start line, along the path."""
+"""Distance of the start line along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
-"""Random starts keep clear of corners: nearer than that, some cars cannot turn in time."""
+"""Distances of random starts from corners; closer to them, some cars cannot turn in time."""
 FASTEST_START_M_S = 10.0
 
 _CLEAR_M: NDArray[np.float64] = np.concatenate(
     [[0.0], np.cumsum(np.diff(COURSE.along_m) - AFTER_CORNER_M - BEFORE_CORNER_M)]
 )
-"""(legs + 1,) length of the path before each corner, without what is close to corners."""
+"""(legs + 1,) length of the path before each corner, without the parts close to corners."""
 
 
 @compiled
 def start_on_line(shares: NDArray[np.float64]) -> Car:
-    """Put a car at rest on the line, by two numbers from 0 to 1: up to 0.3 m and 0.05 rad off."""
-    return beside(LINE_M, _spread(shares[0], 0.3), _spread(shares[1], 0.05), 0.0)
+    """Return a car at rest near the start line.
+
+    Two numbers from 0 to 1 decide its offset of up to 0.3 m and 0.05 rad.
+    """
+    return beside(LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
 
 
 @compiled
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
-    """Put a car on the path, by four numbers from 0 to 1: place, offset, heading, speed."""
+    """Return a car on the path; four numbers from 0 to 1 decide place, offset, heading, speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
     leg = 0
     while _CLEAR_M[leg + 1] <= clear_m:
         leg += 1
     along_m = COURSE.along_m[leg] + AFTER_CORNER_M + clear_m - _CLEAR_M[leg]
-    offset_m, error_rad = _spread(shares[1], 1.5), _spread(shares[2], 0.2)
+    offset_m, error_rad = spread(shares[1], 1.5), spread(shares[2], 0.2)
     return beside(along_m, offset_m, error_rad, FASTEST_START_M_S * shares[3])
 
 
 @compiled
-def _spread(share: float, most: float) -> float:
-    """Turn 0 to 1 into -most to most."""
-    return (2.0 * share - 1.0) * most
-
-
-@compiled
 def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
-    """Put a car beside a place on the path, left positive, at an angle to it."""
+    """Return a car beside a place on the path, left positive, at an angle to the path."""
     leg = leg_at(COURSE, along_m)
     rest_m = along_m - COURSE.along_m[leg]
     cos, sin = COURSE.forward[leg]
@@ -83,14 +80,14 @@ def start_car(
     row: NDArray[np.float64],
     observation: NDArray[np.float32],
 ) -> None:
-    """Start a car by chance, and write it and what it sees.
+    """Start a car at random, and write its state and observation.
 
     Args:
-        shares: (4,) numbers from 0 to 1.
-        on_line: start on the line, not anywhere.
-        classic: if on the line, drive straight ahead for a second.
-        row: (10,) of a `Car`, and where it starts along the path, to be filled.
-        observation: (12,) to be filled.
+        shares: (4,) random numbers from 0 to 1.
+        on_line: Whether to start on the line instead of anywhere.
+        classic: Whether a start on the line drives straight ahead for a second.
+        row: (10,) output: the `Car`, and its start along the path.
+        observation: (12,) output.
     """
     car = start_on_line(shares) if on_line else start_anywhere(shares)
     if on_line and classic:
@@ -111,7 +108,7 @@ def start_one_of(
     observations: NDArray[np.float32],
     i: int,
 ) -> None:
-    """Start car i of N; the other arguments are as of `start_car` and `start_cars`."""
+    """Start car i of N; the other arguments are those of `start_car` and `start_cars`."""
     start_car(shares, on_line, classic, cars[i], observations[i])
     rewards[i], ends[i] = 0.0, DRIVING
 
@@ -131,15 +128,15 @@ def start_cars(
     """Start K of N cars as `start_car` does.
 
     Args:
-        chosen: (K,) which.
-        numbers: of `Draws`, 4 for each.
-        used: of `Draws`.
-        on_line: as of `start_car`.
-        classic: as of `start_car`.
-        cars: (N, 10) rows, as of `start_car`.
-        rewards: (N,) to be set to none.
-        ends: (N,) to be set to DRIVING.
-        observations: (N, 12).
+        chosen: (K,) indices of the cars.
+        numbers: Numbers of a `Draws` with 4 for each start.
+        used: Counters of the same `Draws`.
+        on_line: As in `start_car`.
+        classic: As in `start_car`.
+        cars: (N, 10) rows, as in `start_car`.
+        rewards: (N,) output: 0.
+        ends: (N,) output: DRIVING.
+        observations: (N, 12) output.
     """
     for i in chosen:
         start_car(take(numbers, used, i), on_line, classic, cars[i], observations[i])
@@ -150,13 +147,13 @@ def car_from(options: dict[str, Any]) -> Car:
     """Read a start from the options of `reset`.
 
     Raises:
-        UsageError: there is another option, no such pose, or it is not on the lane.
+        UsageError: There is another option, or the pose is malformed or not on the lane.
     """
     pose = pose_from(options, 0.0, MAX_SPEED_M_S)
     place = project(COURSE, pose.x_m, pose.y_m, 0.0, COURSE.length_m)
     if abs(place.offset_m) > LANE_HALF_WIDTH_M:
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {abs(place.offset_m):.1f} m from the path:"
-            f" at most {LANE_HALF_WIDTH_M} m is on the lane"
+            f" the lane ends at {LANE_HALF_WIDTH_M} m"
         )
     return located(moving(*pose), 0.0, place.along_m, 0.0)

@@ -1,4 +1,4 @@
-"""The lane sim from above: the car stays in the middle, north is up."""
+"""Top view of the lane sim, with the car in the middle and north up."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ VIEW_M = 55.0
 
 
 class LaneView:
-    """Draws one picture for each step, and shows it in a window in mode `human`."""
+    """Renderer of one image for each step, which mode `human` shows in a window."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"]) -> None:
-        """Prepare the parts of the picture that never change.
+        """Prepare the shapes that never change.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
         frames_per_s = round(1.0 / DECISION_S)
         self._view = FollowView(render_mode, "lane", static_shapes(), VIEW_M, frames_per_s)
 
     def draw(self, car: Car, moving: Sequence[Shape], reward: float) -> NDArray[np.uint8]:
-        """Draw the car where it is, and give the picture, (600, 600, 3).
+        """Render the car and its surroundings, (600, 600, 3).
 
         Args:
-            car: the car now.
-            moving: the shapes that change with each step.
-            reward: of the last step.
+            car: State of the car.
+            moving: Shapes that change with each step.
+            reward: Reward of the last step.
         """
         text = (
             f"{car.speed_m_s:4.1f} m/s   offset {car.offset_m:+.2f} m   "

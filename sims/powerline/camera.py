@@ -1,8 +1,8 @@
-"""What the drone's camera can see: the ground, the firs, the towers and the conductors.
+"""Depth camera of the drone; it sees the ground, the firs, the towers and the conductors.
 
-The mesh has ROS axes, as what viewers show. To the camera, the towers' lattice is solid. A
-conductor of 3 cm would be thinner than a pixel from 1.3 m on: it is drawn one pixel wide at any
-distance.
+The mesh is in ROS axes, as the scene for viewers. The lattice of the towers is rendered as a solid.
+A conductor of 3 cm would be thinner than a pixel from a distance of 1.3 m; therefore it is drawn
+one pixel wide at any distance.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from mcaprl.sims.drawing.camera import lens
 from mcaprl.sims.drawing.depth import DepthCamera
 from mcaprl.sims.geometry.mesh import box_mesh, frustum_mesh
 from mcaprl.sims.geometry.vectors import Vector, plus, rotate
-from mcaprl.sims.powerline.quadrotor import Drone
-from mcaprl.sims.powerline.world import (
+from mcaprl.sims.powerline.course import (
     ARM_HALF_LENGTH_M,
     WIRES_M,
     Tower,
@@ -28,36 +27,37 @@ from mcaprl.sims.powerline.world import (
     towers,
     trees,
 )
+from mcaprl.sims.powerline.quadrotor import Drone
 
 Floats = NDArray[np.float64]
 
 LENS = lens(256, 144, math.pi / 2)
 IMAGE_SHAPE = (84, 84)
-"""The whole picture, squashed: a small pixel is 3.05 pixels wide and 1.71 high."""
+"""Size of the averaged image; one of its pixels covers 3.05 x 1.71 rendered pixels."""
 
 CAMERAS = ("down", "front")
 CAMERA_AT_M = {"down": Vector(0.0, 0.0, 0.1), "front": Vector(0.2, 0.0, 0.0)}
-"""Places in the body, x forward, y right, z down."""
+"""Positions in the body, x forward, y right, z down."""
 CAMERA_AXES = {
     "down": (Vector(0.0, 1.0, 0.0), Vector(-1.0, 0.0, 0.0), Vector(0.0, 0.0, 1.0)),
     "front": (Vector(0.0, 1.0, 0.0), Vector(0.0, 0.0, 1.0), Vector(1.0, 0.0, 0.0)),
 }
-"""The optical axes (x right, y down, z along the view) in the body."""
+"""Optical axes (x right, y down, z along the view) in the body."""
 
 GROUND_X_M = np.concatenate(
     [np.linspace(-180, -6, 7), np.linspace(0, 54, 10), np.linspace(60, 720, 31)]
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
-"""NED grid of the ground's mesh: closest on the steep hill, and 100 m beyond the line."""
+"""NED grid of the ground's mesh: densest on the steep hill, and 100 m larger than the line."""
 TREE_SIDE_M = 0.45
-"""Of a fir's height."""
+"""Side of a fir as a share of its height."""
 MAST_FOOT_M = 3.0
 MAST_TOP_M = 0.9
 
 
 @functools.cache
 def ground_triangles() -> Floats:
-    """Give the ground in ROS axes, (T, 3, 3) metres, seen from above; treat it as read-only."""
+    """Return the ground in ROS axes, (T, 3, 3) meters, facing up; do not modify it."""
     corners = np.array([[(x, y, -ground_height(x, y)) for y in GROUND_Y_M] for x in GROUND_X_M])
     here, north = corners[:-1, :-1], corners[1:, :-1]
     east, both = corners[:-1, 1:], corners[1:, 1:]
@@ -67,13 +67,13 @@ def ground_triangles() -> Floats:
 
 
 def tree_triangles(tree: Tree) -> Floats:
-    """Give a fir as a pyramid in ROS axes, (4, 3, 3) metres."""
+    """Return a fir as a pyramid in ROS axes, (4, 3, 3) meters."""
     foot = (tree.x_m, -tree.y_m, ground_height(tree.x_m, tree.y_m) - 0.5)
     return frustum_mesh(foot, TREE_SIDE_M * tree.height_m, 0.0, tree.height_m)
 
 
 def _tower_triangles(tower: Tower) -> Floats:
-    """Give a mast and its arm in ROS axes, (22, 3, 3) metres."""
+    """Return a mast and its arm in ROS axes, (22, 3, 3) meters."""
     foot = (tower.x_m, -tower.y_m, -tower.foot_z_m)
     mast = frustum_mesh(foot, MAST_FOOT_M, MAST_TOP_M, tower.foot_z_m - tower.arm_z_m)
     arm = box_mesh((0.0, 0.0, 0.0), (0.5, 2 * ARM_HALF_LENGTH_M, 0.4))
@@ -85,36 +85,36 @@ def _tower_triangles(tower: Tower) -> Floats:
 
 @functools.cache
 def world_mesh() -> Floats:
-    """Give all surfaces in ROS axes, (T, 3, 3) metres; treat them as read-only."""
+    """Return all surfaces in ROS axes, (T, 3, 3) meters; do not modify them."""
     solids = [_tower_triangles(tower) for tower in towers()]
     solids += [tree_triangles(tree) for tree in trees()]
     return np.concatenate([ground_triangles(), *solids])
 
 
 def world_wires() -> Floats:
-    """Give the conductors' straight pieces in ROS axes, (S, 2, 3) metres."""
+    """Return the straight segments of the conductors in ROS axes, (S, 2, 3) meters."""
     pieces = np.stack([WIRES_M[:, :-1], WIRES_M[:, 1:]], axis=2)
     return to_ros(pieces.reshape(-1, 2, 3))
 
 
 class DroneCamera:
-    """A camera that is fixed to the drone's body, and tilts with it."""
+    """Camera that is fixed to the drone's body."""
 
     def __init__(self, view: str) -> None:
-        """Make the `down` or `front` camera: 90 degrees wide, 84 x 84 pixels."""
+        """Prepare the `down` or `front` camera: 90 degrees wide, 84 x 84 pixels."""
         self._view = view
         self._camera = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE, world_wires())
 
     def image_m(self, drone: Drone) -> NDArray[np.float32]:
-        """Give (84, 84) distances along each ray, metres; inf where nothing is."""
+        """Return (84, 84) distances along each ray, meters; infinity without a surface."""
         return self._camera.image_m(*self.pose(drone))
 
     def without_wires(self, drone: Drone) -> Floats:
-        """Give the whole picture, (144, 256) 1/m along each ray, without conductors."""
+        """Return the inverse distances at full size, (144, 256) 1/m, without conductors."""
         return self._camera.inverse_distance(*self.pose(drone))
 
     def pose(self, drone: Drone) -> tuple[tuple[float, float, float], Floats]:
-        """Give where the camera is, and its (3, 3) axes as rows, in ROS axes."""
+        """Return the camera's position and its (3, 3) axes as rows, in ROS axes."""
         at = plus(drone.position_m, rotate(drone.attitude, CAMERA_AT_M[self._view]))
         axes = [rotate(drone.attitude, axis) for axis in CAMERA_AXES[self._view]]
         return (at.x, -at.y, -at.z), to_ros(np.array(axes))

@@ -1,6 +1,6 @@
-"""The published rules of the powerline sim, their faults included.
+"""Published rules of the powerline sim with their faults, which `PowerlineEnv` lists.
 
-Axes are NED, as in `powerline_world`. The faults are listed in `PowerlineEnv`.
+Axes are NED, as in `mcaprl.sims.powerline.course`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, norm, plus, times
+from mcaprl.sims.powerline.course import LEGS, distance_to_infinite_line, nearest_on_line
 from mcaprl.sims.powerline.quadrotor import fly
 from mcaprl.sims.powerline.rules import (
     CHECK_S,
@@ -27,7 +28,6 @@ from mcaprl.sims.powerline.rules import (
     store_flight,
     vector_at,
 )
-from mcaprl.sims.powerline.world import LEGS, distance_to_endless_line, nearest_on_line
 
 CLASSIC_DECISION_S = 5.0
 CLASSIC_VELOCITY_STEP_M_S = 0.25
@@ -38,16 +38,16 @@ OFF_LINE_REWARD = -10.0
 
 @compiled
 def classic_distance(position_m: Vector) -> float:
-    """Give the distance to the nearest of the endless straight lines through the legs, metres."""
+    """Return the distance to the nearest of the infinite lines through the legs, meters."""
     nearest_m = math.inf
     for leg in range(LEGS):
-        nearest_m = min(nearest_m, distance_to_endless_line(position_m, leg))
+        nearest_m = min(nearest_m, distance_to_infinite_line(position_m, leg))
     return nearest_m
 
 
 @compiled
 def classic_end(position_m: Vector, hit: bool) -> int:
-    """Say whether a flight is over: FLYING, OFF_LINE or COLLISION."""
+    """Return the end of a decision: FLYING, OFF_LINE or COLLISION."""
     if hit:
         return COLLISION
     return OFF_LINE if classic_distance(position_m) > MAX_DISTANCE_M else FLYING
@@ -55,7 +55,7 @@ def classic_end(position_m: Vector, hit: bool) -> int:
 
 @compiled
 def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
-    """Pay a decision: (exp(-d) - 0.5) + (speed - 0.5); -10 beyond 7 m; -100 for a collision."""
+    """Return the reward (exp(-d) - 0.5) + (speed - 0.5); -10 beyond 7 m, -100 for a collision."""
     end = classic_end(position_m, hit)
     if end == COLLISION:
         return COLLISION_REWARD
@@ -66,7 +66,7 @@ def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
 
 @compiled
 def classic_decide(plant: int, flight: Flight, action: int) -> tuple[Flight, bool]:
-    """Fly for 5 s at the measured velocity plus a step; give the flight, and whether it hit."""
+    """Fly for 5 s at the measured velocity plus a step; return the flight and a collision flag."""
     step = times(CLASSIC_VELOCITY_STEP_M_S, vector_at(DIRECTIONS[action], 0))
     command = plus(flight.drone.velocity_m_s, step)
     wind = plus(flight.wind_m_s, flight.gust_m_s)
@@ -89,9 +89,9 @@ def step_classic(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N drones by one decision each, in place; arguments as of `step_flights`.
+    """Advance N drones by one decision each, in place; arguments as in `step_flights`.
 
-    The wind does not change within an episode: there are no gusts.
+    The wind is constant within an episode.
     """
     for i in range(len(flights)):
         after, hit = classic_decide(plant, flight_at(flights[i]), actions[i])

@@ -1,4 +1,4 @@
-"""The powerline sim as a Gymnasium environment."""
+"""Gymnasium environments of the powerline sim."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": ro
 
 
 class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
-    """A drone that learns to follow a power line.
+    """Flight of a drone along a power line.
 
     ## Description
 
-    A drone follows a line of four legs (71, 146, 198 and 206 m) over hilly ground. A tower stands
-    under each corner, and three conductors hang 6 m below the line. The drone is a quadrotor with
-    controllers that follow a commanded velocity, or a point that does so with a lag. It keeps its
-    nose to the north. The same seed and actions give the same bits.
+    The agent commands the velocity of a drone that follows a line of four legs (71, 146, 198 and
+    206 m) over hilly ground, with a tower under each corner and three conductors 6 m below the
+    line. The drone is a quadrotor with controllers, or a point that follows the command with a lag;
+    it always faces north. The same seed and actions result in the same bits.
 
     Actions, observations and poses have the axes of the published line, NED: x north, y east, z
-    **down**; metres and m/s. What viewers read (telemetry, scene, frames, and `info`'s offsets) has
-    ROS axes: x north, y west, z up; y and z change sign.
+    **down**; meters and m/s. Data for viewers (telemetry, scene, frames, and the offsets in `info`)
+    have ROS axes: x north, y west, z up; y and z have the opposite sign.
 
     ## Action Space
 
-    `Discrete(7)`. Each changes the last commanded velocity by 0.5 m/s; a command beyond 8 m/s is
-    not taken. One decision lasts 0.5 s.
+    `Discrete(7)`. Each changes the last commanded velocity by 0.5 m/s; a change that would result
+    in more than 8 m/s is ignored. One decision lasts 0.5 s.
 
     | Action | Meaning |
     |---|---|
@@ -48,7 +48,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     | 3 | faster south (-x) |
     | 4 | faster west (-y) |
     | 5 | faster up (-z) |
-    | 6 | no change: fly on, without slowing down |
+    | 6 | no change of the command |
 
     ## Observation Space
 
@@ -56,33 +56,35 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     | Index | Observation | Unit | Limit |
     |---|---|---|---|
-    | 0-2 | position, from the nearest point of the line: x, y, z | 7 m | 2 |
+    | 0-2 | position relative to the nearest point of the line: x, y, z | 7 m | 2 |
     | 3-5 | velocity | 5 m/s | 4 |
     | 6-8 | command minus velocity | 1 m/s | 8 |
     | 9-11 | direction of the leg, a unit vector | 1 | 1 |
     | 12-14 | direction of the next leg | 1 | 1 |
     | 15 | distance to the leg's end, at most 60 m | 60 m | 1 |
     | 16 | exp(-distance to the leg's end / 10 m) | 1 | 1 |
-    | 17 | how far behind the furthest point so far | 10 m | 10 |
+    | 17 | distance along the line to the furthest point so far | 10 m | 10 |
 
     `observation="depth"`: a `Dict` of `depth`, (84, 84, 1) uint8, the camera's image in the
-    logarithmic code of `mcaprl.sims.drawing.depth.encode_depth`, 255 where there is nothing; and
-    `motion`, 6 float32, rows 3 to 8 of the table. Conductors are drawn one pixel wide, or none
-    would be seen. With `rules="classic"` it is the image alone, in the code of `encode_nearness`.
+    logarithmic code of `mcaprl.sims.drawing.depth.encode_depth`, 255 where there is no surface; and
+    `motion`, 6 float32, rows 3 to 8 of the table. Conductors are drawn one pixel wide, so that they
+    are visible. With `rules="classic"` it is only the image, in the code of `encode_nearness`.
 
     ## Rewards
 
     min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds along the line beyond the
-    furthest point so far, at distance d from it: 5 m/s are paid best, and what is faster is paid
-    less. 5 more for finishing, -5 for leaving the line or a collision.
+    furthest point so far, at distance d from the line; it is highest at 5 m/s. +5 for finishing;
+    -5 instead for leaving the line or a collision.
 
     ## Starting State
 
-    `start="line"`: at the first point, up to 0.2 m off on each axis, then 5 s at (1, -0.5, -1) m/s.
-    `start="anywhere"`: half of the episodes so; the others anywhere on the line but for its last
-    20 m, up to 1 m off, along the line at 0 to 5 m/s, rounded to 0.5 m/s on each axis.
-    `reset(options={"pose": (x_m, y_m, z_m)})`, or with three more numbers for the velocity in m/s,
-    starts there instead, the velocity being the first command.
+    `start="line"`: after 5 s at (1, -0.5, -1) m/s from the first point, with an offset of up to
+    0.2 m on each axis.
+    `start="anywhere"`: half of the episodes as above; the others at a random place on the line,
+    except its last 20 m, with an offset of up to 1 m, along the line at 0 to 5 m/s, rounded to
+    0.5 m/s on each axis.
+    `reset(options={"pose": (x_m, y_m, z_m)})`, optionally with the velocity in m/s as three more
+    numbers, starts at that pose; the velocity is also the first command.
 
     ## Episode End
 
@@ -90,37 +92,40 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     than 0.6 m from a conductor, 1.2 m from the middle of a tower's mast or arm, 0.3 m from the
     ground) or `finished` (1 m before the line's end). Truncated after 400 steps.
 
-    `info` has lateral_offset_m (left positive), vertical_offset_m (up positive), line_distance_m,
-    speed_m_s and progress_m (along the line since the start).
+    `info` contains lateral_offset_m (left positive), vertical_offset_m (up positive),
+    line_distance_m, speed_m_s and progress_m (distance along the line since the start).
 
     ## Classic Rules
 
-    `rules="classic"` is the system as it was published, on a point that lags 0.5 s behind its
-    command: a decision each 5 s; actions change the *measured* velocity by 0.25 m/s; the reward is
-    (exp(-d) - 0.5) + (speed - 0.5), with d to the nearest of the *endless* straight lines through
-    the legs; -10 and the end beyond 7 m; -100 and the end for a collision. It starts with 5 s at
-    (1, -0.67, -0.8) m/s. Its faults:
+    `rules="classic"` are the rules as they were published, by default for a point that follows its
+    command with a lag of 0.5 s. A decision lasts 5 s; actions change the *measured* velocity by
+    0.25 m/s. The reward is (exp(-d) - 0.5) + (speed - 0.5), with the distance d to the nearest of
+    the *infinite* lines through the legs; -10 and the end beyond 7 m, -100 and the end for a
+    collision. An episode starts after 5 s at (1, -0.67, -0.8) m/s. Known faults:
 
-    - The speed is paid in any direction: flying to and fro earns more than following the line.
-    - Coasting past the first tower, along the first leg's extension, is paid for 100 m and more.
-    - No end of the line: flying on beyond the last tower is paid, too.
-    - Hovering on the line costs nothing and never ends; backwards is as good as forwards.
-    - Changing the measured velocity makes commands drift: whatever a gust or a lag leaves is kept.
-    - In 5 s, nothing can be corrected: 25 m at 5 m/s, three and a half times the width allowed.
-    - The picture's code spends half of its values on 1 to 2 m.
+    - Speed is rewarded in any direction: flying to and fro has a higher return than following the
+      line.
+    - Flying past the first tower along the extension of the first leg is rewarded for over 100 m.
+    - The line has no end: flying on beyond the last tower is rewarded as well.
+    - Hovering on the line costs nothing and never ends; flying backward is as good as forward.
+    - Commands that change the measured velocity drift: the effects of gusts and lag persist.
+    - 5 s is too long for corrections: it is 25 m at 5 m/s, three and a half times the allowed
+      distance.
+    - The image's code uses half of its values for distances of 1 to 2 m.
 
-    Ours are the world, the point's lag, and the picture's averaging where the published one
-    interpolates. A flight stops where it collides.
+    The world and the point's lag are our own, and images are averaged where the published ones are
+    interpolated. A collision stops the drone.
 
     ## Arguments
 
     - `rules`: `"default"` or `"classic"`.
     - `observation`: `"state"` or `"depth"`.
     - `camera`: `"down"` or `"front"`; 90 degrees wide, fixed to the body.
-    - `start`: `"anywhere"` or `"line"`; classic rules know only the latter.
-    - `plant`: `"quad"`, `"point"`, or None for the rules' own: quad, and point for classic.
-    - `wind_m_s`: greatest steady wind, 0 to 8; an episode's is drawn up to it, from any side.
-    - `gust_m_s`: standard deviation on each axis of the gusts, 0 to 3. No wind moves a point.
+    - `start`: `"anywhere"` or `"line"`; the classic rules always start on the line.
+    - `plant`: `"quad"`, `"point"`, or None, which means quad, in the classic rules point.
+    - `wind_m_s`: maximum steady wind, 0 to 8; each episode draws its speed and direction.
+    - `gust_m_s`: standard deviation of the gusts on each axis, 0 to 3; 0 in the classic rules.
+      Wind and gusts have no effect on a point.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -142,11 +147,11 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         gust_m_s: float = 0.0,
         render_mode: RenderMode | None = None,
     ) -> None:
-        """See "Arguments" above.
+        """Make the environment; see "Arguments" of the class.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
-            UsageError: a number is outside its range, or the classic rules are to have gusts.
+            UnknownNameError: An argument has a value that is not in its list.
+            UsageError: A number is outside its range.
         """
         fleet = PowerlineFleet(1, rules, observation, camera, start, plant, wind_m_s, gust_m_s)
         super().__init__(fleet, render_mode)
@@ -154,36 +159,36 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     @property
     def flight(self) -> Flight:
-        """The whole state of the drone, NED."""
+        """State of the drone, NED."""
         return self.fleet.flight(0)
 
     @property
     def place(self) -> tuple[float, ...]:
-        """Where the drone is now, NED."""
+        """Current position of the drone, NED."""
         return self.flight.drone.position_m
 
     def telemetry(self) -> dict[str, float]:
-        """Give the drone's state by name, in ROS axes; the units are in the names."""
+        """Return the state of the drone by name, in ROS axes; names include the units."""
         return {**powerline_scene.telemetry(self.flight), **self.fleet.info(0)}
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Give the camera's (84, 84) distances along each ray, metres; inf is nothing."""
+        """Return the camera's (84, 84) distances along each ray, meters, or infinity."""
         return self.fleet.depth_image_m(0)
 
     def static_scene(self) -> Sequence[Shape]:
-        """Give the shapes that never change, those of the drone's body in the frame `drone`."""
+        """Return the shapes that never change; those of the drone are in the frame `drone`."""
         return powerline_scene.static_shapes()
 
     def scene(self) -> Sequence[Shape]:
-        """Give the shapes that change with each step."""
+        """Return the shapes that change with each step."""
         return powerline_scene.moving_shapes(self.flight, self.trail)
 
     def static_frames(self) -> Sequence[Frame]:
-        """Give the camera's frame in the drone: optical axes, z along the view, x right, y down."""
+        """Return the camera's frame in the drone: x right, y down, z along the view."""
         return (powerline_scene.camera_frame(self._camera),)
 
     def frames(self) -> Sequence[Frame]:
-        """Give the drone's place in the map, level, and its attitude there."""
+        """Return the drone's position in the map, as a level frame, and its attitude in that."""
         return powerline_scene.drone_frames(self.flight.drone)
 
     def _open_view(self, render_mode: RenderMode) -> PowerlineView:
@@ -196,6 +201,6 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
 
 class BatchedPowerlineEnv(BatchedEnv):
-    """Many drones at once, each in a wind of its own; see `PowerlineEnv`."""
+    """Many drones that are stepped together, each in its own wind; see `PowerlineEnv`."""
 
     fleet_type = PowerlineFleet

@@ -1,4 +1,4 @@
-"""N drones of the powerline sim as arrays: starts, steps and observations."""
+"""Fleet of the powerline sim: starts, steps and observations of N drones."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from mcaprl.sims.powerline.rules import (
     flight_at,
     observe,
     step_flights,
+    store_bearings,
     store_flight,
-    take_bearings,
 )
 from mcaprl.sims.powerline.start import draw_wind, flight_from, start_anywhere, start_on_line
 from mcaprl.sims.vehicle.arguments import check_name, check_range
@@ -44,11 +44,11 @@ STARTS = ("anywhere", "line")
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 MOTION = slice(3, 9)
-"""What of the vector is observed beside a picture: velocity, and command minus velocity."""
+"""Indices of the observed numbers beside an image: velocity, and command minus velocity."""
 
 
 class PowerlineFleet(Fleet):
-    """N drones on the line, each in a wind of its own; see `PowerlineEnv`."""
+    """N drones on the line, each in its own wind; arguments as in `PowerlineEnv`."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
@@ -64,11 +64,11 @@ class PowerlineFleet(Fleet):
         wind_m_s: float = 0.0,
         gust_m_s: float = 0.0,
     ) -> None:
-        """Make N drones; each is to be started by `begin`.
+        """Allocate N drones; `begin` starts them.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
-            UsageError: a number is outside its range, or the classic rules are to have gusts.
+            UnknownNameError: An argument has a value that is not in its list.
+            UsageError: A number is outside its range.
         """
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
@@ -103,7 +103,7 @@ class PowerlineFleet(Fleet):
         self._seen = np.zeros((self.count, len(OBSERVATION_NAMES)), dtype=np.float32)
 
     def flight(self, i: int) -> Flight:
-        """Give the whole state of a drone, NED."""
+        """Return the state of a drone, NED."""
         return flight_at(self._flights[i])
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
@@ -121,13 +121,13 @@ class PowerlineFleet(Fleet):
         self._started_at_m[i] = flight.furthest_m
         self.rewards[i], self.ends[i] = 0.0, GOING_ON
         observe(flight, self._seen[i])
-        take_bearings(self._flights[i : i + 1], self._bearings[i : i + 1])
+        store_bearings(self._flights[i : i + 1], self._bearings[i : i + 1])
         self._depth_m.pop(i, None)
 
     def advance(self) -> None:
-        """Fly on for a decision."""
+        """Advance all drones by a decision."""
         self._step()
-        take_bearings(self._flights, self._bearings)
+        store_bearings(self._flights, self._bearings)
         self._depth_m.clear()
 
     def _kernel(self) -> tuple[Any, ...]:
@@ -138,7 +138,7 @@ class PowerlineFleet(Fleet):
         return step_flights, *before, self._gust_m_s, self.noise, *after
 
     def observation(self, i: int) -> Any:
-        """Give the numbers or the picture that drone i sees."""
+        """Return the numbers or the image that drone i observes."""
         if self._shows_state:
             return self._seen[i].copy()
         if self.classic:
@@ -147,7 +147,7 @@ class PowerlineFleet(Fleet):
         return {"depth": depth, "motion": self._seen[i, MOTION].copy()}
 
     def observations(self) -> Any:
-        """Give what all drones see."""
+        """Return the observations of all drones."""
         if self._shows_state:
             return self._seen.copy()
         seen = [self.observation(i) for i in range(self.count)]
@@ -156,7 +156,7 @@ class PowerlineFleet(Fleet):
         return {key: np.stack([each[key] for each in seen]) for key in ("depth", "motion")}
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Give drone i's (84, 84) distances along each ray, metres; inf is nothing."""
+        """Return drone i's (84, 84) distances along each ray, meters, or infinity."""
         if i not in self._depth_m:
             if self._camera is None:
                 self._camera = DroneCamera(self._camera_view)
@@ -164,21 +164,21 @@ class PowerlineFleet(Fleet):
         return self._depth_m[i]
 
     def places(self) -> NDArray[np.float64]:
-        """Give where all are, (N, 2) x and y in the map, metres."""
-        # The log's axes are ROS's: y points west.
+        """Return the positions of all drones, (N, 2) x and y in the map, meters."""
+        # The map has ROS axes: y points west.
         return self._flights[:, :2] * (1.0, -1.0)
 
     def info(self, i: int) -> dict[str, Any]:
-        """Give the `info` of drone i."""
-        return _described(self._bearings[i].tolist(), self._started_at_m.item(i))
+        """Return the `info` of drone i."""
+        return _named(self._bearings[i].tolist(), self._started_at_m.item(i))
 
     def infos(self) -> dict[str, NDArray[Any]]:
-        """Give the `info` of all drones."""
-        return _described(self._bearings.T.copy(), self._started_at_m)
+        """Return the `info` of all drones."""
+        return _named(self._bearings.T.copy(), self._started_at_m)
 
 
-def _described(bearing: Any, started_at_m: Any) -> dict[str, Any]:
-    """Name what is told of a drone, or of all: 5 numbers, or as many columns."""
+def _named(bearing: Any, started_at_m: Any) -> dict[str, Any]:
+    """Return the `info` of one drone (5 numbers) or of all drones (5 rows)."""
     lateral_m, vertical_m, distance_m, along_m, speed_m_s = bearing
     return {
         "lateral_offset_m": lateral_m,

@@ -1,27 +1,23 @@
-"""The scripted flyer of the powerline sim: aim at a point ahead, slow down before corners."""
+"""Pilot of the powerline sim: it aims at a point ahead and slows down before corners."""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, minus, norm, times
+from mcaprl.sims.powerline.course import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, Flight
-from mcaprl.sims.powerline.world import ALONG_M, LEGS, TANGENTS, nearest_on_line, point_on_line
-from mcaprl.sims.vehicle.arguments import check_one
+from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 AIM_M = 6.0
-"""The point aimed at lies this far ahead on the line."""
+"""Distance along the line to the point that the pilot aims at."""
 OFFSET_GAIN_PER_S = 0.5
 MAX_SPEED_M_S = 5.0
 HALF_TURN_RAD = 0.46
 TURN_SPEED_M_S = 2.0
-"""A corner of 2 x 0.46 rad is taken at 2 m/s; sharper ones more slowly."""
+"""Speed in a corner of 2 x 0.46 rad; sharper corners are flown more slowly."""
 BRAKE_M_S2 = 0.3
 CORNER_EARLY_M = 6.0
 NO_CHANGE = len(ACTION_MEANINGS) - 1
@@ -29,7 +25,7 @@ NO_CHANGE = len(ACTION_MEANINGS) - 1
 
 @compiled
 def corner_speed(leg: int) -> float:
-    """Give the speed, m/s, for the corner at a leg's end: less, the sharper it is."""
+    """Return the speed, m/s, for the corner at a leg's end; the sharper it is, the slower."""
     if leg + 1 >= LEGS:
         return MAX_SPEED_M_S
     cosine = 0.0
@@ -42,7 +38,7 @@ def corner_speed(leg: int) -> float:
 
 @compiled
 def wanted_velocity(position_m: Vector) -> Vector:
-    """Give the velocity that a drone at a position should have, m/s."""
+    """Return the velocity, m/s, that a drone at a position should have."""
     place = nearest_on_line(position_m)
     slowing_m = max(0.0, ALONG_M[place.leg + 1] - place.along_m - CORNER_EARLY_M)
     corner_m_s = corner_speed(place.leg)
@@ -54,12 +50,12 @@ def wanted_velocity(position_m: Vector) -> Vector:
 
 @compiled
 def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
-    """Choose the action that mends the largest part of the command's error, if it is worth a step.
+    """Choose the action that reduces the command's error most, or no change if it is small.
 
     Args:
-        flight: now.
-        step_m_s: that an action makes.
-        from_measured: whether actions change the measured velocity, not the last command.
+        flight: State of the drone.
+        step_m_s: Velocity change of an action.
+        from_measured: Whether actions change the measured velocity instead of the last command.
     """
     base = flight.drone.velocity_m_s if from_measured else flight.command_m_s
     missing = minus(wanted_velocity(flight.drone.position_m), base)
@@ -73,24 +69,10 @@ def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
     return best
 
 
-class PowerlinePilot:
-    """Flies the drone of one environment, whose state it reads."""
+class PowerlinePilot(ScriptedPilot[PowerlineEnv]):
+    """Pilot of one powerline sim's drone."""
 
-    name: ClassVar[str] = "pilot"
-
-    def __init__(self, sim: PowerlineEnv) -> None:
-        """Take over `sim`."""
-        self._sim = sim
-
-    def act(
-        self, observations: NDArray[np.generic] | dict[str, NDArray[np.generic]]
-    ) -> NDArray[np.int64]:
-        """Give the action, shape (1,), for the drone as it is now.
-
-        Raises:
-            ValueError: there are observations of more than one environment.
-        """
-        check_one(observations)
-        sim = self._sim
-        action = choose(sim.flight, sim.fleet.velocity_step_m_s, sim.fleet.classic)
-        return np.array([action], dtype=np.int64)
+    def choose(self) -> int:
+        """Choose the action for the current state of the drone."""
+        fleet = self.sim.fleet
+        return choose(self.sim.flight, fleet.velocity_step_m_s, fleet.classic)

@@ -1,7 +1,7 @@
 """Two drones that follow a commanded velocity: a quadrotor with its controllers, and a point.
 
-Axes are NED: x north, y east, z down; the body's are x forward, y right, z down. Both keep their
-nose to the north.
+Axes are NED: x north, y east, z down; those of the body are x forward, y right, z down. Both always
+face north.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ QUAD, POINT = 0, 1
 
 GRAVITY_M_S2 = 9.81
 TIME_STEP_S = 0.002
-"""The quadrotor's equations and controllers run at 500 Hz."""
+"""Time step of the quadrotor's equations and controllers, which run at 500 Hz."""
 POINT_LAG_S = 0.5
 
 MASS_KG = 1.0
 INERTIA_KG_M2 = (0.01, 0.01, 0.018)
 ROTOR_OFFSET_M = 0.15
-"""Of each rotor from the middle, both forward and sideways: the arms form an X."""
+"""Distance of each rotor from the middle, both forward and sideways: the arms form an X."""
 TORQUE_PER_THRUST_M = 0.016
 MAX_ROTOR_THRUST_N = 5.5
 ROTOR_LAG_S = 0.02
 ROTOR_SHARE = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
-"""Of the way to a commanded thrust, in one time step."""
+"""Share of the difference to the commanded thrust that one time step makes up."""
 DRAG_PER_S = 0.25
-"""Drag is linear in the speed through the air; per mass."""
+"""Drag per mass, linear in the airspeed."""
 
 VELOCITY_GAIN_PER_S = 2.5
 INTEGRAL_GAIN_PER_S2 = 1.5
 REFERENCE_GAIN_PER_S = VELOCITY_GAIN_PER_S + DRAG_PER_S
-"""In still air, the velocity itself approaches the command at this rate."""
+"""Rate at which the reference, as the velocity in still air, approaches the command."""
 MAX_INTEGRAL_M_S2 = 2.0
 MAX_ACCELERATION_M_S2 = 6.0
 ATTITUDE_GAIN_PER_S = 12.0
@@ -59,7 +59,7 @@ RATE_GAIN_PER_S = 30.0
 
 
 class Rotors(NamedTuple):
-    """One number for each rotor; the first two turn against the last two."""
+    """One number for each rotor; the first two rotate opposite to the last two."""
 
     front_right: float
     rear_left: float
@@ -68,23 +68,23 @@ class Rotors(NamedTuple):
 
 
 class Drone(NamedTuple):
-    """The whole state of a drone and its controllers; a point uses only the first two."""
+    """State of a drone and its controllers; a point uses only the first two fields."""
 
     position_m: Vector
     velocity_m_s: Vector
     attitude: Quaternion
-    """Turns vectors of the body into the world's."""
+    """Rotation from the body's axes to the world's."""
     rates_rad_s: Vector
     """Angular velocity about the body's axes."""
     thrusts_n: Rotors
     reference_m_s: Vector
-    """The velocity that the command asks for by now, without wind."""
+    """Velocity that the drone would have now without wind."""
     integral_m_s2: Vector
-    """What the velocity controller has learnt of the wind."""
+    """Integral of the velocity controller, which compensates for the wind."""
 
 
 DRONE_SIZE = 23
-"""Numbers in a `Drone`, and in the row of an array that holds one."""
+"""Size of a `Drone`, and of the array row that stores one."""
 
 
 @compiled
@@ -115,7 +115,7 @@ def store(drone: Drone, row: NDArray[np.float64]) -> None:
 
 @compiled
 def cruising(position_m: Vector, velocity_m_s: Vector) -> Drone:
-    """Make a level drone that has been commanded its velocity, in still air, for some time."""
+    """Return a level drone in steady flight at a velocity in still air."""
     hover_n = 0.25 * MASS_KG * GRAVITY_M_S2
     still = Vector(0.0, 0.0, 0.0)
     return Drone(
@@ -133,14 +133,14 @@ def cruising(position_m: Vector, velocity_m_s: Vector) -> Drone:
 def fly(
     plant: int, drone: Drone, command_m_s: Vector, wind_m_s: Vector, duration_s: float
 ) -> Drone:
-    """Fly at a commanded velocity for a while.
+    """Return the drone after flying at a commanded velocity.
 
     Args:
-        plant: QUAD, or POINT, which no wind moves.
-        drone: at the start.
-        command_m_s: over the ground.
-        wind_m_s: velocity of the air over the ground.
-        duration_s: for QUAD, a multiple of 2 ms.
+        plant: QUAD or POINT; wind has no effect on the latter.
+        drone: State before.
+        command_m_s: Commanded velocity over the ground.
+        wind_m_s: Velocity of the air over the ground.
+        duration_s: Duration; for QUAD a multiple of 2 ms.
     """
     if plant == POINT:
         return lag(drone, command_m_s, duration_s)
@@ -151,9 +151,9 @@ def fly(
 
 @compiled
 def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
-    """Solve v' = (c - v) / T exactly: v(t) = c + (v - c) e, x(t) = x + c t + (v - c) T (1 - e).
+    """Advance a point by the exact solution of v' = (c - v) / T.
 
-    e = exp(-t / T).
+    v(t) = c + (v - c) e and x(t) = x + c t + (v - c) T (1 - e), with e = exp(-t / T).
     """
     left = math.exp(-duration_s / POINT_LAG_S)
     error = minus(drone.velocity_m_s, command_m_s)
@@ -171,7 +171,7 @@ def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
 
 @inlined
 def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
-    """Advance a quadrotor by 2 ms: control it, then move it."""
+    """Advance a quadrotor and its controllers by 2 ms."""
     wanted = wanted_acceleration(drone, command_m_s)
     rotors = rotor_commands(drone, wanted)
     reference = drone.reference_m_s
@@ -194,10 +194,11 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
 
 @inlined
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
-    """Ask for the acceleration that brings the velocity to the command.
+    """Return the acceleration with which the velocity controller approaches the command.
 
-    On each axis k (c - v), what drag takes away at the commanded speed, and the integral, which
-    sees the wind and not the step; at most 6 m/s^2.
+    On each axis it is the sum of k (c - v), the drag at the commanded speed, and the integral of
+    the error from the reference, which is due to wind and not to steps of the command; it is
+    limited to 6 m/s^2.
     """
     c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
     return Vector(_asked(c.x, v.x, i.x), _asked(c.y, v.y, i.y), _asked(c.z, v.z, i.z))
@@ -211,7 +212,7 @@ def _asked(command_m_s: float, velocity_m_s: float, integral_m_s2: float) -> flo
 
 @inlined
 def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> float:
-    """Add up an axis' velocity error, unless its acceleration is at the limit."""
+    """Integrate the velocity error of an axis, unless its acceleration is at the limit."""
     if abs(wanted_m_s2) >= MAX_ACCELERATION_M_S2:
         return integral_m_s2
     grown = integral_m_s2 + TIME_STEP_S * INTEGRAL_GAIN_PER_S2 * error_m_s
@@ -220,11 +221,12 @@ def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> f
 
 @inlined
 def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
-    """Choose the rotors' thrusts, newtons, for a wanted acceleration.
+    """Return the commanded thrusts of the rotors, newtons, for a wanted acceleration.
 
-    The body's z axis is to point along g - a, by the shortest turn from upright. The attitude's
-    error commands the angular velocity, and that one's error the torques. Mellinger and Kumar,
-    "Minimum snap trajectory generation and control for quadrotors", ICRA 2011, has the cascade.
+    The wanted attitude is the shortest rotation from upright that points the body's z axis along
+    g - a. Its error commands the angular velocity, whose error commands the torques, as in the
+    cascade of Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors",
+    ICRA 2011.
     """
     down = minus(Vector(0.0, 0.0, GRAVITY_M_S2), wanted_m_s2)
     size = norm(down)
@@ -241,14 +243,14 @@ def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
 
 @inlined
 def angular_momentum(rates_rad_s: Vector) -> Vector:
-    """Give inertia times angular velocity, about the body's axes."""
+    """Return the angular momentum in the body's axes."""
     about_x, about_y, about_z = INERTIA_KG_M2
     return Vector(about_x * rates_rad_s.x, about_y * rates_rad_s.y, about_z * rates_rad_s.z)
 
 
 @inlined
 def _mixed(thrust_n: float, torque_n_m: Vector) -> Rotors:
-    """Share a thrust and torques among the rotors; none pulls down or beyond its limit."""
+    """Distribute a thrust and torques among the rotors, each within 0 and its maximum."""
     each = 0.25 * thrust_n
     roll = 0.25 * torque_n_m.x / ROTOR_OFFSET_M
     pitch = 0.25 * torque_n_m.y / ROTOR_OFFSET_M
@@ -268,10 +270,11 @@ def _limited(thrust_n: float) -> float:
 
 @inlined
 def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
-    """Advance a rigid body by 2 ms: rates and velocity first, then attitude and position with them.
+    """Advance a rigid body by 2 ms with the semi-implicit Euler method.
 
     m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega, q' = q (0, omega) / 2, and
-    each thrust follows its command with a lag of 20 ms.
+    each thrust follows its command with a lag of 20 ms. Attitude and position are advanced with the
+    new rates and the new velocity.
     """
     share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(
@@ -301,7 +304,7 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
 
 @inlined
 def _turned(rates_rad_s: Vector, thrusts: Rotors) -> Vector:
-    """Give the angular velocity after 2 ms."""
+    """Return the angular velocity after 2 ms."""
     right, left = thrusts.front_right + thrusts.rear_right, thrusts.front_left + thrusts.rear_left
     front, rear = thrusts.front_right + thrusts.front_left, thrusts.rear_right + thrusts.rear_left
     one_way = thrusts.front_right + thrusts.rear_left

@@ -1,6 +1,6 @@
-"""The equations of the powerline sim's default rules, for one drone or many.
+"""Equations of the powerline sim's default rules: flight, rewards, ends and observations.
 
-Axes are NED, as in `powerline_world`.
+Axes are NED, as in `mcaprl.sims.powerline.course`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.vectors import Vector, minus, norm, plus, times
-from mcaprl.sims.powerline.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
-from mcaprl.sims.powerline.quadrotor_block import fly_all
-from mcaprl.sims.powerline.world import (
+from mcaprl.sims.powerline.block import fly_all
+from mcaprl.sims.powerline.course import (
     ALONG_M,
     LEGS,
     LENGTH_M,
@@ -26,6 +25,7 @@ from mcaprl.sims.powerline.world import (
     tower_distance,
     wire_distance,
 )
+from mcaprl.sims.powerline.quadrotor import DRONE_SIZE, Drone, cruising, drone_at, fly, store
 
 ACTION_MEANINGS = (
     "faster north (+x)",
@@ -37,29 +37,30 @@ ACTION_MEANINGS = (
     "no change",
 )
 DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])
-"""(7, 3) how each action changes the velocity, in steps, along x, y and z."""
+"""(7, 3) change of the velocity by each action, in steps along x, y and z."""
 
 DECISION_S = 0.5
 CHECK_S = 0.1
-"""How often a flight is checked for its end."""
+"""Interval of the checks for collisions and other ends."""
 VELOCITY_STEP_M_S = 0.5
 MAX_COMMAND_M_S = 8.0
 APPROACH_S = 5.0
-"""An episode's flight from the first point of the line before the first decision."""
+"""Duration of the flight from the first point of the line before the first decision."""
 FIRST_COMMAND_M_S = (1.0, -0.5, -1.0)
-"""The published one is (1, -0.67, -0.8): from there, no steps of 0.5 m/s lead back to hovering."""
+"""Command of that flight. From the published one, (1, -0.67, -0.8), steps of 0.5 m/s could not
+return to hovering."""
 
 MAX_DISTANCE_M = 7.0
 WIRE_CLEARANCE_M = 0.6
 TOWER_CLEARANCE_M = 1.2
 GROUND_CLEARANCE_M = 0.3
 FINISH_M = 1.0
-"""The line is done this far before its end."""
+"""Distance from the line's end at which it is finished."""
 FAILURE_REWARD = -5.0
 FINISH_REWARD = 5.0
-PAID_PROGRESS_M = 2.5
-"""In one decision, 5 m/s: what is more is taken off again."""
-PAID_DISTANCE_M = 4.0
+BEST_PROGRESS_M = 2.5
+"""Progress per decision with the highest reward: 5 m/s."""
+DISTANCE_SCALE_M = 4.0
 FLYING, OFF_LINE, COLLISION, FINISHED = 0, 1, 2, 3
 REASONS = ("", "off_line", "collision", "finished")
 
@@ -89,11 +90,11 @@ OBSERVATION_LIMIT = np.array([2] * 3 + [4] * 3 + [8] * 3 + [1] * 8 + [10], dtype
 
 COMMAND, WIND, GUST, FURTHEST = DRONE_SIZE, DRONE_SIZE + 3, DRONE_SIZE + 6, DRONE_SIZE + 9
 FLIGHT_SIZE = DRONE_SIZE + 10
-"""Numbers in a `Flight`, and in the row of an array that holds one."""
+"""Size of a `Flight`, and of the array row that stores one."""
 
 
 class Flight(NamedTuple):
-    """The whole state of one drone on the line."""
+    """State of one drone on the line."""
 
     drone: Drone
     command_m_s: Vector
@@ -101,14 +102,14 @@ class Flight(NamedTuple):
     wind_m_s: Vector
     """Steady wind of the episode."""
     gust_m_s: Vector
-    """What is added to it now."""
+    """Current gust, which is added to the wind."""
     furthest_m: float
-    """Most progress along the line so far."""
+    """Maximum progress along the line so far."""
 
 
 @compiled
 def vector_at(row: NDArray[np.float64], start: int) -> Vector:
-    """Read a vector from three neighbours of a row."""
+    """Read a vector from three consecutive numbers of a row."""
     return Vector(row[start], row[start + 1], row[start + 2])
 
 
@@ -137,7 +138,7 @@ def store_flight(flight: Flight, row: NDArray[np.float64]) -> None:
 
 @compiled
 def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Make a flight that starts at its commanded velocity."""
+    """Return a flight that starts at its commanded velocity."""
     drone = cruising(position_m, command_m_s)
     place = nearest_on_line(position_m)
     return Flight(drone, command_m_s, wind_m_s, Vector(0.0, 0.0, 0.0), place.along_m)
@@ -145,7 +146,7 @@ def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
 
 @compiled
 def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Hover at a position, then fly for 5 s at a command."""
+    """Return the flight after 5 s at a command from hovering at a position."""
     drone = cruising(position_m, Vector(0.0, 0.0, 0.0))
     drone = fly(plant, drone, command_m_s, wind_m_s, APPROACH_S)
     along_m = nearest_on_line(drone.position_m).along_m
@@ -154,7 +155,7 @@ def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vect
 
 @compiled
 def commanded(command_m_s: Vector, action: int) -> Vector:
-    """Change a command by an action; one that would exceed 8 m/s stays as it is."""
+    """Return a command changed by an action; unchanged if it would exceed 8 m/s."""
     direction = vector_at(DIRECTIONS[action], 0)
     changed = plus(command_m_s, times(VELOCITY_STEP_M_S, direction))
     return changed if norm(changed) <= MAX_COMMAND_M_S else command_m_s
@@ -162,14 +163,14 @@ def commanded(command_m_s: Vector, action: int) -> Vector:
 
 @compiled
 def blown(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
-    """Give the gusts of the next decision: on each axis, noise that forgets itself within 2 s.
+    """Return the gust of the next decision: on each axis an Ornstein-Uhlenbeck process.
 
-    g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has standard deviation s for ever.
+    g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has the stationary standard deviation s.
 
     Args:
-        gust_m_s: until now.
-        strength_m_s: s.
-        noise: (3,) numbers n from the standard normal distribution.
+        gust_m_s: Gust g of the last decision.
+        strength_m_s: Standard deviation s.
+        noise: (3,) standard normal numbers n.
     """
     kept = math.exp(-DECISION_S / GUST_TIME_S)
     fresh = strength_m_s * math.sqrt(1.0 - kept * kept)
@@ -178,7 +179,7 @@ def blown(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> 
 
 @compiled
 def collides(position_m: Vector) -> bool:
-    """Say whether a drone there touches a conductor, a tower or the ground."""
+    """Return whether a drone at a position touches a conductor, a tower or the ground."""
     if wire_distance(position_m) < WIRE_CLEARANCE_M:
         return True
     if tower_distance(position_m) < TOWER_CLEARANCE_M:
@@ -189,7 +190,7 @@ def collides(position_m: Vector) -> bool:
 
 @compiled
 def end_of(position_m: Vector, place: Place) -> int:
-    """Say whether a flight is over: FLYING, OFF_LINE, COLLISION or FINISHED."""
+    """Return the end of a decision: FLYING, OFF_LINE, COLLISION or FINISHED."""
     if collides(position_m):
         return COLLISION
     if place.distance_m > MAX_DISTANCE_M:
@@ -199,25 +200,25 @@ def end_of(position_m: Vector, place: Place) -> int:
 
 @compiled
 def reward_of(furthest_m: float, after: Flight, end: int) -> float:
-    """Pay a decision: new progress ds along the line, less for flying beside it.
+    """Return the reward of a decision: new progress along the line, close to the line.
 
-    Before the decision the drone had been at most `furthest_m` along the line. Pays
-    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, at distance d; -5 for a failure, 5 more for the
-    finish. Beyond 5 m/s each metre costs what it would have paid: if it cost nothing, hurrying
-    would waste the rest of the line, but only beyond the horizon of whoever discounts.
+    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds beyond `furthest_m`, the
+    furthest point before the decision, at distance d; +5 for the finish, -5 for a failure. Beyond
+    5 m/s the reward decreases. If it only stayed constant, flying too fast would still lose the
+    reward of the rest of the line, but a discounting agent would not notice.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD
     distance_m = nearest_on_line(after.drone.position_m).distance_m
-    progress = (after.furthest_m - furthest_m) / PAID_PROGRESS_M
+    progress = (after.furthest_m - furthest_m) / BEST_PROGRESS_M
     progress = min(progress, 2.0 - progress)
     bonus = FINISH_REWARD if end == FINISHED else 0.0
-    return progress * math.exp(-distance_m / PAID_DISTANCE_M) + bonus
+    return progress * math.exp(-distance_m / DISTANCE_SCALE_M) + bonus
 
 
 @compiled
 def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
-    """Write the 18 observed numbers; see the table of `PowerlineEnv`."""
+    """Write the 18 observed numbers; see "Observation Space" of `PowerlineEnv`."""
     drone = flight.drone
     place = nearest_on_line(drone.position_m)
     following = min(place.leg + 1, LEGS - 1)
@@ -237,22 +238,22 @@ def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
 
 
 class Bearing(NamedTuple):
-    """Where a drone is, seen from the line, in ROS axes."""
+    """Position of a drone relative to the line, in ROS axes."""
 
     lateral_m: float
-    """Left of the line, seen along it."""
+    """Horizontal offset from the line, left positive."""
     vertical_m: float
-    """Above the line."""
+    """Vertical offset from the line, up positive."""
     distance_m: float
-    """From the line."""
+    """Distance from the line."""
     along_m: float
-    """Of the nearest point, along the line."""
+    """Distance of the nearest point along the line."""
     speed_m_s: float
 
 
 @compiled
 def bearing_of(drone: Drone) -> Bearing:
-    """Give where a drone is."""
+    """Return the bearing of a drone."""
     place = nearest_on_line(drone.position_m)
     away = minus(drone.position_m, place.point_m)
     forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
@@ -263,7 +264,7 @@ def bearing_of(drone: Drone) -> Bearing:
 
 
 @compiled
-def take_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
+def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
     """Write the bearings (N, 5) of N drones, (N, 33) rows of `Flight`."""
     for i in range(len(flights)):
         bearing = bearing_of(drone_at(flights[i]))
@@ -288,11 +289,11 @@ def step_flights(
         plant: QUAD or POINT.
         flights: (N, 33) rows of `Flight`.
         actions: (N,) 0 to 6.
-        gust_m_s: standard deviation of the gusts.
-        noise: (N, 3) standard normal numbers for the gusts; (N, 0) will do where there are none.
-        rewards: (N,) to be filled.
-        ends: (N,) to be filled with FLYING, OFF_LINE, COLLISION or FINISHED.
-        observations: (N, 18) to be filled.
+        gust_m_s: Standard deviation of the gusts.
+        noise: (N, 3) standard normal numbers for the gusts; (N, 0) without gusts.
+        rewards: (N,) output.
+        ends: (N,) output: FLYING, OFF_LINE, COLLISION or FINISHED.
+        observations: (N, 18) output.
     """
     if gust_m_s > 0.0:
         for i in range(len(flights)):
@@ -307,7 +308,7 @@ def step_flights(
 
 @compiled
 def blow(row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]) -> None:
-    """Renew the gusts of a flight's row; see `blown`."""
+    """Advance the gust in a flight's row; see `blown`."""
     gust = blown(vector_at(row, GUST), strength_m_s, noise)
     for k in range(3):
         row[GUST + k] = gust[k]
@@ -320,9 +321,9 @@ def decide_all(
     actions: NDArray[np.int64],
     ends: NDArray[np.int64],
 ) -> None:
-    """Fly N drones, (N, 33) rows of `Flight`, for half a second or to the end of each's flight.
+    """Fly N drones, (N, 33) rows of `Flight`, for half a second or until their episodes end.
 
-    The ends (N,) are filled with FLYING, OFF_LINE, COLLISION or FINISHED.
+    Writes FLYING, OFF_LINE, COLLISION or FINISHED to the ends (N,).
     """
     count = len(flights)
     commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))

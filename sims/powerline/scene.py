@@ -1,8 +1,8 @@
-"""What a 3D viewer shows of the powerline sim: hills, firs, towers, conductors and the drone.
+"""Scene of the powerline sim: hills, firs, towers, conductors and the drone.
 
 Frames: `map` (x north, y west, z up), `base_stabilized` (at the drone, level), `drone` (its body, x
 forward, y left, z up) and `camera` (ROS optical axes: x right, y down, z along the view).
-The drone is drawn five times its size, so that it can be seen.
+The drone is drawn at five times its size, so that it is visible.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.scene import Color, Frame, Shape, path
+from mcaprl.sims.drawing.shapes import label
 from mcaprl.sims.geometry.vectors import Vector, norm
-from mcaprl.sims.powerline import camera, world
+from mcaprl.sims.powerline import camera, course
 from mcaprl.sims.powerline.quadrotor import ROTOR_OFFSET_M, Drone
 from mcaprl.sims.powerline.rules import Flight
 
@@ -36,25 +37,25 @@ LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
 UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
-"""An arrow of no length points nowhere, and viewers complain."""
+"""Offset of arrows, since viewers reject an arrow of length 0."""
 CORNERS_PER_M = 16
-"""Corners of surfaces are rounded so: a log holds them in a third of the space."""
+"""Corners of surfaces are rounded to 1/16 m, so that they take a third of the space in a log."""
 SHADES = 10
-"""Surfaces are drawn in so many brightnesses, by how they face the sun."""
+"""Number of brightness levels of surfaces, by their angle to the sun."""
 SUN = np.array([0.45, 0.35, 0.82])
 
 DRONE_SCALE = 5.0
 CROSSINGS = 6
-"""Storeys of a tower's lattice."""
+"""Number of cross-braced sections of a tower."""
 
 
 def ros(ned: Vector) -> tuple[float, float, float]:
-    """Turn one NED vector into ROS axes."""
+    """Transform an NED vector into ROS axes."""
     return ned.x, -ned.y, -ned.z
 
 
 def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> list[Shape]:
-    """Colour triangles (T, 3, 3) by how they face the sun, one shape for each brightness."""
+    """Color triangles (T, 3, 3) by their angle to the sun, one shape for each brightness."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     light = np.clip(normals @ SUN / np.linalg.norm(normals, axis=1), 0.0, 1.0)
     classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)
@@ -69,17 +70,17 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
 
 
 def _firs() -> Floats:
-    return np.concatenate([camera.tree_triangles(tree) for tree in world.trees()])
+    return np.concatenate([camera.tree_triangles(tree) for tree in course.trees()])
 
 
-def _lattice(tower: world.Tower) -> Floats:
-    """Give a tower's beams in ROS axes as pairs of points, (N, 3)."""
+def _lattice(tower: course.Tower) -> Floats:
+    """Return the beams of a tower in ROS axes as pairs of points, (N, 3)."""
     foot = np.array([tower.x_m, -tower.y_m, -tower.foot_z_m])
     height_m = tower.foot_z_m - tower.arm_z_m
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     rings = []
-    for storey in range(CROSSINGS + 1):
-        share = storey / CROSSINGS
+    for section in range(CROSSINGS + 1):
+        share = section / CROSSINGS
         side_m = camera.MAST_FOOT_M + share * (camera.MAST_TOP_M - camera.MAST_FOOT_M)
         ring = np.column_stack([side_m * corners, np.full(4, share * height_m)])
         rings.append(foot + ring)
@@ -91,22 +92,22 @@ def _lattice(tower: world.Tower) -> Floats:
     return np.array(pairs)
 
 
-def _arm(index: int, tower: world.Tower) -> list[Shape]:
-    """Give a tower's arm, and the insulators on it."""
+def _arm(index: int, tower: course.Tower) -> list[Shape]:
+    """Return the arm of a tower and its insulators."""
     right = np.array([tower.right[0], -tower.right[1], 0.0])
     middle = np.array([tower.x_m, -tower.y_m, -tower.arm_z_m])
     yaw_rad = math.atan2(right[1], right[0])
-    size = (2 * world.ARM_HALF_LENGTH_M, 0.5, 0.4)
+    size = (2 * course.ARM_HALF_LENGTH_M, 0.5, 0.4)
     at = (float(middle[0]), float(middle[1]), float(middle[2]))
     shapes = [Shape(f"arm_{index}", "box", STEEL, size=size, position=at, yaw_rad=yaw_rad)]
-    for phase, phase_m in enumerate(world.PHASES_M):
-        x_m, y_m, z_m = middle + phase_m * right + [0.0, 0.0, world.ARM_BELOW_WIRES_M / 2]
+    for phase, phase_m in enumerate(course.PHASES_M):
+        x_m, y_m, z_m = middle + phase_m * right + [0.0, 0.0, course.ARM_BELOW_WIRES_M / 2]
         shapes.append(
             Shape(
                 name=f"insulator_{index}_{phase}",
                 kind="cylinder",
                 color=CERAMIC,
-                size=(0.25, 0.25, world.ARM_BELOW_WIRES_M),
+                size=(0.25, 0.25, course.ARM_BELOW_WIRES_M),
                 position=(float(x_m), float(y_m), float(z_m)),
             )
         )
@@ -114,8 +115,8 @@ def _arm(index: int, tower: world.Tower) -> list[Shape]:
 
 
 def _line() -> list[Shape]:
-    shapes = [Shape("route", "line", ROUTE, world.to_ros(world.POINTS_M), size=(0.12, 0.0, 0.0))]
-    for index, tower in enumerate(world.towers()):
+    shapes = [Shape("route", "line", ROUTE, course.to_ros(course.POINTS_M), size=(0.12, 0.0, 0.0))]
+    for index, tower in enumerate(course.towers()):
         lattice = _lattice(tower)
         shapes.append(Shape(f"tower_{index}", "segments", STEEL, lattice, size=(0.16, 0.0, 0.0)))
         shapes += _arm(index, tower)
@@ -125,7 +126,7 @@ def _line() -> list[Shape]:
 
 
 def _drone() -> list[Shape]:
-    """Give the drone's parts in its own frame."""
+    """Return the drone's parts in its own frame."""
     arm_m = DRONE_SCALE * ROTOR_OFFSET_M
     turns = ((1, 1), (-1, -1), (1, -1), (-1, 1))
     names = ("front_left", "rear_right", "front_right", "rear_left")
@@ -167,55 +168,47 @@ def _drone() -> list[Shape]:
 
 @functools.cache
 def ground_shapes() -> tuple[Shape, ...]:
-    """Give the ground and the firs."""
+    """Return the ground and the firs."""
     ground = _shaded("ground", camera.ground_triangles(), GRASS)
     return (*ground, *_shaded("firs", _firs(), NEEDLES))
 
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Give what never changes: the world in `map`, ground first, and the drone's parts."""
+    """Return the shapes that never change: the world in `map`, ground first, and the drone."""
     return (*ground_shapes(), *_line(), *_drone())
 
 
 def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple[Shape, ...]:
-    """Give what changes with each step.
+    """Return the shapes that change with each step.
 
     Args:
-        flight: now.
-        trail_m: the last positions of the drone, NED; at least one.
+        flight: State of the drone.
+        trail_m: Last positions of the drone, NED; at least one.
     """
     position = flight.drone.position_m
-    place = world.nearest_on_line(position)
+    place = course.nearest_on_line(position)
     here = np.array(ros(position))
-    # What starts at the drone is given from there: it hangs on it, and repeats itself in a log.
+    # Shapes that start at the drone are relative to it: they then repeat and compress well in logs.
     level, origin = "base_stabilized", np.zeros(3)
     link = np.array([origin, ros(place.point_m) - here])
-    ahead = np.array([ros(world.point_on_line(place.along_m + 6.0)) - here])
+    ahead = np.array([ros(course.point_on_line(place.along_m + 6.0)) - here])
     arrow = np.array([origin, np.array(ros(flight.command_m_s)) + UP_A_LITTLE])
     speed_m_s = norm(flight.drone.velocity_m_s)
     return (
-        Shape("trail", "line", TRAIL, world.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
+        Shape("trail", "line", TRAIL, course.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
         Shape("offset", "line", LOOK, link, size=(0.08, 0.0, 0.0), frame=level),
         Shape("ahead", "points", LOOK, ahead, size=(0.4, 0.4, 0.4), frame=level),
         Shape("command", "arrow", WHITE, arrow, size=(0.12, 0.3, 0.4), frame=level),
-        Shape(
-            name="speed",
-            kind="text",
-            color=WHITE,
-            size=(1.0, 1.0, 0.8),
-            position=(0.0, 0.0, 1.6),
-            frame=level,
-            text=f"{speed_m_s:.1f} m/s",
-        ),
+        label(f"{speed_m_s:.1f} m/s", WHITE, 1.6, level),
     )
 
 
 def drone_frames(drone: Drone) -> tuple[Frame, ...]:
-    """Give where the drone is, level, in the map; and its attitude there.
+    """Return the drone's position in the map, as a level frame, and its attitude in that frame.
 
-    Turning the axes of the world and of the body by half a turn about x makes NED of ROS axes, so a
-    rotation's y and z parts change sign, as a vector's.
+    NED axes are ROS axes rotated by half a turn about x, for the world and for the body; therefore
+    the y and z parts of a quaternion change sign, as those of a vector.
     """
     q = drone.attitude
     return (
@@ -225,14 +218,14 @@ def drone_frames(drone: Drone) -> tuple[Frame, ...]:
 
 
 def camera_frame(view: str) -> Frame:
-    """Give the camera in the drone: optical axes."""
+    """Return the camera's frame in the drone: optical axes."""
     half = math.sqrt(0.5)
     rotations = {"front": (-0.5, 0.5, -0.5, 0.5), "down": (half, -half, 0.0, 0.0)}
     return Frame("camera", ros(camera.CAMERA_AT_M[view]), rotations[view], parent="drone")
 
 
 def telemetry(flight: Flight) -> dict[str, float]:
-    """Give what `info` does not tell of a drone, in ROS axes; the units are in the names."""
+    """Return the state that `info` does not contain, in ROS axes; names include the units."""
     drone = flight.drone
     x_m, y_m, z_m = ros(drone.position_m)
     tilt_cosine = 1.0 - 2.0 * (drone.attitude.x**2 + drone.attitude.y**2)
@@ -241,6 +234,6 @@ def telemetry(flight: Flight) -> dict[str, float]:
         "y_m": y_m,
         "z_m": z_m,
         "tilt_rad": math.acos(min(1.0, max(-1.0, tilt_cosine))),
-        "wire_distance_m": world.wire_distance(drone.position_m),
-        "height_m": z_m - world.ground_height(drone.position_m.x, drone.position_m.y),
+        "wire_distance_m": course.wire_distance(drone.position_m),
+        "height_m": z_m - course.ground_height(drone.position_m.x, drone.position_m.y),
     }

@@ -1,4 +1,4 @@
-"""Where the episodes of the powerline sim start, and in what wind."""
+"""Starts of the powerline sim's episodes, and their wind."""
 
 from __future__ import annotations
 
@@ -9,6 +9,13 @@ import numpy as np
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.vectors import Vector, norm
 from mcaprl.sims.powerline.classic import classic_end
+from mcaprl.sims.powerline.course import (
+    LENGTH_M,
+    POINTS_M,
+    TANGENTS,
+    nearest_on_line,
+    point_on_line,
+)
 from mcaprl.sims.powerline.rules import (
     FLYING,
     MAX_COMMAND_M_S,
@@ -20,25 +27,18 @@ from mcaprl.sims.powerline.rules import (
     collides,
     end_of,
 )
-from mcaprl.sims.powerline.world import (
-    LENGTH_M,
-    POINTS_M,
-    TANGENTS,
-    nearest_on_line,
-    point_on_line,
-)
 from mcaprl.sims.vehicle.arguments import check_range, read_pose
 
 POSE_NAMES = ("x_m", "y_m", "z_m", "vx_m_s", "vy_m_s", "vz_m_s")
 FIRST_POINT_NOISE_M = 0.2
 NOISE_M = 1.0
 LAST_START_M = 20.0
-"""Random starts are at least this far from the line's end."""
+"""Minimum distance of random starts from the line's end."""
 MAX_SPEED_M_S = 5.0
 
 
 def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
-    """Draw an episode's steady wind: level, from any side."""
+    """Draw an episode's steady horizontal wind from a random direction."""
     if not greatest_m_s:
         return Vector(0.0, 0.0, 0.0)
     speed_m_s = random.uniform(0.0, greatest_m_s)
@@ -49,19 +49,19 @@ def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
 def start_on_line(
     random: np.random.Generator, plant: int, command: tuple[float, float, float], wind: Vector
 ) -> Flight:
-    """Hover near the first point, then fly for 5 s at a command, m/s."""
+    """Return a flight after 5 s at a command, m/s, from hovering near the first point."""
     noise = random.uniform(-FIRST_POINT_NOISE_M, FIRST_POINT_NOISE_M, 3)
     position = Vector(*(POINTS_M[0] + noise).tolist())
     return approach(plant, position, Vector(*command), wind)
 
 
 def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
-    """Start near a place on the line, along it, at a speed that steps of 0.5 m/s can reach."""
+    """Return a flight near a random place on the line, along it, in multiples of 0.5 m/s."""
     along_m = float(random.uniform(0.0, LENGTH_M - LAST_START_M))
     point = point_on_line(along_m)
     speed_m_s = random.uniform(0.0, MAX_SPEED_M_S)
     steps = np.rint(speed_m_s * TANGENTS[nearest_on_line(point).leg] / VELOCITY_STEP_M_S)
-    # At most NOISE_M away in all, since each axis has its share.
+    # The offset on each axis is scaled so that its length is at most NOISE_M.
     noise = random.uniform(-NOISE_M, NOISE_M, 3) / np.sqrt(3.0)
     position = Vector(*np.add(point, noise).tolist())
     return begin(position, Vector(*(VELOCITY_STEP_M_S * steps).tolist()), wind)
@@ -71,7 +71,8 @@ def flight_from(options: dict[str, Any], wind: Vector, classic: bool) -> Flight:
     """Read a start from the options of `reset`.
 
     Raises:
-        UsageError: there is another option, or the pose is malformed, too fast, or not free.
+        UsageError: There is another option, or the pose is malformed, too fast, or would end the
+            episode at once.
     """
     pose = read_pose(options, POSE_NAMES, least=3)
     position, velocity = Vector(*pose[:3]), Vector(*pose[3:])

@@ -1,6 +1,6 @@
-"""The powerline sim from above, and from the side along the line in a strip below.
+"""Top view of the powerline sim, with a side view along the line in a strip below.
 
-From above, x (north) points right and y (west) up, as in the ROS axes of the scene.
+In the top view, x (north) points right and y (west) up, as in the ROS axes of the scene.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from mcaprl.sims.drawing.canvas import rgb
 from mcaprl.sims.drawing.follow_view import SIDE_PX, Body, FollowView
 from mcaprl.sims.geometry.vectors import norm
 from mcaprl.sims.powerline import scene
-from mcaprl.sims.powerline.rules import DECISION_S, Flight
-from mcaprl.sims.powerline.world import (
+from mcaprl.sims.powerline.course import (
     ALONG_M,
     CHORDS,
     LENGTH_M,
@@ -29,6 +28,7 @@ from mcaprl.sims.powerline.world import (
     point_on_line,
     towers,
 )
+from mcaprl.sims.powerline.rules import DECISION_S, Flight
 
 Floats = NDArray[np.float64]
 
@@ -37,20 +37,20 @@ STRIP_TOP_PX, STRIP_BOTTOM_PX = 430, SIDE_PX - 34
 STRIP_M = 180.0
 """Length of the line in the strip; heights have the same scale."""
 DRONE_DOWN_PX = 45
-"""Place of the drone in the strip, from its top."""
+"""Distance of the drone from the top of the strip."""
 _SKY = (158, 188, 212)
 _GROUND = (88, 112, 74)
 _SAMPLE_M = 2.0
 
 
 class PowerlineView:
-    """Draws one picture for each step, and shows it in a window in mode `human`."""
+    """Renderer of one image for each step, which mode `human` shows in a window."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"]) -> None:
-        """Prepare the parts of the picture that never change.
+        """Prepare the shapes that never change.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
         frames_per_s = round(1.0 / DECISION_S)
         floor = scene.ground_shapes()
@@ -60,12 +60,12 @@ class PowerlineView:
     def draw(
         self, flight: Flight, trail_m: Sequence[tuple[float, ...]], reward: float
     ) -> NDArray[np.uint8]:
-        """Draw the drone where it is, and give the picture, (600, 600, 3).
+        """Render the drone and its surroundings, (600, 600, 3).
 
         Args:
-            flight: now.
-            trail_m: the last positions, NED; at least one.
-            reward: of the last step.
+            flight: State of the drone.
+            trail_m: Last positions of the drone, NED; at least one.
+            reward: Reward of the last step.
         """
         drone = flight.drone
         x_m, y_m, z_m = scene.ros(drone.position_m)
@@ -84,7 +84,7 @@ class PowerlineView:
         self._view.close()
 
     def _draw_strip(self, place: Place, height_m: float) -> None:
-        """Draw the line from its side, with the drone where it is on it."""
+        """Draw the side view of the line and the drone."""
         draw = self._view.canvas.pygame.draw
         box_px = (0, STRIP_TOP_PX, SIDE_PX, STRIP_BOTTOM_PX - STRIP_TOP_PX)
         strip = self._view.canvas.strip(box_px, _SKY)
@@ -109,13 +109,13 @@ class PowerlineView:
 
 
 def _ground_under(along_m: Floats) -> Floats:
-    """Give the ground's heights (N,) under points of the line."""
+    """Return the heights (N,) of the ground below points of the line."""
     points = [point_on_line(along) for along in along_m]
     return np.array([ground_height(point.x, point.y) for point in points])
 
 
 def _middle_wire() -> tuple[Floats, Floats]:
-    """Give places along the line and heights of the middle conductor, from end to end."""
+    """Return distances along the line, and heights of the middle conductor there."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     spans = WIRES_M[len(PHASES_M) // 2 :: len(PHASES_M)]
     along_m = ALONG_M[:-1, None] + shares * np.diff(ALONG_M)[:, None]

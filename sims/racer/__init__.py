@@ -1,1 +1,14 @@
-"""The ray-cast racer, `mcaprl/Racer-v0`."""
+"""The car that races by its rays, `mcaprl/Racer-v0`."""
+
+from mcaprl.sims.spec import SimSpec
+
+SPEC = SimSpec(
+    name="racer",
+    env_id="mcaprl/Racer-v0",
+    entry_point="mcaprl.sims.racer.env:RacerEnv",
+    vector_entry_point="mcaprl.sims.racer.env:BatchedRacerEnv",
+    # The limit of the classic rules; episodes of the default rules end earlier.
+    max_episode_steps=10_000,
+    pilot="mcaprl.sims.racer.pilot:RacerPilot",
+    engine="numba",
+)

@@ -1,6 +1,6 @@
-"""One car of the racer sim: its state, its corners, and how it is put on a track.
+"""Car of the racer sim: its state, its corners, and its placement on a track.
 
-Pixels and angles are those of the picture: y points down, so angles grow clockwise.
+Pixels and angles are those of the image: y points down, so angles are clockwise.
 """
 
 from __future__ import annotations
@@ -13,45 +13,45 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import project, wrap_angle
-from mcaprl.sims.racer.track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track
+from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 
 CAR_LENGTH_PX, CAR_WIDTH_PX = 30.0, 14.0
 
 
-class Racer(NamedTuple):
-    """The whole state of one car; a row of a (cars, 12) array holds the same."""
+class Car(NamedTuple):
+    """State of one car, stored as a row of a (cars, 12) array."""
 
     x_px: float
     y_px: float
     heading_rad: float
-    """Clockwise from the picture's x, in [-pi, pi)."""
+    """Heading clockwise from the image's x, in [-pi, pi)."""
     course_rad: float
-    """Direction of travel; the heading, unless the car drifts."""
+    """Direction of travel; equals the heading unless the car drifts."""
     speed_px: float
-    """Along the course, pixels a step; negative backwards."""
+    """Speed along the course, pixels per step; negative backward."""
     next_gate: float
     gates: float
-    """How many were passed since the start."""
+    """Number of gates passed since the start."""
     idle_steps: float
-    """Steps since the last gate."""
+    """Number of steps since the last gate."""
     steps: float
-    """Since the start."""
+    """Number of steps since the start."""
     along_m: float
-    """Distance of the nearest path point along the path; grows beyond one lap."""
+    """Distance of the nearest path point along the path, counted over all laps."""
     offset_m: float
     """Distance from the path, left positive."""
     heading_error_rad: float
-    """Of the heading from the path's direction, counter-clockwise, in [-pi, pi)."""
+    """Heading relative to the path's direction, counter-clockwise, in [-pi, pi)."""
 
 
-STARTED_AT = len(Racer._fields)
-"""Where a row has, behind all that, how far along the path the car was at its start."""
+STARTED_AT = len(Car._fields)
+"""Index in a row of the car's distance along the path at its start; it follows the `Car`."""
 
 
 @compiled
-def racer_at(row: NDArray[np.float64]) -> Racer:
+def car_at(row: NDArray[np.float64]) -> Car:
     """Read a car from a row of 12 floats."""
-    return Racer(
+    return Car(
         row[0],
         row[1],
         row[2],
@@ -68,7 +68,7 @@ def racer_at(row: NDArray[np.float64]) -> Racer:
 
 
 @compiled
-def store_racer(car: Racer, row: NDArray[np.float64]) -> None:
+def store_car(car: Car, row: NDArray[np.float64]) -> None:
     """Write a car into a row of 12 floats."""
     for i, value in enumerate(car):
         row[i] = value
@@ -77,13 +77,13 @@ def store_racer(car: Racer, row: NDArray[np.float64]) -> None:
 @compiled
 def placed(
     track: Track, x_px: float, y_px: float, heading_rad: float, speed_px: float, near_m: float
-) -> Racer:
-    """Put a car on a track at rest in time: no steps taken, its next gate the first one ahead.
+) -> Car:
+    """Return a car on a track before its first step; its next gate is the first one ahead.
 
-    Its place on the path is looked for within half a lap of `near_m`.
+    Its place on the path is searched within half a lap of `near_m`.
     """
     half_lap_m = 0.5 * track.path.length_m
-    x_m, y_m = METRES_PER_PX * x_px, METRES_PER_PX * (PICTURE_HEIGHT_PX - y_px)
+    x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
     place = project(track.path, x_m, y_m, near_m - half_lap_m, near_m + half_lap_m)
     along_m, count = place.along_m % track.path.length_m, len(track.gates_px)
     gate = int(along_m / track.path.length_m * count) % count
@@ -91,7 +91,7 @@ def placed(
         gate = (gate + 1) % count
     error_rad = wrap_angle(-heading_rad - place.yaw_rad)
     heading_rad = wrap_angle(heading_rad)
-    return Racer(
+    return Car(
         x_px,
         y_px,
         heading_rad,
@@ -109,14 +109,14 @@ def placed(
 
 @compiled
 def is_beyond(x_px: float, y_px: float, gate: NDArray[np.float64]) -> bool:
-    """Say whether a point is ahead of the line through a gate (4,), in the direction of travel."""
+    """Return whether a point is beyond the line through a gate (4,), in the direction of travel."""
     across_x, across_y = gate[2] - gate[0], gate[3] - gate[1]
     return bool(across_x * (y_px - gate[1]) - across_y * (x_px - gate[0]) < 0.0)
 
 
 @compiled
-def corner_at(car: Racer, forward: float, right: float) -> tuple[float, float]:
-    """Give a corner of the car: `forward` 1 is the front, `right` 1 the right side; -1 others."""
+def corner_at(car: Car, forward: float, right: float) -> tuple[float, float]:
+    """Return a corner of the car: `forward` is 1 or -1 (rear), `right` is 1 or -1 (left)."""
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     ahead, aside = 0.5 * CAR_LENGTH_PX * forward, 0.5 * CAR_WIDTH_PX * right
     return car.x_px + ahead * cos - aside * sin, car.y_px + ahead * sin + aside * cos

@@ -1,4 +1,4 @@
-"""N cars of the racer sim as arrays: starts, steps and observations."""
+"""Fleet of the racer sim: starts, steps and observations of N cars."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.compiled import ready
-from mcaprl.sims.racer.car import STARTED_AT, Racer, store_racer
+from mcaprl.sims.racer.car import STARTED_AT, Car, store_car
+from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track, make_track
 from mcaprl.sims.racer.rules import (
     ACTION_MEANINGS,
     OBSERVATION_NAMES,
     REASONS,
     STEP_S,
     TRUNCATES,
-    Told,
+    StepResult,
+    car_info,
     observe,
-    step_only_racer,
-    step_racers,
-    tell_racers,
+    step_cars,
+    step_only_car,
 )
-from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, racer_from, start_racer
-from mcaprl.sims.racer.track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track, make_track
+from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_car
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
@@ -37,7 +37,7 @@ ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9
 
 
 class RacerFleet(Fleet):
-    """N cars on one track; see `RacerEnv`, whose arguments it has."""
+    """N cars on one track; arguments as in `RacerEnv`."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = TRUNCATES
@@ -52,11 +52,11 @@ class RacerFleet(Fleet):
         drift: bool = False,
         track_seed: int | None = None,
     ) -> None:
-        """Make N cars; each is to be started by `begin`.
+        """Allocate N cars; `begin` starts them.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
-            UsageError: the track's seed is not a whole number of 0 or more.
+            UnknownNameError: An argument has a value that is not in its list.
+            UsageError: The track's seed is not an integer of at least 0.
         """
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
@@ -76,21 +76,21 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        # By what chance a car is started.
+        # Random numbers of a single start; their count selects the kind of start.
         self._shares = np.zeros(ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
 
-    def car(self, i: int) -> Racer:
-        """Give the whole state of a car."""
-        return Racer._make(self._cars[i, :STARTED_AT].tolist())
+    def car(self, i: int) -> Car:
+        """Return the state of a car."""
+        return Car._make(self._cars[i, :STARTED_AT].tolist())
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `RacerEnv`."""
         if options:
-            car, row = racer_from(self.track, options), self._cars[i]
-            store_racer(car, row)
+            car, row = car_from(self.track, options), self._cars[i]
+            store_car(car, row)
             row[STARTED_AT] = car.along_m
             observe(self.track, car, self.classic, self._seen[i])
         else:
@@ -99,16 +99,16 @@ class RacerFleet(Fleet):
         self.rewards[i], self.ends[i], self.last_actions[i] = 0.0, GOING_ON, 0
 
     def advance(self) -> None:
-        """Drive on for one step."""
+        """Advance all cars by one step."""
         self.action_set.take(self.actions, out=self.last_actions, mode="clip")
         self._step()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Drive on with the only car: all that is told of its state comes in one call."""
+        """Advance the only car; one call returns reward, end and `info`."""
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
             self._numbers[action]
         )
-        # As `_named`, which would be one more call.
+        # As in `_named`, without the cost of a call.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -119,7 +119,7 @@ class RacerFleet(Fleet):
         return self._observe_only(), reward, end, info
 
     def _kernel(self) -> tuple[Any, ...]:
-        return step_racers, *self._arguments
+        return step_cars, *self._arguments
 
     @property
     def _arguments(self) -> tuple[Any, ...]:
@@ -129,13 +129,13 @@ class RacerFleet(Fleet):
     @cached_property
     def _start_one(self) -> Callable[[int], None]:
         arrays = (self._shares, self._cars, self._seen)
-        return ready(start_racer, self.track, self.classic, *arrays, examples=(0,))
+        return ready(start_car, self.track, self.classic, *arrays, examples=(0,))
 
-    # Of a fleet of one, what its steps call.
+    # The following functions serve a fleet of one car.
 
     @cached_property
-    def _drive_only(self) -> Callable[[int], Told]:
-        return ready(step_only_racer, *self._arguments, examples=(0,))
+    def _drive_only(self) -> Callable[[int], StepResult]:
+        return ready(step_only_car, *self._arguments, examples=(0,))
 
     @cached_property
     def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
@@ -143,38 +143,38 @@ class RacerFleet(Fleet):
         return copy
 
     def observation(self, i: int) -> NDArray[np.float32]:
-        """Give the numbers that car i sees."""
+        """Return the numbers that car i observes."""
         seen: NDArray[np.float32] = self._seen[i].copy()
         return seen
 
     def observations(self) -> NDArray[np.float32]:
-        """Give what all cars see."""
+        """Return the observations of all cars."""
         return self._seen.copy()
 
     def places(self) -> NDArray[np.float64]:
-        """Give where all are, (N, 2) x and y in the map, metres."""
+        """Return the positions of all cars, (N, 2) x and y in the map, meters."""
         x_px, y_px = self._cars[:, 0], self._cars[:, 1]
-        return METRES_PER_PX * np.column_stack([x_px, PICTURE_HEIGHT_PX - y_px])
+        return METERS_PER_PX * np.column_stack([x_px, IMAGE_HEIGHT_PX - y_px])
 
     def info(self, i: int) -> dict[str, Any]:
-        """Give the `info` of car i."""
-        told = np.empty((5, 1))
-        tell_racers(self._cars[i : i + 1], told)
-        offset_m, heading_error_rad, speed_m_s, progress_m, gates = told[:, 0].tolist()
+        """Return the `info` of car i."""
+        values = np.empty((5, 1))
+        car_info(self._cars[i : i + 1], values)
+        offset_m, heading_error_rad, speed_m_s, progress_m, gates = values[:, 0].tolist()
         return _named(offset_m, heading_error_rad, speed_m_s, progress_m, int(gates))
 
     def infos(self) -> dict[str, NDArray[Any]]:
-        """Give the `info` of all cars."""
-        told = np.empty((5, self.count))
-        tell_racers(self._cars, told)
-        offset_m, heading_error_rad, speed_m_s, progress_m, gates = told
+        """Return the `info` of all cars."""
+        values = np.empty((5, self.count))
+        car_info(self._cars, values)
+        offset_m, heading_error_rad, speed_m_s, progress_m, gates = values
         return _named(offset_m, heading_error_rad, speed_m_s, progress_m, gates.astype(np.int64))
 
 
 def _named(
     offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any, gates: Any
 ) -> dict[str, Any]:
-    """Name what is told of a car, or of all."""
+    """Return the `info` of one car or of all cars."""
     return {
         "lateral_offset_m": offset_m,
         "heading_error_rad": heading_error_rad,
@@ -186,5 +186,5 @@ def _named(
 
 def _track_of(seed: int | None) -> Track:
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
-        raise UsageError(f"track_seed is None or a whole number of 0 or more, not {seed!r}")
+        raise UsageError(f"track_seed must be None or an integer of at least 0, not {seed!r}")
     return make_track(seed)

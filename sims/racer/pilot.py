@@ -1,44 +1,43 @@
-"""The scripted driver of the racer sim: steer to where there is room, slow down where not."""
+"""Pilot of the racer sim: it steers toward free space and slows down where there is little."""
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
-from mcaprl.sims.racer.car import Racer
+from mcaprl.sims.racer.car import Car
+from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
-from mcaprl.sims.racer.rays import CENTRE_RAYS, CENTRE_RAYS_RAD, RAYS, measure
+from mcaprl.sims.racer.rays import CENTER_RAYS, CENTER_RAYS_RAD, RAYS, measure
 from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TURN
-from mcaprl.sims.racer.track import Track
-from mcaprl.sims.vehicle.arguments import check_one
+from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 ROOM_EXPONENT = 1.17
-"""How much more a long ray counts than a short one."""
+"""Exponent of a ray's length in its weight."""
 TURN_BEYOND_RAD = math.radians(7.5)
-"""Half of what one action turns."""
+"""Half of the turn of one action."""
 STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
-"""The speed is in proportion to the free way ahead, less 38.5 pixels, and never below 2."""
+"""The speed is 0.296 times the free distance ahead beyond 38.5 pixels, and at least 2."""
 
 
 @compiled
-def choose(track: Track, car: Racer, allowed: NDArray[np.int64], classic: bool) -> int:
-    """Choose one of the allowed actions by the rays that look ahead, up to 90 degrees.
+def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
+    """Choose one of the allowed actions by the forward rays, up to 90 degrees to each side.
 
-    Their mean direction, weighted by the lengths, says where to turn; the one straight ahead says
-    how fast to drive. Turning comes first where an action cannot do both.
+    Their mean direction, weighted by their lengths, decides the turn; the ray straight ahead
+    decides the speed. If no action does both, the turn has priority.
     """
     lengths_px = np.empty(RAYS)
     measure(track.walls_px, car, False, lengths_px)
     weights, moments = 0.0, 0.0
-    for i in range(CENTRE_RAYS):
-        if abs(CENTRE_RAYS_RAD[i]) <= 0.5 * math.pi:
+    for i in range(CENTER_RAYS):
+        if abs(CENTER_RAYS_RAD[i]) <= 0.5 * math.pi:
             weight = lengths_px[i] ** ROOM_EXPONENT
             weights += weight
-            moments += weight * CENTRE_RAYS_RAD[i]
+            moments += weight * CENTER_RAYS_RAD[i]
     aim_rad = moments / weights
     turn = 0 if abs(aim_rad) <= TURN_BEYOND_RAD else int(math.copysign(1.0, aim_rad))
     wanted_px = min(max((lengths_px[0] - STOP_PX) * SPEED_PER_PX, SLOWEST_PX), MAX_SPEED_PX)
@@ -54,22 +53,11 @@ def choose(track: Track, car: Racer, allowed: NDArray[np.int64], classic: bool) 
     return int(best)
 
 
-class RacerPilot:
-    """Drives the car of one environment, whose state it reads."""
+class RacerPilot(ScriptedPilot[RacerEnv]):
+    """Driver of one racer sim's car."""
 
-    name: ClassVar[str] = "pilot"
-
-    def __init__(self, sim: RacerEnv) -> None:
-        """Take the wheel of `sim`."""
-        self._sim = sim
-
-    def act(self, observations: NDArray[np.generic]) -> NDArray[np.int64]:
-        """Give the action, shape (1,), for the car as it is now.
-
-        Raises:
-            ValueError: there are observations of more than one environment.
-        """
-        check_one(observations)
-        fleet = self._sim.fleet
-        chosen = choose(fleet.track, self._sim.car, fleet.action_set, fleet.classic)
-        return np.flatnonzero(fleet.action_set == chosen)
+    def choose(self) -> int:
+        """Choose the action for the current state of the car."""
+        fleet = self.sim.fleet
+        chosen = choose(fleet.track, self.sim.car, fleet.action_set, fleet.classic)
+        return int(np.flatnonzero(fleet.action_set == chosen)[0])

@@ -1,4 +1,4 @@
-"""What a car of the racer sim sees: the lengths of 18 rays to the walls."""
+"""Ray observation of the racer sim: the lengths of 18 rays to the walls."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import heading_of
 from mcaprl.sims.geometry.ray_code import FAR_M
-from mcaprl.sims.racer.car import Racer, corner_at
-from mcaprl.sims.racer.track import METRES_PER_PX
+from mcaprl.sims.racer.car import Car, corner_at
+from mcaprl.sims.racer.course import METERS_PER_PX
 
-FAR_PX = FAR_M / METRES_PER_PX
+FAR_PX = FAR_M / METERS_PER_PX
 JOINT = 1e-9
-"""Walls are longer by this share at both ends, so that no ray slips through between two."""
-CENTRE_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
-"""Directions of the rays from the car's centre; right is positive."""
-CENTRE_RAYS_RAD = tuple(math.radians(angle) for angle in CENTRE_RAYS_DEG)
-_COS: NDArray[np.float64] = np.cos(CENTRE_RAYS_RAD)
-_SIN: NDArray[np.float64] = np.sin(CENTRE_RAYS_RAD)
-CENTRE_RAYS = len(CENTRE_RAYS_DEG)
-RAYS = CENTRE_RAYS + 4
+"""Share by which walls are extended at both ends, so that no ray passes between two of them."""
+CENTER_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
+"""Directions of the rays from the car's center; right is positive."""
+CENTER_RAYS_RAD = tuple(math.radians(angle) for angle in CENTER_RAYS_DEG)
+_COS: NDArray[np.float64] = np.cos(CENTER_RAYS_RAD)
+_SIN: NDArray[np.float64] = np.sin(CENTER_RAYS_RAD)
+CENTER_RAYS = len(CENTER_RAYS_DEG)
+RAYS = CENTER_RAYS + 4
 RAY_NAMES = (
     "ahead",
     "left_30",
@@ -49,18 +49,19 @@ RAY_NAMES = (
 def crossing(
     x: float, y: float, dx: float, dy: float, line: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Find where the line through two points meets another.
+    """Return where the line through two points intersects another line.
 
     Args:
-        x: of the first point.
-        y: of the first point.
-        dx: from the first point to the second.
-        dy: from the first point to the second.
+        x: x of the first point.
+        y: y of the first point.
+        dx: x from the first point to the second.
+        dy: y from the first point to the second.
         line: (4,) x1, y1, x2, y2.
 
     Returns:
-        The shares of the way from the first point to the second, and along `line`; both lie
-        between 0 and 1 where the segments cross. Infinite for parallels.
+        Position of the intersection as a share of the way from the first point to the second, and
+        as a share of `line`; both are between 0 and 1 if the segments intersect. Infinite for
+        parallel lines.
     """
     ex, ey = line[2] - line[0], line[3] - line[1]
     cross = dx * ey - dy * ex
@@ -71,20 +72,20 @@ def crossing(
 
 
 @compiled
-def aim(car: Racer, classic: bool, rays: NDArray[np.float64]) -> None:
-    """Write a car's rays (4, 18): where each starts, x and y, and from there to 1000 pixels away.
+def aim(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
+    """Write a car's rays (4, 18): x and y of the start, and the vector to the end 1000 pixels away.
 
-    The left corner's sideways ray looks to the left; in the classic rules across the car's nose.
+    The left corner's sideways ray points to the left; in the classic rules, across the car's nose.
     """
     cos, sin = heading_of(car.heading_rad)
-    for ray in range(CENTRE_RAYS):
+    for ray in range(CENTER_RAYS):
         rays[0, ray], rays[1, ray] = car.x_px, car.y_px
         rays[2, ray] = FAR_PX * (cos * _COS[ray] - sin * _SIN[ray])
         rays[3, ray] = FAR_PX * (sin * _COS[ray] + cos * _SIN[ray])
     for corner in range(2):
         right = 2.0 * corner - 1.0
         side = -right if classic else right
-        sideways, ahead = CENTRE_RAYS + corner, CENTRE_RAYS + 2 + corner
+        sideways, ahead = CENTER_RAYS + corner, CENTER_RAYS + 2 + corner
         x_px, y_px = corner_at(car, 1.0, right)
         rays[0, sideways], rays[1, sideways] = x_px, y_px
         rays[0, ahead], rays[1, ahead] = x_px, y_px
@@ -96,15 +97,15 @@ def aim(car: Racer, classic: bool, rays: NDArray[np.float64]) -> None:
 def cast(
     walls: NDArray[np.float64], rays: NDArray[np.float64], shares: NDArray[np.float64]
 ) -> None:
-    """Find where rays first meet a wall.
+    """Compute where rays first hit a wall.
 
-    As `crossing` has it, for all rays at once: without a branch, so that the compiler can do
-    several together. Parallels give inf or NaN, which are in no interval.
+    The equations are those of `crossing`, without branches, so that the compiler can vectorize the
+    loop over rays. Parallel lines result in inf or NaN, which fail the comparisons.
 
     Args:
-        walls: (W, 4).
-        rays: (4, R) as `aim` writes them.
-        shares: (R,) to be filled with the share of each ray's length; 1 without a wall.
+        walls: (W, 4) walls.
+        rays: (4, R) rays as written by `aim`.
+        shares: (R,) output: hit as a share of the ray's length; 1 without a hit.
     """
     x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
     shares[:] = 1.0
@@ -122,8 +123,11 @@ def cast(
 
 
 @compiled
-def floored_distance(car: Racer, line: NDArray[np.float64], share: float) -> float:
-    """Give the distance from a car's centre to the pixel at a share of the way along a line."""
+def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float:
+    """Return the distance from a car's center to a point of a line, rounded down to whole pixels.
+
+    The point is given as a share of the line's length.
+    """
     hit_x = math.floor(line[0] + share * (line[2] - line[0]))
     hit_y = math.floor(line[1] + share * (line[3] - line[1]))
     return math.hypot(hit_x - car.x_px, hit_y - car.y_px)
@@ -131,11 +135,11 @@ def floored_distance(car: Racer, line: NDArray[np.float64], share: float) -> flo
 
 @compiled
 def floored_ray_length(
-    walls: NDArray[np.float64], car: Racer, rays: NDArray[np.float64], ray: int
+    walls: NDArray[np.float64], car: Car, rays: NDArray[np.float64], ray: int
 ) -> float:
-    """Give the classic length of a ray: from the car's centre to the nearest floored hit.
+    """Return the classic length of a ray: the distance from the car's center to the nearest hit.
 
-    Hits are floored to whole pixels before they are compared; without a hit it is 1000.
+    Hits are rounded down to whole pixels before they are compared; without a hit it is 1000.
     """
     nearest = math.inf
     for wall in walls:
@@ -147,9 +151,9 @@ def floored_ray_length(
 
 @compiled
 def measure(
-    walls: NDArray[np.float64], car: Racer, classic: bool, lengths_px: NDArray[np.float64]
+    walls: NDArray[np.float64], car: Car, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays; the classic ones are all from its centre."""
+    """Write the lengths (18,) of the car's rays; classic lengths are all from the car's center."""
     rays = np.empty((4, RAYS))
     aim(car, classic, rays)
     if classic:
@@ -161,8 +165,8 @@ def measure(
             lengths_px[ray] *= FAR_PX
 
 
-def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
-    """Give the rays as lines (18, 2, 2) from their start to the wall, x and y in pixels."""
+def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
+    """Return the rays as lines (18, start and end, x and y) to the walls, pixels."""
     rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
     aim(car, False, rays)
     cast(walls, rays, shares)
@@ -172,5 +176,5 @@ def ray_ends(walls: NDArray[np.float64], car: Racer) -> NDArray[np.float64]:
 
 @compiled
 def classic_code(length_px: float) -> float:
-    """Pack a length into (1000 px - d) / 1000 px: 1 is near."""
+    """Encode a length as (1000 px - d) / 1000 px: 1 is near."""
     return (FAR_PX - length_px) / FAR_PX

@@ -1,6 +1,6 @@
-"""The equations of the racer sim: one step of a car between walls, for one car or many.
+"""Equations of the racer sim, default and classic: motion, rewards, ends and observations of a car.
 
-Pixels and angles are those of the picture: y points down, so angles grow clockwise.
+Pixels and angles are those of the image: y points down, so angles are clockwise.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from mcaprl.sims.geometry.ray_code import log_code
 from mcaprl.sims.racer.car import (
     CAR_LENGTH_PX,
     CAR_WIDTH_PX,
-    Racer,
+    Car,
+    car_at,
     corner_at,
-    racer_at,
-    store_racer,
+    store_car,
 )
+from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rays import (
     RAY_NAMES,
     RAYS,
@@ -29,7 +30,6 @@ from mcaprl.sims.racer.rays import (
     floored_distance,
     measure,
 )
-from mcaprl.sims.racer.track import METRES_PER_PX, PICTURE_HEIGHT_PX, Track
 
 ACTION_MEANINGS = (
     "none",
@@ -44,23 +44,23 @@ ACTION_MEANINGS = (
 )
 THROTTLE = (0, 1, 0, 0, -1, -1, -1, 1, 1)
 TURN = (0, 0, -1, 1, 0, 1, -1, -1, 1)
-"""Right is positive."""
+"""Turn of each action; right is positive."""
 
 STEP_S = 0.1
 TURN_RAD = math.radians(15.0)
 SPEED_CHANGE_PX = 2.0
 MAX_SPEED_PX = 10.0
-MAX_SPEED_M_S = MAX_SPEED_PX * METRES_PER_PX / STEP_S
+MAX_SPEED_M_S = MAX_SPEED_PX * METERS_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
-"""A drifting car's course turns by at most this at its top speed, and more when it is slower."""
+"""Approximate maximum turn of a drifting car's course in a step at top speed; more if slower."""
 
 BEHIND_M, AHEAD_M = 4.0, 8.0
-"""How far behind and ahead of the last nearest path point the next one is looked for."""
+"""Search window of the nearest path point, relative to the last one."""
 
 CORNER_PX_2 = 0.25 * (CAR_LENGTH_PX**2 + CAR_WIDTH_PX**2)
-"""Square of a corner's distance from the car's centre."""
+"""Squared distance of a corner from the car's center."""
 LOOK_PX, NEAR_GATE_PX = 50.0, 20.0
-"""Classic: a gate is passed when the car looks at it, so far at most, from nearer than this."""
+"""Classic rules: length of the ray that must hit a gate, and maximum distance of the hit."""
 MAX_IDLE_STEPS = 100
 MAX_STEPS = 1_000
 MAX_STEPS_CLASSIC = 10_000
@@ -73,8 +73,8 @@ OBSERVATION_NAMES = (*RAY_NAMES, "speed")
 
 
 @compiled
-def walls_hit(track: Track, car: Racer) -> int:
-    """Count the walls that cut an edge of the car."""
+def walls_hit(track: Track, car: Car) -> int:
+    """Return the number of walls that intersect an edge of the car."""
     count = 0
     corners = (
         corner_at(car, 1.0, -1.0),
@@ -86,7 +86,7 @@ def walls_hit(track: Track, car: Racer) -> int:
         along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
         away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
         if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
-            # The whole line of the wall is farther than any corner.
+            # The line through the wall is farther away than any corner.
             continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
@@ -98,10 +98,10 @@ def walls_hit(track: Track, car: Racer) -> int:
 
 
 @compiled
-def drive(track: Track, car: Racer, action: int, classic: bool, drift: bool) -> Racer:
-    """Carry out one action, and take note of a gate passed.
+def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Car:
+    """Return the car after one action, with a passed gate counted.
 
-    In the classic rules forward is against the rays' own forward, and back along it.
+    In the classic rules, forward and back are swapped.
     """
     throttle = -THROTTLE[action] if classic else THROTTLE[action]
     speed_px = min(max(car.speed_px + SPEED_CHANGE_PX * throttle, -MAX_SPEED_PX), MAX_SPEED_PX)
@@ -113,9 +113,9 @@ def drive(track: Track, car: Racer, action: int, classic: bool, drift: bool) -> 
         course_rad = wrap_angle(car.course_rad + min(max(turn_rad, -limit_rad), limit_rad))
     x_px = car.x_px + speed_px * math.cos(course_rad)
     y_px = car.y_px + speed_px * math.sin(course_rad)
-    x_m, y_m = METRES_PER_PX * x_px, METRES_PER_PX * (PICTURE_HEIGHT_PX - y_px)
+    x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
     place = project(track.path, x_m, y_m, car.along_m - BEHIND_M, car.along_m + AHEAD_M)
-    moved = Racer(
+    moved = Car(
         x_px,
         y_px,
         heading_rad,
@@ -133,13 +133,13 @@ def drive(track: Track, car: Racer, action: int, classic: bool, drift: bool) -> 
 
 
 @compiled
-def _with_gate(track: Track, before: Racer, after: Racer, classic: bool) -> Racer:
-    """Count the next gate, if the step has passed it."""
+def _with_gate(track: Track, before: Car, after: Car, classic: bool) -> Car:
+    """Return the car after a step with the next gate counted if the step passed it."""
     gate = track.gates_px[int(after.next_gate)]
     passed = sees_gate(after, gate) if classic else crosses_gate(before, after, gate)
     if not passed:
         return after
-    return Racer(
+    return Car(
         after.x_px,
         after.y_px,
         after.heading_rad,
@@ -156,16 +156,16 @@ def _with_gate(track: Track, before: Racer, after: Racer, classic: bool) -> Race
 
 
 @compiled
-def crosses_gate(before: Racer, after: Racer, gate: NDArray[np.float64]) -> bool:
-    """Say whether the car's centre moved over a gate (4,)."""
+def crosses_gate(before: Car, after: Car, gate: NDArray[np.float64]) -> bool:
+    """Return whether the car's center crossed a gate (4,) in a step."""
     dx, dy = after.x_px - before.x_px, after.y_px - before.y_px
     share, along_gate = crossing(before.x_px, before.y_px, dx, dy, gate)
     return 0.0 < share <= 1.0 and 0.0 <= along_gate <= 1.0
 
 
 @compiled
-def sees_gate(car: Racer, gate: NDArray[np.float64]) -> bool:
-    """Say whether the classic rules call a gate (4,) passed: it is ahead, and within 20 pixels."""
+def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
+    """Return whether a gate (4,) is passed by the classic rules: it is ahead within 20 pixels."""
     dx, dy = LOOK_PX * math.cos(car.course_rad), LOOK_PX * math.sin(car.course_rad)
     share, along_gate = crossing(car.x_px, car.y_px, dx, dy, gate)
     if not (0.0 < share < 1.0 and 0.0 < along_gate < 1.0):
@@ -174,10 +174,10 @@ def sees_gate(car: Racer, gate: NDArray[np.float64]) -> bool:
 
 
 @compiled
-def judge(track: Track, before: Racer, after: Racer, classic: bool) -> tuple[float, int]:
-    """Give a step's reward, and how the episode ends: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
+def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[float, int]:
+    """Return a step's reward and end: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
 
-    +1 for a gate, -1 for a crash; in the classic rules -1 for each wall that is hit.
+    The reward is +1 for a gate and -1 for a crash; in the classic rules -1 for each wall hit.
     """
     hits = walls_hit(track, after)
     reward = after.gates - before.gates
@@ -191,19 +191,19 @@ def judge(track: Track, before: Racer, after: Racer, classic: bool) -> tuple[flo
 
 
 @compiled
-def observe(track: Track, car: Racer, classic: bool, observation: NDArray[np.float32]) -> None:
-    """Write the 19 observed numbers; see the table of `RacerEnv`."""
+def observe(track: Track, car: Car, classic: bool, observation: NDArray[np.float32]) -> None:
+    """Write the 19 observed numbers; see "Observation Space" of `RacerEnv`."""
     lengths_px = np.empty(RAYS)
     measure(track.walls_px, car, classic, lengths_px)
     for i in range(RAYS):
         length_px = lengths_px[i]
-        code = classic_code(length_px) if classic else log_code(METRES_PER_PX * length_px)
+        code = classic_code(length_px) if classic else log_code(METERS_PER_PX * length_px)
         observation[i] = code
     observation[RAYS] = (-car.speed_px if classic else car.speed_px) / MAX_SPEED_PX
 
 
 @compiled
-def step_racers(
+def step_cars(
     track: Track,
     cars: NDArray[np.float64],
     actions: NDArray[np.int64],
@@ -213,31 +213,31 @@ def step_racers(
     classic: bool,
     drift: bool,
 ) -> None:
-    """Advance N cars by one step each, in place; they do not meet each other.
+    """Advance N independent cars by one step each, in place.
 
     Args:
-        track: that all drive on.
-        cars: (N, 13) rows that begin with `Racer`.
+        track: Track of all cars.
+        cars: (N, 13) rows that begin with `Car`.
         actions: (N,) 0 to 8.
-        rewards: (N,) to be filled.
-        ends: (N,) to be filled with DRIVING, CRASH, NO_GATE or TIME_LIMIT.
-        observations: (N, 19) to be filled.
-        classic: play by the classic rules.
-        drift: let the course lag behind the heading.
+        rewards: (N,) output.
+        ends: (N,) output: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
+        observations: (N, 19) output.
+        classic: Whether the classic rules apply.
+        drift: Whether the direction of travel lags behind the heading.
     """
     for i in range(len(cars)):
-        before = racer_at(cars[i])
+        before = car_at(cars[i])
         after = drive(track, before, actions[i], classic, drift)
-        rewards[i], ends[i] = judge(track, before, after, classic)
+        rewards[i], ends[i] = outcome_of(track, before, after, classic)
         observe(track, after, classic, observations[i])
-        store_racer(after, cars[i])
+        store_car(after, cars[i])
 
 
-Told = tuple[float, int, float, float, float, float, int]
+StepResult = tuple[float, int, float, float, float, float, int]
 
 
 @compiled
-def step_only_racer(
+def step_only_car(
     track: Track,
     cars: NDArray[np.float64],
     actions: NDArray[np.int64],
@@ -247,34 +247,34 @@ def step_only_racer(
     classic: bool,
     drift: bool,
     action: int,
-) -> Told:
-    """Do as `step_racers` with a single car, and give back all that is told of it.
+) -> StepResult:
+    """Advance a single car as `step_cars` does, and return the contents of its `info` as well.
 
     Returns:
         Reward, end, offset, heading error, speed, progress, and gates passed.
     """
     actions[0] = action
-    step_racers(track, cars, actions, rewards, ends, observations, classic, drift)
-    car = racer_at(cars[0])
-    told = (car.offset_m, car.heading_error_rad, speed_of(car), car.along_m - cars[0, -1])
-    return rewards[0], ends[0], *told, int(car.gates)
+    step_cars(track, cars, actions, rewards, ends, observations, classic, drift)
+    car = car_at(cars[0])
+    info = (car.offset_m, car.heading_error_rad, speed_of(car), car.along_m - cars[0, -1])
+    return rewards[0], ends[0], *info, int(car.gates)
 
 
 @compiled
-def tell_racers(cars: NDArray[np.float64], told: NDArray[np.float64]) -> None:
-    """Put together what is told of N cars.
+def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
+    """Compute the contents of the `info` of N cars.
 
     Args:
-        cars: (N, 13) rows that begin with `Racer`, and end with where the car started.
-        told: (5, N) to be filled with offsets, heading errors, speeds, progress and gates.
+        cars: (N, 13) rows of `Car` and of the place where the car started.
+        info: (5, N) output: offsets, heading errors, speeds, progress and gates.
     """
     for i in range(len(cars)):
-        car = racer_at(cars[i])
-        told[0, i], told[1, i], told[2, i] = car.offset_m, car.heading_error_rad, speed_of(car)
-        told[3, i], told[4, i] = car.along_m - cars[i, -1], car.gates
+        car = car_at(cars[i])
+        info[0, i], info[1, i], info[2, i] = car.offset_m, car.heading_error_rad, speed_of(car)
+        info[3, i], info[4, i] = car.along_m - cars[i, -1], car.gates
 
 
 @compiled
-def speed_of(car: Racer) -> float:
-    """Give a car's speed, m/s; negative backwards."""
-    return car.speed_px * METRES_PER_PX / STEP_S
+def speed_of(car: Car) -> float:
+    """Return a car's speed, m/s; negative backward."""
+    return car.speed_px * METERS_PER_PX / STEP_S

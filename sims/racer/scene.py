@@ -1,4 +1,4 @@
-"""What a 3D viewer shows of the racer sim: track, walls, gates, the car and its rays.
+"""Scene of the racer sim: track, walls, gates, the car and its rays.
 
 Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's middle, x
 forward, y left). One pixel of the rules is 0.1 m here.
@@ -12,18 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.car_parts import part, wheel
 from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
-from mcaprl.sims.racer.car import Racer
-from mcaprl.sims.racer.rays import ray_ends
-from mcaprl.sims.racer.track import (
-    METRES_PER_PX,
-    PICTURE_HEIGHT_PX,
-    PICTURE_WIDTH_PX,
+from mcaprl.sims.drawing.shapes import car_part, ground, label, wheels
+from mcaprl.sims.racer.car import Car
+from mcaprl.sims.racer.course import (
+    IMAGE_HEIGHT_PX,
+    IMAGE_WIDTH_PX,
+    METERS_PER_PX,
     Track,
     asphalt,
     to_map,
 )
+from mcaprl.sims.racer.rays import ray_ends
 
 Floats = NDArray[np.float64]
 
@@ -46,18 +46,12 @@ WHEEL_RADIUS_M, WHEEL_WIDTH_M = 0.3, 0.26
 
 
 def _ground() -> Shape:
-    width_m, height_m = PICTURE_WIDTH_PX * METRES_PER_PX, PICTURE_HEIGHT_PX * METRES_PER_PX
-    return Shape(
-        name="ground",
-        kind="box",
-        color=GRASS,
-        size=(width_m, height_m, 0.1),
-        position=(width_m / 2, height_m / 2, -0.1),
-    )
+    width_m, height_m = IMAGE_WIDTH_PX * METERS_PER_PX, IMAGE_HEIGHT_PX * METERS_PER_PX
+    return ground(GRASS, (width_m / 2, height_m / 2), (width_m, height_m))
 
 
 def _wall(index: int, ends_m: Floats) -> Shape:
-    """Build a wall between two points (2, 2); its colour changes from one to the next."""
+    """Return the wall between two points (2, 2); colors alternate from wall to wall."""
     along, middle = ends_m[1] - ends_m[0], ends_m.mean(axis=0)
     length_m = float(np.hypot(*along)) + WALL_THICKNESS_M
     return Shape(
@@ -71,21 +65,15 @@ def _wall(index: int, ends_m: Floats) -> Shape:
 
 
 def _car() -> list[Shape]:
-    wheels = {
-        "front_left": (0.95, 0.55),
-        "front_right": (0.95, -0.55),
-        "rear_left": (-1.0, 0.55),
-        "rear_right": (-1.0, -0.55),
-    }
     return [
-        part("floor", CARBON, (2.0, 0.9, 0.10), (-0.2, 0.0, 0.16)),
-        part("body", PAINT, (2.1, 0.5, 0.32), (-0.35, 0.0, 0.37)),
-        part("pods", PAINT, (0.9, 0.86, 0.24), (-0.3, 0.0, 0.33)),
-        part("nose", PAINT, (0.8, 0.26, 0.18), (1.05, 0.0, 0.32)),
-        part("front_wing", WHITE, (0.28, 1.4, 0.06), (1.36, 0.0, 0.16)),
-        part("rear_wing", WHITE, (0.26, 1.1, 0.08), (-1.37, 0.0, 0.80)),
-        part("rear_wing_left", CARBON, (0.3, 0.05, 0.45), (-1.35, 0.55, 0.62)),
-        part("rear_wing_right", CARBON, (0.3, 0.05, 0.45), (-1.35, -0.55, 0.62)),
+        car_part("floor", CARBON, (2.0, 0.9, 0.10), (-0.2, 0.0, 0.16)),
+        car_part("body", PAINT, (2.1, 0.5, 0.32), (-0.35, 0.0, 0.37)),
+        car_part("pods", PAINT, (0.9, 0.86, 0.24), (-0.3, 0.0, 0.33)),
+        car_part("nose", PAINT, (0.8, 0.26, 0.18), (1.05, 0.0, 0.32)),
+        car_part("front_wing", WHITE, (0.28, 1.4, 0.06), (1.36, 0.0, 0.16)),
+        car_part("rear_wing", WHITE, (0.26, 1.1, 0.08), (-1.37, 0.0, 0.80)),
+        car_part("rear_wing_left", CARBON, (0.3, 0.05, 0.45), (-1.35, 0.55, 0.62)),
+        car_part("rear_wing_right", CARBON, (0.3, 0.05, 0.45), (-1.35, -0.55, 0.62)),
         Shape(
             name="car_helmet",
             kind="sphere",
@@ -94,15 +82,12 @@ def _car() -> list[Shape]:
             position=(-0.1, 0.0, 0.6),
             frame="car",
         ),
-        *(
-            wheel(name, RUBBER, (x_m, y_m, WHEEL_RADIUS_M), WHEEL_RADIUS_M, WHEEL_WIDTH_M)
-            for name, (x_m, y_m) in wheels.items()
-        ),
+        *wheels(RUBBER, 0.95, -1.0, 0.55, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
 
 def static_shapes(track: Track) -> tuple[Shape, ...]:
-    """Give what never changes: the world in `map`, and the car's parts in `car`."""
+    """Return the shapes that never change: the world in `map`, the car's parts in `car`."""
     walls_m = to_map(track.walls_px.reshape(-1, 2, 2))
     gates_m = to_map(track.gates_px.reshape(-1, 2, 2))
     return (
@@ -115,14 +100,14 @@ def static_shapes(track: Track) -> tuple[Shape, ...]:
 
 
 def moving_shapes(
-    track: Track, car: Racer, trail_m: Sequence[tuple[float, ...]]
+    track: Track, car: Car, trail_m: Sequence[tuple[float, ...]]
 ) -> tuple[Shape, ...]:
-    """Give what changes with each step.
+    """Return the shapes that change with each step.
 
     Args:
-        track: that the car drives on.
-        car: now.
-        trail_m: the last positions of the car, (x, y) in the map; at least one.
+        track: Track of the car.
+        car: State of the car.
+        trail_m: Last positions of the car, (x, y) in the map; at least one.
     """
     gate_m = to_map(track.gates_px[int(car.next_gate)].reshape(2, 2))
     rays_m = to_map(ray_ends(track.walls_px, car))
@@ -131,20 +116,12 @@ def moving_shapes(
         Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
         Shape("rays", "segments", RAY, raised(rays_m, 0.4), size=(0.1, 0.0, 0.0)),
         Shape("hits", "points", HIT, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),
-        Shape(
-            name="speed",
-            kind="text",
-            color=WHITE,
-            size=(1.0, 1.0, 0.8),
-            position=(0.0, 0.0, 2.0),
-            frame="car",
-            text=f"{car.speed_px:.0f} px/step, {int(car.gates)} gates",
-        ),
+        label(f"{car.speed_px:.0f} px/step, {int(car.gates)} gates", WHITE, 2.0),
     )
 
 
-def car_frame(car: Racer) -> Frame:
-    """Give the car's frame in the map."""
-    x_m = METRES_PER_PX * car.x_px
-    y_m = METRES_PER_PX * (PICTURE_HEIGHT_PX - car.y_px)
+def car_frame(car: Car) -> Frame:
+    """Return the car's frame in the map."""
+    x_m = METERS_PER_PX * car.x_px
+    y_m = METERS_PER_PX * (IMAGE_HEIGHT_PX - car.y_px)
     return Frame("car", (x_m, y_m, 0.0), yaw_rotation(-car.heading_rad))

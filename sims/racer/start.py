@@ -1,4 +1,4 @@
-"""Where the episodes of the racer sim start."""
+"""Starts of the racer sim's episodes."""
 
 from __future__ import annotations
 
@@ -11,46 +11,47 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import leg_at, point_at
-from mcaprl.sims.racer.car import STARTED_AT, Racer, placed, store_racer
+from mcaprl.sims.racer.car import STARTED_AT, Car, placed, store_car
+from mcaprl.sims.racer.course import HALF_WIDTH_PX, IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rules import MAX_SPEED_M_S, STEP_S, observe, walls_hit
-from mcaprl.sims.racer.track import HALF_WIDTH_PX, METRES_PER_PX, PICTURE_HEIGHT_PX, Track
 from mcaprl.sims.vehicle.arguments import pose_from
+from mcaprl.sims.vehicle.draws import spread
 
 ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
-"""How many numbers a start is drawn by."""
+"""Number of random numbers of each kind of start."""
 
 
 @compiled
-def start_exactly(track: Track) -> Racer:
-    """Put a car at rest on the start line."""
+def start_exactly(track: Track) -> Car:
+    """Return a car at rest exactly on the start line."""
     x_px, y_px, heading_rad = track.start_px
     return placed(track, x_px, y_px, heading_rad, 0.0, 0.0)
 
 
 @compiled
-def start_on_line(track: Track, shares: NDArray[np.float64]) -> Racer:
-    """Put a car at rest near the start line, by two numbers from 0 to 1: offset and heading."""
+def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
+    """Return a car at rest near the line; two numbers from 0 to 1 decide offset and heading."""
     x_px, y_px, heading_rad = track.start_px
-    left_px, left_rad = _spread(shares[0], 3.0), _spread(shares[1], 0.05)
+    left_px, left_rad = spread(shares[0], 3.0), spread(shares[1], 0.05)
     x_px += left_px * math.sin(heading_rad)
     y_px -= left_px * math.cos(heading_rad)
     return placed(track, x_px, y_px, heading_rad - left_rad, 0.0, 0.0)
 
 
 @compiled
-def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Racer:
-    """Put a car on the track, by four numbers from 0 to 1: place, speed, offset, heading."""
+def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Car:
+    """Return a car on the track; four numbers from 0 to 1 decide place, speed, offset, heading."""
     along_m, speed_px = track.path.length_m * shares[0], 6.0 * shares[1]
-    left_px, left_rad = _spread(shares[2], 12.0), _spread(shares[3], 0.2)
+    left_px, left_rad = spread(shares[2], 12.0), spread(shares[3], 0.2)
     x_m, y_m = point_at(track.path, along_m)
     heading_rad = -track.path.yaw_rad[leg_at(track.path, along_m)]
-    x_px = x_m / METRES_PER_PX + left_px * math.sin(heading_rad)
-    y_px = PICTURE_HEIGHT_PX - y_m / METRES_PER_PX - left_px * math.cos(heading_rad)
+    x_px = x_m / METERS_PER_PX + left_px * math.sin(heading_rad)
+    y_px = IMAGE_HEIGHT_PX - y_m / METERS_PER_PX - left_px * math.cos(heading_rad)
     return placed(track, x_px, y_px, heading_rad - left_rad, speed_px, along_m)
 
 
 @compiled
-def start_racer(
+def start_car(
     track: Track,
     classic: bool,
     shares: NDArray[np.float64],
@@ -58,15 +59,16 @@ def start_racer(
     observations: NDArray[np.float32],
     i: int,
 ) -> None:
-    """Start car i of N, and write it and what it sees.
+    """Start car i of N, and write its state and observation.
 
     Args:
-        track: to start on.
-        classic: see by the classic rules.
-        shares: numbers from 0 to 1: (4,) for anywhere, (2,) for the line, (0,) for exactly there.
-        cars: (N, 13) rows of a `Racer`, and of where it starts along the path.
-        observations: (N, 19).
-        i: which row is to be filled.
+        track: Track of the cars.
+        classic: Whether the classic rules apply.
+        shares: Random numbers from 0 to 1: (4,) for a start anywhere, (2,) near the line, (0,)
+            exactly on the line.
+        cars: (N, 13) rows of `Car`, and of its start along the path.
+        observations: (N, 19) output.
+        i: Index of the car.
     """
     if len(shares) == ANYWHERE:
         car = start_anywhere(track, shares)
@@ -74,28 +76,22 @@ def start_racer(
         car = start_on_line(track, shares)
     else:
         car = start_exactly(track)
-    store_racer(car, cars[i])
+    store_car(car, cars[i])
     cars[i, STARTED_AT] = car.along_m
     observe(track, car, classic, observations[i])
 
 
-@compiled
-def _spread(share: float, most: float) -> float:
-    """Turn 0 to 1 into -most to most."""
-    return (2.0 * share - 1.0) * most
-
-
-def racer_from(track: Track, options: dict[str, Any]) -> Racer:
+def car_from(track: Track, options: dict[str, Any]) -> Car:
     """Read a start from the options of `reset`.
 
     Raises:
-        UsageError: there is another option, no such pose, or the car would not be on the track.
+        UsageError: There is another option, or the pose is malformed or not on the track.
     """
     pose = pose_from(options, -MAX_SPEED_M_S, MAX_SPEED_M_S)
-    x_px, y_px = pose.x_m / METRES_PER_PX, PICTURE_HEIGHT_PX - pose.y_m / METRES_PER_PX
-    speed_px = pose.speed_m_s * STEP_S / METRES_PER_PX
+    x_px, y_px = pose.x_m / METERS_PER_PX, IMAGE_HEIGHT_PX - pose.y_m / METERS_PER_PX
+    speed_px = pose.speed_m_s * STEP_S / METERS_PER_PX
     car = placed(track, x_px, y_px, -pose.yaw_rad, speed_px, 0.0)
-    half_width_m = HALF_WIDTH_PX * METRES_PER_PX
+    half_width_m = HALF_WIDTH_PX * METERS_PER_PX
     if abs(car.offset_m) > half_width_m or walls_hit(track, car):
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {abs(car.offset_m):.1f} m from the middle of the"

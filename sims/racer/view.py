@@ -1,4 +1,4 @@
-"""The racer sim from above, drawn with pygame: the whole track, the rays, and what is pressed."""
+"""Top view of the racer sim, drawn with pygame: the whole track, the rays and the keys."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.canvas import Canvas, Rgb
 from mcaprl.sims.drawing.top_view import Patch, patches, placed
-from mcaprl.sims.racer.car import Racer
+from mcaprl.sims.racer.car import Car
+from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rules import STEP_S, THROTTLE, TURN
 from mcaprl.sims.racer.scene import car_frame, moving_shapes, static_shapes
-from mcaprl.sims.racer.track import METRES_PER_PX, PICTURE_HEIGHT_PX, PICTURE_WIDTH_PX, Track
 
 INK: Rgb = (255, 255, 255)
 PRESSED: Rgb = (64, 217, 107)
@@ -22,32 +22,32 @@ KEY_PX = 32
 _KEYS = {"forward": (1, 0), "left": (0, 1), "back": (1, 1), "right": (2, 1)}
 """Column and row of each key."""
 _ARROWS = {"forward": (0, -1), "left": (-1, 0), "back": (0, 1), "right": (1, 0)}
-"""Where the arrow on each key points: right and down."""
+"""Direction of the arrow on each key: right and down."""
 
 
 class RacerView:
-    """Draws one picture for each step, and shows it in a window in mode `human`."""
+    """Renderer of one image for each step, which mode `human` shows in a window."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"], track: Track) -> None:
-        """Prepare the parts of the picture that never change.
+        """Prepare the shapes that never change.
 
         Raises:
-            MissingExtraError: pygame is not installed.
+            MissingExtraError: Pygame is not installed.
         """
-        size_px = (PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX)
+        size_px = (IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX)
         self._canvas = Canvas(render_mode, size_px, "mcaprl racer", round(1 / STEP_S))
         self._track = track
         self._static = patches(static_shapes(track))
 
     def draw(
-        self, car: Racer, trail_m: Sequence[tuple[float, ...]], action: int
+        self, car: Car, trail_m: Sequence[tuple[float, ...]], action: int
     ) -> NDArray[np.uint8]:
-        """Draw the car where it is, and give the picture, (600, 1000, 3).
+        """Render the track and the car, (600, 1000, 3).
 
         Args:
-            car: the car now.
-            trail_m: its last positions, (x, y) in the map; at least one.
-            action: the last one, 0 to 8.
+            car: State of the car.
+            trail_m: Last positions of the car, (x, y) in the map; at least one.
+            action: Last action, 0 to 8.
         """
         moving = patches(moving_shapes(self._track, car, trail_m))
         for patch in sorted([*self._static, *moving], key=lambda each: each.top_m):
@@ -61,15 +61,15 @@ class RacerView:
         """Close the window."""
         self._canvas.close()
 
-    def _fill(self, patch: Patch, car: Racer) -> None:
+    def _fill(self, patch: Patch, car: Car) -> None:
         corners_m = patch.corners_m
         if patch.frame == "car":
             x_m, y_m, _ = car_frame(car).position
             corners_m = placed(corners_m, x_m, y_m, -car.heading_rad)
-        corners_px = corners_m / METRES_PER_PX * [1.0, -1.0] + [0.0, PICTURE_HEIGHT_PX]
+        corners_px = corners_m / METERS_PER_PX * [1.0, -1.0] + [0.0, IMAGE_HEIGHT_PX]
         self._canvas.polygon(corners_px, patch.color)
 
-    def _write(self, car: Racer) -> None:
+    def _write(self, car: Car) -> None:
         left, top = PANEL_PX
         self._canvas.text(f"score {int(car.gates)}", (left, top), 32, INK)
         self._canvas.text(f"speed {car.speed_px:.0f}", (left, top + 26), 32, INK)

@@ -1,1 +1,1 @@
-"""What the sims share: single and batched environments, fleets, seeded draws."""
+"""Single and batched environments, fleets, pilots and random draws that the sims share."""

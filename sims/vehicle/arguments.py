@@ -1,4 +1,4 @@
-"""Checks of what a user hands to a sim; each refusal says what is allowed."""
+"""Validation of the arguments that a user passes to a sim; each message says what is allowed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 
 
 class Pose(NamedTuple):
-    """Where a caller wants a vehicle on the ground to start, in the map."""
+    """Requested start of a ground vehicle, in the map."""
 
     x_m: float
     y_m: float
@@ -23,86 +23,75 @@ class Pose(NamedTuple):
 
 
 def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
-    """Refuse a value that is not in the list.
+    """Validate that a value is one of those allowed.
 
     Raises:
-        UnknownNameError: it is not; the message lists those that are.
+        UnknownNameError: The value is not allowed; the message lists those that are.
     """
     if value not in allowed:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
 
 
 def check_range(argument: str, value: float, low: float, high: float) -> None:
-    """Refuse a number outside [low, high].
+    """Validate that a number is in [low, high].
 
     Raises:
-        UsageError: it is outside, or no number.
+        UsageError: The number is outside, or NaN.
     """
     if not low <= value <= high:
-        raise UsageError(f"{argument} is {low:g} to {high:g}, not {value}")
+        raise UsageError(f"{argument} must be {low:g} to {high:g}, not {value}")
 
 
 def check_action(action: int | np.integer[Any], count: int) -> int:
-    """Give an action as an int; refuse one that is not 0 to count - 1.
+    """Validate an action and return it as an int.
 
     Raises:
-        UsageError: it is not, or no whole number.
+        UsageError: The action is not an integer from 0 to count - 1.
     """
     try:
         number = operator.index(action)
     except TypeError:
-        raise UsageError(f"action {action!r} is no whole number") from None
+        raise UsageError(f"action {action!r} is not an integer") from None
     if not 0 <= number < count:
-        raise UsageError(f"action {action} does not exist: 0 to {count - 1} do")
+        raise UsageError(f"action {action} does not exist: actions are 0 to {count - 1}")
     return number
 
 
 def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
-    """Give the actions of many vehicles; refuse any that is not 0 to count - 1.
+    """Validate the actions of many vehicles and return them as int64.
 
     Raises:
-        UsageError: it is not; or there is not one whole number for each vehicle.
+        UsageError: An action is not 0 to count - 1, or there is not one integer for each vehicle.
     """
     numbers = np.asarray(actions)
     if numbers.shape != (vehicles,) or numbers.dtype.kind not in "iu":
         raise UsageError(
-            f"actions are an array of {vehicles} whole numbers,"
+            f"actions must be an array of {vehicles} integers,"
             f" not {numbers.dtype} of shape {numbers.shape}"
         )
     numbers = numbers.astype(np.int64, copy=False)
-    # Without a sign, those below 0 are the largest.
+    # Viewed as unsigned, negative numbers are the largest.
     does_not_exist = numbers.view(np.uint64) >= count
     if does_not_exist.any():
         wrong = numbers[does_not_exist][0]
-        raise UsageError(f"action {wrong} does not exist: 0 to {count - 1} do")
+        raise UsageError(f"action {wrong} does not exist: actions are 0 to {count - 1}")
     return numbers
 
 
-def check_one(observations: Any) -> None:
-    """Refuse a pilot's observations, which may be a dict of arrays, unless there is just one.
-
-    Raises:
-        ValueError: there are more.
-    """
-    rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
-    count = len(rows)
-    if count != 1:
-        raise ValueError(f"one pilot has one environment, not {count}")
-
-
 def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list[float]:
-    """Read the one option of `reset`, `pose`.
+    """Read `pose`, the only option of `reset`.
 
     Args:
-        options: of `reset`.
-        names: of all the numbers that a pose can have, with units.
-        least: how many it must have; those left out are 0.
+        options: Options of `reset`.
+        names: Names, with units, of all numbers that a pose can have.
+        least: Number of those that it must have; the others default to 0.
 
     Raises:
-        UsageError: there is another option, or the pose is not so many finite numbers.
+        UsageError: There is another option, or the pose does not consist of this many finite
+            numbers.
     """
     if set(options) != {"pose"}:
-        raise UsageError(f"reset knows only the option 'pose', not {sorted(set(options))}")
+        raise UsageError(f"reset accepts only the option 'pose', not {sorted(set(options))}")
     try:
         pose = np.asarray(options["pose"], dtype=np.float64)
     except (TypeError, ValueError):
@@ -115,10 +104,10 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
 
 
 def pose_from(options: dict[str, Any], slowest_m_s: float, fastest_m_s: float) -> Pose:
-    """Read the start of a vehicle on the ground: (x_m, y_m, yaw_rad), or with speed_m_s.
+    """Read the start of a ground vehicle: (x_m, y_m, yaw_rad), optionally with speed_m_s.
 
     Raises:
-        UsageError: there is another option, no such pose, or a speed beyond the vehicle's.
+        UsageError: There is another option, the pose is malformed, or the speed is out of range.
     """
     pose = Pose(*read_pose(options, Pose._fields, least=3))
     check_range("a pose's speed_m_s", pose.speed_m_s, slowest_m_s, fastest_m_s)

@@ -1,4 +1,4 @@
-"""The batched environments: N vehicles in one array step, as Gymnasium's vector environments."""
+"""Base class of the batched environments, which step N vehicles as one Gymnasium VectorEnv."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ Bools = NDArray[np.bool_]
 class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """N vehicles of one sim, stepped together.
 
-    What vehicle i does is what a single environment of the sim does, seeded with `seed + i` and
-    wrapped in a TimeLimit: bit for bit the same observations, rewards, ends and infos. Infos have
-    Gymnasium's vector format: an array for each key, and a mask `_key` of those that have it.
+    Vehicle i behaves as a single environment of the sim that is seeded with `seed + i` and wrapped
+    in a TimeLimit: observations, rewards, ends and infos are equal bit for bit. Infos have
+    Gymnasium's vector format: an array for each key, and a mask `_key` of the environments that
+    have the key.
 
-    `reset` takes the options of the sim's single environment for all vehicles; a `pose` of shape
-    (N, K) gives each its own. With `reset_mask`, (N,) bools, only some are reset.
+    `reset` accepts the options of the sim's single environment, for all vehicles; a `pose` of shape
+    (N, K) has one row for each vehicle. With `reset_mask`, (N,) bools, only some are reset.
 
-    The autoreset mode is one of Gymnasium's: `NextStep` resets in the step after an end and ignores
-    the action, `SameStep` at once, with the last observation in `final_obs` and the info in
-    `final_info`; `Disabled` leaves it to the caller, by a `reset_mask`.
+    The autoreset mode is one of Gymnasium's. `NextStep` resets in the step after an end and ignores
+    its action. `SameStep` resets at once, with the last observation in `final_obs` and its info in
+    `final_info`. `Disabled` leaves the reset to the caller, with a `reset_mask`.
     """
 
     fleet_type: ClassVar[type[Fleet]]
@@ -48,17 +49,17 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Make N vehicles.
 
         Args:
-            num_envs: N, at least 1.
-            max_episode_steps: an episode is truncated after so many.
-            autoreset_mode: when an ended episode makes place for the next.
-            **kwargs: arguments of the sim's single environment; none of them draws pictures.
+            num_envs: Number of vehicles N, at least 1.
+            max_episode_steps: Steps after which an episode is truncated; None for no limit.
+            autoreset_mode: When an ended episode is followed by the next.
+            **kwargs: Arguments of the sim's single environment, except `render_mode`.
 
         Raises:
-            UnknownNameError: an argument has a value that is not in its list.
-            UsageError: a number is outside its range.
+            UnknownNameError: An argument has a value that is not in its list.
+            UsageError: A number is outside its range.
         """
         if kwargs.pop("render_mode", None) is not None:
-            raise UsageError("batched sims draw no pictures: make a single one with render_mode")
+            raise UsageError("batched sims do not render: make a single sim with render_mode")
         _check_count("num_envs", num_envs)
         if max_episode_steps is not None:
             _check_count("max_episode_steps", max_episode_steps)
@@ -66,10 +67,10 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.autoreset_mode = _mode_of(autoreset_mode)
         self.fleet = self.fleet_type(num_envs, **kwargs)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
-        self._take_spaces(self.fleet)
+        self._adopt_spaces(self.fleet)
         self._truncates = np.array(self.fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # Whoever goes on has none.
+        # An episode that goes on has no reason.
         self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -77,8 +78,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._ended = np.ones(num_envs, dtype=np.bool_)
         self._is_started = False
 
-    def _take_spaces(self, fleet: Fleet) -> None:
-        """Have the fleet's names and spaces, for one and for all."""
+    def _adopt_spaces(self, fleet: Fleet) -> None:
+        """Copy the fleet's names and spaces, and derive the batched spaces from them."""
         self.step_duration_s = fleet.step_duration_s
         self.action_meanings = fleet.action_meanings
         self.observation_names = fleet.observation_names
@@ -96,12 +97,12 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start episodes.
 
         Args:
-            seed: of the first vehicle, the others' counting on; or one for each; None goes on with
-                the random numbers as they are.
-            options: see above.
+            seed: Seed of the first vehicle, vehicle i using seed + i; or one seed for each; or None
+                to continue with the present random generators.
+            options: Options as described for the class.
 
         Raises:
-            UsageError: there is not one seed for each, or an option is unknown or malformed.
+            UsageError: The number of seeds is wrong, or an option is unknown or malformed.
         """
         others = dict(options or {})
         chosen = _mask_of(others.pop("reset_mask", None), self.num_envs)
@@ -113,18 +114,18 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self.fleet.begin(i, self._randoms[i], starts[i])
         self._steps[chosen], self._ended[chosen] = 0, False
         self._is_started = True
-        return self.fleet.observations(), self._told(chosen, np.zeros_like(chosen))
+        return self.fleet.observations(), self._infos_of(chosen, np.zeros_like(chosen))
 
     def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Bools, Bools, dict[str, Any]]:
         """Take one step with each vehicle.
 
         Args:
-            actions: (N,) whole numbers.
+            actions: (N,) integers.
 
         Raises:
-            UsageError: the actions are not so many valid ones; or an episode has ended and, as
-                autoreset is disabled, was not reset.
-            ResetNeeded: there was no `reset`.
+            UsageError: The actions are invalid, or autoreset is disabled and an ended episode was
+                not reset.
+            ResetNeeded: `reset` was not called.
         """
         self.fleet.actions[:] = check_actions(actions, self.num_envs, len(self.action_meanings))
         fresh = self._check_can_step()
@@ -134,24 +135,24 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
         fleet.advance()
         self._steps += 1
-        # These were at their end already: their step is a reset.
+        # For episodes that had ended before, this step is the reset.
         self._begin_all(np.flatnonzero(fresh))
-        ended_itself = fleet.ends != GOING_ON
-        terminated, truncated = ended_itself, self._steps >= self._max_steps
+        has_reason = fleet.ends != GOING_ON
+        terminated, truncated = has_reason, self._steps >= self._max_steps
         if self._some_truncate:
             cut = self._truncates[fleet.ends]
-            terminated, truncated = ended_itself & ~cut, cut | truncated
+            terminated, truncated = has_reason & ~cut, cut | truncated
         rewards = fleet.rewards.copy()
         self._ended = terminated | truncated
-        infos = self._infos(ended_itself)
+        infos = self._infos(has_reason)
         return fleet.observations(), rewards, terminated, truncated, infos
 
     def places(self) -> NDArray[np.float64]:
-        """Give where all vehicles are, (N, 2) x and y in the map, metres."""
+        """Return the positions of all vehicles, (N, 2) x and y in the map, meters."""
         return self.fleet.places()
 
     def _check_can_step(self) -> Bools:
-        """Give which episodes are at their end, and to be reset in this step."""
+        """Return which episodes have ended and are reset in this step."""
         if not self._is_started:
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
@@ -166,13 +167,13 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self.fleet.begin_all(chosen, self._randoms)
             self._steps[chosen], self._ended[chosen] = 0, False
 
-    def _infos(self, ended_itself: Bools) -> dict[str, Any]:
-        """Give the infos of a step; in mode `SameStep`, reset what has ended."""
+    def _infos(self, has_reason: Bools) -> dict[str, Any]:
+        """Return the infos of a step; in mode `SameStep`, reset the ended episodes first."""
         ended = self._ended.copy()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
-            return self._told(np.ones_like(ended), ended_itself)
+            return self._infos_of(np.ones_like(ended), has_reason)
         last = np.full(self.num_envs, None, dtype=object)
-        final = self._told(ended, ended_itself)
+        final = self._infos_of(ended, has_reason)
         chosen = np.flatnonzero(ended)
         for i in chosen.tolist():
             last[i] = self.fleet.observation(i)
@@ -182,25 +183,25 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             "_final_obs": ended,
             "final_info": final,
             "_final_info": ended.copy(),
-            **self._told(np.ones_like(ended), np.zeros_like(ended)),
+            **self._infos_of(np.ones_like(ended), np.zeros_like(ended)),
         }
 
-    def _told(self, chosen: Bools, ended_itself: Bools) -> dict[str, Any]:
-        """Give the infos of some vehicles, with the reasons of those that ended by themselves."""
+    def _infos_of(self, chosen: Bools, has_reason: Bools) -> dict[str, Any]:
+        """Return the infos of the chosen vehicles, with the reasons why episodes ended."""
         infos: dict[str, Any] = {}
         are_all = chosen.all()
         for key, values in self.fleet.infos().items():
             infos[key] = values if are_all else np.where(chosen, values, 0)
             infos[f"_{key}"] = chosen.copy()
-        if ended_itself.any():
+        if has_reason.any():
             infos["reason"] = self._reasons[self.fleet.ends]
-            infos["_reason"] = ended_itself.copy()
+            infos["_reason"] = has_reason.copy()
         return infos
 
 
 def _check_count(argument: str, value: object) -> None:
     if not isinstance(value, int | np.integer) or value < 1:
-        raise UsageError(f"{argument} is a whole number of 1 or more, not {value!r}")
+        raise UsageError(f"{argument} must be an integer of at least 1, not {value!r}")
 
 
 def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
@@ -210,32 +211,34 @@ def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
 
 
 def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
-    """Give each vehicle its seed."""
+    """Return one seed for each vehicle."""
     if seed is None:
         return [None] * count
     if isinstance(seed, int | np.integer):
         return [int(seed) + i for i in range(count)]
     seeds = list(seed)
     if len(seeds) != count:
-        raise UsageError(f"{len(seeds)} seeds for {count} environments: give one for each")
+        raise UsageError(f"{len(seeds)} seeds for {count} environments: pass one for each")
     return seeds
 
 
 def _mask_of(mask: Any, count: int) -> Bools:
-    """Give which vehicles to reset: all, if there is no mask."""
+    """Return which vehicles to reset: all if there is no mask."""
     if mask is None:
         return np.ones(count, dtype=np.bool_)
     chosen = np.asarray(mask)
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise UsageError(f"reset_mask is an array of {count} bools, one of them true; not {mask!r}")
+        raise UsageError(
+            f"reset_mask must be an array of {count} bools, at least one of them true, not {mask!r}"
+        )
     return chosen
 
 
 def _starts_of(options: dict[str, Any], count: int) -> list[dict[str, Any] | None]:
-    """Give each vehicle its options: the same to all, but for a pose of shape (N, K)."""
+    """Return the options of each vehicle: the same for all, except a pose of shape (N, K)."""
     poses: Any = options.get("pose")
     if np.ndim(poses) != 2:
         return [options] * count
     if len(poses) != count:
-        raise UsageError(f"{len(poses)} poses for {count} environments: give one, or one for each")
+        raise UsageError(f"{len(poses)} poses for {count} environments: pass one, or one for each")
     return [{**options, "pose": pose} for pose in poses]

@@ -1,4 +1,4 @@
-"""The single environments: one vehicle of a fleet, and what viewers show of it."""
+"""Base class of the single environments: a fleet of one vehicle, and its rendering."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RENDER_MODES = ("human", "rgb_array")
 
 
 class View(Protocol):
-    """What draws a sim."""
+    """Renderer of a sim."""
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -31,17 +31,17 @@ AnyView = TypeVar("AnyView", bound=View)
 
 
 class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
-    """An environment of one vehicle: seeds, steps, ends and pictures, the same for all sims."""
+    """Environment of one vehicle: seeding, steps, ends and rendering, the same in all sims."""
 
     trail_length: int = 40
     success_reasons: ClassVar[tuple[str, ...]]
-    """Ends that are what one hopes for; `time_limit` is that of the TimeLimit, too."""
+    """Reasons that count as success; `time_limit` includes truncation by the TimeLimit wrapper."""
 
     def __init__(self, fleet: AnyFleet, render_mode: RenderMode | None) -> None:
-        """Take over a fleet of one.
+        """Wrap a fleet of one vehicle.
 
         Raises:
-            UnknownNameError: there is no such render mode.
+            UnknownNameError: There is no such render mode.
         """
         check_name("render_mode", render_mode, (None, *RENDER_MODES))
         self.fleet = fleet
@@ -52,7 +52,7 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        # Looked up in each step.
+        # Attributes of this object are faster to look up in each step.
         self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
@@ -65,7 +65,7 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         """Start an episode; see "Starting State".
 
         Raises:
-            UsageError: `options` has an unknown key, or a pose that cannot be started from.
+            UsageError: `options` has an unknown key or an invalid pose.
         """
         if seed is not None:
             super().reset(seed=seed)
@@ -76,17 +76,17 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         return self.fleet.observation(0), self.fleet.info(0)
 
     def step(self, action: int | np.integer[Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Drive or fly on for one decision.
+        """Advance the vehicle by one decision.
 
         Raises:
-            UsageError: there is no such action.
+            UsageError: There is no such action.
         """
         try:
             number = index(action)
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # It says what is wrong; a call in each step would take longer than this.
+            # Raises the error; to call it in each step would be slower than this inline check.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -102,11 +102,11 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
     @property
     @abstractmethod
     def place(self) -> tuple[float, ...]:
-        """Where the vehicle is now, for its trail."""
+        """Current position of the vehicle, for its trail."""
 
     @property
     def trail(self) -> list[tuple[float, ...]]:
-        """The vehicle's last places, at least one: from when they were first asked for."""
+        """Last positions of the vehicle, at least one, since the trail was first read."""
         self._is_watched = True
         if not self._trail:
             self._trail.append(self.place)
@@ -114,20 +114,20 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
 
     @abstractmethod
     def _open_view(self, render_mode: RenderMode) -> AnyView:
-        """Make what draws the sim; the only place where pygame is imported."""
+        """Make the renderer of the sim; only this method imports pygame."""
 
     @abstractmethod
     def _draw(self, view: AnyView) -> NDArray[np.uint8]:
-        """Draw the vehicle where it is: (H, W, 3)."""
+        """Render the vehicle in its current state as an (H, W, 3) image."""
 
     def _watch(self) -> None:
-        """Take note of where the vehicle is, and show it."""
+        """Append the vehicle's position to the trail, and show it in mode `human`."""
         self._trail.append(self.place)
         if self.render_mode == "human":
             self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Draw the sim: give (H, W, 3) uint8 for `rgb_array`, show it for `human`."""
+        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
         if self._render_mode is None:
             return None
         if self._view is None:

@@ -1,4 +1,4 @@
-"""N vehicles of one sim, held as arrays: what its single and its batched environment share."""
+"""N vehicles of one sim as arrays, shared by its single and its batched environment."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from numpy.typing import NDArray
 from mcaprl.sims.geometry.compiled import ready
 
 GOING_ON = 0
-"""In `Fleet.ends`: the episode is not over."""
+"""Value of `Fleet.ends` while an episode goes on."""
 
 
 class Fleet(ABC):
-    """N vehicles that do not meet each other; each starts by itself.
+    """N independent vehicles, each with its own episodes.
 
     Attributes:
-        count: N.
-        observation_space: of one vehicle.
-        observation_names: of the numbers in a vector that is observed; none for pictures.
-        action_meanings: what each action does.
-        step_duration_s: simulated time of one step.
-        actions: (N,) what each is to do in the next step; valid ones.
-        rewards: (N,) of the last step; 0 at a start.
-        ends: (N,) how the last step ended the episodes: `GOING_ON` or an index of `reasons`.
-        noise: (N, K) standard normal numbers for the next step, which the environment draws before
-            it; K is 0 where nothing in a step is random.
+        count: Number of vehicles N.
+        observation_space: Observation space of one vehicle.
+        observation_names: Names of the observed numbers; empty for images.
+        action_meanings: Meaning of each action.
+        step_duration_s: Simulated time of one step.
+        actions: (N,) valid actions of the next step.
+        rewards: (N,) rewards of the last step; 0 after a start.
+        ends: (N,) `GOING_ON`, or the index in `reasons` of why the last step ended the episode.
+        noise: (N, K) standard normal numbers that the environment draws for the next step; K is 0
+            if steps are deterministic.
     """
 
     reasons: ClassVar[tuple[str, ...]]
-    """Why an episode ends, by the codes in `ends`."""
+    """Reasons why an episode ends, indexed by `ends`."""
     truncates: ClassVar[tuple[bool, ...]]
-    """Of each of them, whether it only breaks the episode off."""
+    """Whether each reason truncates the episode instead of terminating it."""
 
     def __init__(
         self,
@@ -47,7 +47,7 @@ class Fleet(ABC):
         step_duration_s: float,
         noise_size: int = 0,
     ) -> None:
-        """Make the arrays that all fleets have."""
+        """Allocate the arrays that all fleets have."""
         self.count = count
         self.observation_space = observation_space
         self.observation_names = observation_names
@@ -63,36 +63,36 @@ class Fleet(ABC):
         """Start an episode of vehicle i.
 
         Args:
-            i: 0 to N - 1.
-            random: all that is drawn is drawn from it.
-            options: of `reset`.
+            i: Index of the vehicle, 0 to N - 1.
+            random: Source of all random numbers.
+            options: Options of `reset`.
 
         Raises:
-            UsageError: `options` has an unknown key, or a pose that cannot be started from.
+            UsageError: `options` has an unknown key or an invalid pose.
         """
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
         """Start an episode of some vehicles, as `begin` does without options.
 
         Args:
-            chosen: (K,) which.
-            randoms: a generator for each of the N vehicles.
+            chosen: (K,) indices of the vehicles.
+            randoms: Generators of all N vehicles.
         """
         for i in chosen.tolist():
             self.begin(i, randoms[i], None)
 
     @abstractmethod
     def advance(self) -> None:
-        """Take one step with each vehicle, by its number in `actions`."""
+        """Take one step with each vehicle, with the actions in `actions`."""
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
         """Take a step with the only vehicle of a fleet of one.
 
         Args:
-            action: a valid one.
+            action: Valid action.
 
         Returns:
-            What it observes, its reward, how its episode ended as in `ends`, and its `info`.
+            Observation, reward, end as in `ends`, and `info`.
         """
         self.actions[0] = action
         self.advance()
@@ -100,15 +100,21 @@ class Fleet(ABC):
 
     @abstractmethod
     def _kernel(self) -> tuple[Any, ...]:
-        """Give the compiled function of a step, and its arguments, which are never replaced."""
+        """Return the compiled function of a step and its arguments.
+
+        The arguments stay the same objects for the lifetime of the fleet.
+        """
 
     @cached_property
     def _step(self) -> Callable[[], None]:
-        """What `_kernel` gives, as machine code; compiled when it is first needed."""
+        """Machine code of `_kernel`, compiled on first use."""
         return ready(*self._kernel())
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies: all but what looks into this fleet's own arrays, and is made when needed."""
+        """Return the state for copies, without the cached properties.
+
+        Those refer to this fleet's arrays; the copy computes its own.
+        """
         kind = type(self)
         return {
             name: value
@@ -117,10 +123,10 @@ class Fleet(ABC):
         }
 
     def imitate(self, i: int, other: Fleet, j: int) -> None:
-        """Make vehicle i the same as vehicle j of another fleet of this kind.
+        """Copy the state of vehicle j of another fleet of the same class into vehicle i.
 
-        What a fleet knows of its vehicles are arrays with a row for each, and dicts by number of
-        what was worked out for some.
+        The state of vehicles are arrays with one row for each vehicle, and dicts from a vehicle's
+        index to a cached value.
         """
         for name, theirs in vars(other).items():
             mine = getattr(self, name)
@@ -132,20 +138,20 @@ class Fleet(ABC):
 
     @abstractmethod
     def observation(self, i: int) -> Any:
-        """Give what vehicle i observes, the caller's own."""
+        """Return a new copy of the observation of vehicle i."""
 
     @abstractmethod
     def observations(self) -> Any:
-        """Give what all observe, with a leading dimension of N, the caller's own."""
+        """Return a new copy of all observations, with a leading dimension of N."""
 
     @abstractmethod
     def places(self) -> NDArray[np.float64]:
-        """Give where all are, (N, 2) x and y in the map, metres; the caller's own."""
+        """Return a new (N, 2) array of the positions x and y in the map, meters."""
 
     @abstractmethod
     def info(self, i: int) -> dict[str, Any]:
-        """Give the `info` of vehicle i, without the reason of an end."""
+        """Return the `info` of vehicle i, without the reason why an episode ended."""
 
     @abstractmethod
     def infos(self) -> dict[str, NDArray[Any]]:
-        """Give the same of all, each an array (N,), the caller's own."""
+        """Return the `info` of all vehicles, each value as a new (N,) array."""

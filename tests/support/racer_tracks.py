@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from mcaprl.sims.geometry.paths import closed_path
-from mcaprl.sims.racer.car import Racer, placed
-from mcaprl.sims.racer.track import Track
+from mcaprl.sims.racer.car import Car, placed
+from mcaprl.sims.racer.course import Track
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
@@ -23,7 +23,7 @@ def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
 
 def car_in(
     track: Track, x_px: float, y_px: float, heading_deg: float = 0.0, speed_px: float = 0.0
-) -> Racer:
+) -> Car:
     """Place a car on that track whose next gate is the first one."""
     car = placed(track, x_px, y_px, math.radians(heading_deg), speed_px, x_px / 10)
     return car._replace(next_gate=0.0)

@@ -14,6 +14,7 @@ from mcaprl.sims.drawing.camera import draw, fronts, lens, level_axes, ray_lengt
 from mcaprl.sims.drawing.depth import (
     FARTHEST_M,
     NEAREST_M,
+    DepthCamera,
     decode_depth,
     encode_depth,
     overlaps,
@@ -21,7 +22,7 @@ from mcaprl.sims.drawing.depth import (
 )
 from mcaprl.sims.geometry.mesh import box_mesh, ground_mesh
 from mcaprl.sims.geometry.paths import point_at
-from mcaprl.sims.lane.camera import LENS, lane_camera
+from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS, lane_mesh
 from mcaprl.sims.lane.course import COURSE, GROUND_HALF_SIDE_M, buildings, rails
 
 Floats = NDArray[np.float64]
@@ -29,12 +30,12 @@ Floats = NDArray[np.float64]
 ALL_CODES = np.arange(256, dtype=np.uint8)
 
 
-def draw_mesh(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, picture: Floats) -> None:
-    draw(mesh, fronts(mesh), eye_m, axes, focal_px, picture)
+def draw_mesh(mesh: Floats, eye_m: Floats, axes: Floats, focal_px: float, image: Floats) -> None:
+    draw(mesh, fronts(mesh), eye_m, axes, focal_px, image)
 
 
 def unit_rays(columns: NDArray[np.int64], rows: NDArray[np.int64], yaw_rad: float) -> Floats:
-    """Give the directions (N, 3), in the map, of the rays through the middles of pixels."""
+    """Return the directions (N, 3), in the map, of the rays through the middles of pixels."""
     right = (columns + 0.5 - LENS.width_px / 2) / LENS.focal_px
     down = (rows + 0.5 - LENS.height_px / 2) / LENS.focal_px
     forward = np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
@@ -45,7 +46,7 @@ def unit_rays(columns: NDArray[np.int64], rows: NDArray[np.int64], yaw_rad: floa
 
 
 def cast_on_course(eye_m: Floats, rays: Floats) -> Floats:
-    """Give the distances (N,) to the boxes of the course and its ground, by the slab method."""
+    """Return the distances (N,) to the boxes of the course and its ground, by the slab method."""
     boxes = [*rails(), *buildings()]
     low = np.array([[b.x_m - b.length_m / 2, b.y_m - b.width_m / 2, 0.0] for b in boxes])
     high = np.array([[b.x_m + b.length_m / 2, b.y_m + b.width_m / 2, b.height_m] for b in boxes])
@@ -64,7 +65,7 @@ def cast_on_course(eye_m: Floats, rays: Floats) -> Floats:
 def test_the_course_looks_as_ray_casting_says() -> None:
     """Of 240,000 pixels at 60 random poses, fewer than 1 in 10,000 differ, at box edges."""
     random = np.random.default_rng(3)
-    camera = lane_camera()
+    camera = DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
     differing = 0
     for _ in range(60):
         x_m, y_m = point_at(COURSE, random.uniform(0, COURSE.length_m))
@@ -79,7 +80,7 @@ def test_the_course_looks_as_ray_casting_says() -> None:
 
 
 def nearest_front(triangles: Floats, ray: Floats) -> float:
-    """Give 1/distance along z of the nearest front that a ray from the origin meets, or 0.
+    """Return 1/distance along z of the nearest front that a ray from the origin meets, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -106,61 +107,61 @@ def test_backs_are_told_by_the_planes_of_their_fronts() -> None:
 
 def test_a_soup_of_triangles_looks_as_ray_casting_says() -> None:
     random = np.random.default_rng(4)
-    picture = np.empty((12, 16))
+    image = np.empty((12, 16))
     for _ in range(40):
         triangles = random.uniform([-4, -4, -3], [4, 4, 9], size=(6, 3, 3))
-        draw_mesh(triangles, np.zeros(3), np.eye(3), 8.0, picture)
+        draw_mesh(triangles, np.zeros(3), np.eye(3), 8.0, image)
         for row, column in random.integers([12, 16], size=(25, 2)):
             ray = np.array([(column + 0.5 - 8) / 8.0, (row + 0.5 - 6) / 8.0, 1.0])
-            assert picture[row, column] == pytest.approx(nearest_front(triangles, ray), abs=1e-9)
+            assert image[row, column] == pytest.approx(nearest_front(triangles, ray), abs=1e-9)
 
 
 def test_a_wall_straight_ahead_has_its_distance() -> None:
     """A wall 10 m ahead: z is 10 m in every pixel, the ray to the corner is longer."""
     wall = box_mesh((15.0, 0.0, 0.0), (10.0, 100.0, 100.0))
-    picture = np.empty((144, 256))
-    draw_mesh(wall, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
-    np.testing.assert_allclose(1.0 / picture, 10.0, rtol=1e-12)
+    image = np.empty((144, 256))
+    draw_mesh(wall, np.zeros(3), level_axes(0.0), LENS.focal_px, image)
+    np.testing.assert_allclose(1.0 / image, 10.0, rtol=1e-12)
     lengths = ray_lengths(LENS)
     assert lengths[0, 0] == pytest.approx(math.sqrt(1 + (127.5 / 128) ** 2 + (71.5 / 128) ** 2))
 
 
 def test_level_ground_ends_at_the_middle_row() -> None:
-    picture = np.empty((144, 256))
-    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.7), LENS.focal_px, picture)
-    assert np.all(picture[:72] == 0.0)
+    image = np.empty((144, 256))
+    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.7), LENS.focal_px, image)
+    assert np.all(image[:72] == 0.0)
     # The middle of row 72 lies half a pixel under the horizon: z = 1.4 m x 128 / 0.5.
-    np.testing.assert_allclose(1.0 / picture[72], 1.4 * 128 / 0.5, rtol=1e-9)
-    np.testing.assert_allclose(1.0 / picture[143], 1.4 * 128 / 71.5, rtol=1e-9)
+    np.testing.assert_allclose(1.0 / image[72], 1.4 * 128 / 0.5, rtol=1e-9)
+    np.testing.assert_allclose(1.0 / image[143], 1.4 * 128 / 71.5, rtol=1e-9)
 
 
-def test_left_of_the_car_is_left_in_the_picture() -> None:
+def test_left_of_the_car_is_left_in_the_image() -> None:
     """Facing north (y), a box to the west (-x) is in the left half."""
     west = box_mesh((-5.0, 10.0, 0.0), (2.0, 2.0, 2.0))
-    picture = np.empty((144, 256))
-    draw_mesh(west, np.zeros(3), level_axes(math.pi / 2), LENS.focal_px, picture)
-    assert np.any(picture[:, :128] > 0)
-    assert np.all(picture[:, 128:] == 0)
+    image = np.empty((144, 256))
+    draw_mesh(west, np.zeros(3), level_axes(math.pi / 2), LENS.focal_px, image)
+    assert np.any(image[:, :128] > 0)
+    assert np.all(image[:, 128:] == 0)
 
 
 def test_what_is_behind_or_inside_is_not_seen() -> None:
-    picture = np.empty((144, 256))
+    image = np.empty((144, 256))
     for mesh in (box_mesh((-5.0, 0.0, 0.0), (2.0, 2.0, 2.0)), box_mesh((0, 0, 0), (9.0, 9.0, 9.0))):
-        draw_mesh(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, picture)
-        assert np.all(picture == 0.0)
+        draw_mesh(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, image)
+        assert np.all(image == 0.0)
 
 
-def test_neighbouring_triangles_leave_no_gap_and_share_no_pixel() -> None:
+def test_neighboring_triangles_leave_no_gap_and_share_no_pixel() -> None:
     """A fan of thin triangles around the middle covers each pixel of a disc exactly once."""
     turns = np.linspace(0, 2 * math.pi, 38)
     rim = np.column_stack([5 * np.cos(turns), 5 * np.sin(turns), np.full(38, 5.0)])
     covered = np.zeros((64, 64))
     for i in range(37):
-        picture = np.empty((64, 64))
-        # y points down in the picture: clockwise there is counter-clockwise for the eye.
+        image = np.empty((64, 64))
+        # y points down in the image: clockwise there is counter-clockwise for the eye.
         slice_of = np.array([[[0, 0, 5.0], rim[i + 1], rim[i]]])
-        draw_mesh(slice_of, np.zeros(3), np.eye(3), 30.0, picture)
-        covered += picture > 0
+        draw_mesh(slice_of, np.zeros(3), np.eye(3), 30.0, image)
+        covered += image > 0
     v, u = np.mgrid[0:64, 0:64] + 0.5 - 32
     assert np.all(covered[np.hypot(u, v) < 29.5] == 1)
     assert covered.max() == 1
@@ -177,9 +178,9 @@ def test_one_code_is_a_fixed_share_of_the_distance(depth_m: float) -> None:
 
 
 def test_codes_by_hand() -> None:
-    metres = np.array([0.1, 0.5, math.sqrt(50.0), 100.0, 1e4, np.inf])
+    meters = np.array([0.1, 0.5, math.sqrt(50.0), 100.0, 1e4, np.inf])
     # The geometric mean of the ends, sqrt(50) m, is code 127.5, which rounds to the even 128.
-    assert encode_depth(metres).tolist() == [0, 0, 128, 255, 255, 255]
+    assert encode_depth(meters).tolist() == [0, 0, 128, 255, 255, 255]
     assert decode_depth(np.array([0, 255], np.uint8)).tolist() == [0.5, np.inf]
 
 
@@ -188,7 +189,7 @@ def test_codes_survive_decoding() -> None:
 
 
 def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Shrink a picture to a shape."""
+    """Shrink an image to a shape."""
     small = np.empty(shape, dtype=np.float32)
     rows, columns = overlaps(inverse.shape[0], shape[0]), overlaps(inverse.shape[1], shape[1])
     shrink(inverse, rows, columns, small)
@@ -217,9 +218,9 @@ def test_each_new_pixel_is_made_of_whole_shares(old: int, new: int) -> None:
 
 def test_a_plane_keeps_its_depth_when_shrunk() -> None:
     """Inverse depth is linear on the ground: each new row has its middle's value within 1 %."""
-    picture = np.empty((144, 256))
-    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, picture)
-    small = shrunk(picture, (84, 84))
+    image = np.empty((144, 256))
+    draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, image)
+    small = shrunk(image, (84, 84))
     middle_v = (np.arange(44, 84) + 0.5) * 144 / 84 - 72
     np.testing.assert_allclose(small[44:, 0], 1.4 * 128 / middle_v, rtol=0.01)
     assert np.all(np.isinf(small[:42]))

@@ -1,4 +1,4 @@
-"""Whole depth pictures of both worlds against Intel's ray tracer, Embree.
+"""Whole depth images of both worlds against Intel's ray tracer, Embree.
 
 Embree, in single precision, only says which triangle a ray hits; how far away that one's plane is,
 is worked out here in double precision. A pixel is at an edge if the rays around it do not all hit
@@ -16,17 +16,17 @@ import pytest
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.camera import Lens, level_axes
-from mcaprl.sims.drawing.depth import encode_depth
+from mcaprl.sims.drawing.depth import DepthCamera, encode_depth
 from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.geometry.vectors import Quaternion, Vector
+from mcaprl.sims.lane.camera import IMAGE_SHAPE, lane_mesh
 from mcaprl.sims.lane.camera import LENS as LANE_LENS
-from mcaprl.sims.lane.camera import lane_camera, lane_mesh
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.powerline.camera import LENS as DRONE_LENS
 from mcaprl.sims.powerline.camera import DroneCamera, world_mesh
+from mcaprl.sims.powerline.course import LENGTH_M, point_on_line
 from mcaprl.sims.powerline.quadrotor import Drone, cruising
 from mcaprl.sims.powerline.rules import collides
-from mcaprl.sims.powerline.world import LENGTH_M, point_on_line
 from tests.conftest import need
 
 Floats = NDArray[np.float64]
@@ -54,7 +54,7 @@ class RayTracer:
         self._rays = np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def look(self, eye_m: Floats, axes: Floats) -> tuple[Codes, NDArray[np.bool_]]:
-        """Give the picture's codes, and where they are at an edge."""
+        """Return the image's codes, and where they are at an edge."""
         rays = self._rays @ axes
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         flat = rays.reshape(-1, 3)
@@ -71,7 +71,7 @@ class RayTracer:
 
 
 def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
-    """Make sure that a picture of 1/m is exact but at edges; give how many codes differ there."""
+    """Make sure that an image of 1/m is exact but at edges; give how many codes differ there."""
     with np.errstate(divide="ignore"):
         differs = encode_depth(1.0 / drawn) != expected
     assert not np.any(differs & ~at_edge)
@@ -81,7 +81,7 @@ def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
 def test_the_streets_are_exact_but_for_edges() -> None:
     """From 40 places in the lane, anywhere along the course, in any direction."""
     random = np.random.default_rng(11)
-    camera = lane_camera()
+    camera = DepthCamera(lane_mesh(), LANE_LENS, IMAGE_SHAPE)
     tracer = RayTracer(lane_mesh(), LANE_LENS)
     differing = 0
     for _ in range(POSES):

@@ -9,9 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.evaluation.batch_rollout import batch_rollout
 from mcaprl.sims.evaluation.evaluate import evaluate
-from mcaprl.sims.evaluation.rollout import EpsilonGreedy, run_episode
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, batch_rollout, run_episode
 
 
 class Swaying:

@@ -187,9 +187,9 @@ def test_a_constant_steering_drives_a_circle() -> None:
     for _ in range(4000):
         motion = roll(motion, slip_of(angle_rad), 0.0, wheelbase_m, 0.001)
         points.append((motion.x_m, motion.y_m))
-    centre = (-radius_m * math.sin(slip_rad), radius_m * math.cos(slip_rad))
+    center = (-radius_m * math.sin(slip_rad), radius_m * math.cos(slip_rad))
     np.testing.assert_allclose(
-        np.linalg.norm(np.array(points) - centre, axis=1), radius_m, rtol=1e-3
+        np.linalg.norm(np.array(points) - center, axis=1), radius_m, rtol=1e-3
     )
     assert motion.yaw_rad == pytest.approx(4.0 * 5.0 / radius_m)
 

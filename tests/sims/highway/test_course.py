@@ -46,7 +46,7 @@ def test_a_straight_road_by_hand() -> None:
 
 
 def test_a_ring_by_hand() -> None:
-    """Their clockwise, on pictures with y down, turns right: clockwise in ROS axes as well."""
+    """Their clockwise, on images with y down, turns right: clockwise in ROS axes as well."""
     ring = a_ring()
     assert ring.is_closed
     assert ring.length_m == pytest.approx(2 * math.pi * 20.0, rel=1e-3)
@@ -85,7 +85,7 @@ def test_racetracks_are_closed_and_their_lanes_5_m_apart(road: str, lanes: int) 
         assert course.is_closed
         np.testing.assert_array_equal(course.points_m[0], course.points_m[-1])
         assert 0.4 < np.diff(course.along_m).min() < np.diff(course.along_m).max() < 1.6
-        # Their lanes' ends miss each other by some centimetres.
+        # Their lanes' ends miss each other by some centimeters.
         turns = np.diff(np.unwrap(np.arctan2(*np.diff(course.points_m, axis=0).T[::-1])))
         assert np.abs(turns).max() < 0.25
     for inner, outer in itertools.pairwise(found):

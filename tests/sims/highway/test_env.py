@@ -187,7 +187,7 @@ def test_a_pose_off_the_road_or_in_another_car_is_refused() -> None:
         sim.reset(options={"pose": (60.0, -45.0, 0.0)})
     sim.reset(seed=0)
     (other,) = sim.others
-    with pytest.raises(UsageError, match="is where another car is"):
+    with pytest.raises(UsageError, match="is occupied by another car"):
         sim.reset(seed=0, options={"pose": (other.x_m, other.y_m, 0.0)})
 
 

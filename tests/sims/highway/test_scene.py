@@ -47,7 +47,7 @@ def test_lines_are_at_the_edges_of_lanes() -> None:
     offsets = np.array(
         [[course.nearest(x_m, y_m).offset_m for course in sim.courses] for x_m, y_m in points]
     )
-    # Their lanes' ends miss each other by some decimetres.
+    # Their lanes' ends miss each other by some decimeters.
     assert np.quantile(np.abs(np.abs(offsets).min(axis=1) - 2.5), 0.95) < 0.1
     # The first lane is the left one.
     left = np.isclose(offsets[:, 0], 2.5, atol=0.1)
@@ -69,22 +69,22 @@ def test_cars_are_where_they_are() -> None:
     assert abs(sim.courses[0].nearest(other.x_m, other.y_m).offset_m) < 5.1
 
 
-def near(picture: Any, color: Color) -> Any:
+def near(image: Any, color: Color) -> Any:
     wanted = np.round(255 * np.array(color[:3]))
-    return np.all(np.abs(picture - wanted) <= 2, axis=-1)
+    return np.all(np.abs(image - wanted) <= 2, axis=-1)
 
 
-def test_the_picture_shows_the_car_on_its_road() -> None:
+def test_the_image_shows_the_car_on_its_road() -> None:
     env = make_sim("highway-lane", render_mode="rgb_array", **TRACK)
     env.reset(seed=0, options={"pose": (60.0, 0.0, 0.0)})
-    picture: Any = env.render()
+    image: Any = env.render()
     env.close()
-    assert (picture.shape, picture.dtype) == ((600, 600, 3), np.uint8)
-    rows, columns = np.nonzero(near(picture, PAINT))
+    assert (image.shape, image.dtype) == ((600, 600, 3), np.uint8)
+    rows, columns = np.nonzero(near(image, PAINT))
     assert (abs(rows.mean() - 300) < 3, abs(columns.mean() - 300) < 5) == (True, True)
-    assert near(picture, OTHER_PAINT).sum() > 100
+    assert near(image, OTHER_PAINT).sum() > 100
     # 80 m are 600 pixels: the left edge of the left lane is 19 pixels up, two lanes are 75 wide.
-    column = picture[250:400, 330]
+    column = image[250:400, 330]
     rows = np.flatnonzero(near(column, ASPHALT))
     assert rows.min() == pytest.approx(50 - 19, abs=3)
     assert rows.max() == pytest.approx(50 + 56, abs=3)

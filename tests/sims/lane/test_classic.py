@@ -241,7 +241,7 @@ def test_fault_in_a_second_nothing_can_be_corrected() -> None:
         assert sim.step(action)[4]["reason"] == "off_lane"
 
 
-def test_fault_half_of_the_picture_s_codes_are_for_1_to_2_m() -> None:
+def test_fault_half_of_the_image_s_codes_are_for_1_to_2_m() -> None:
     sim = lane(observation="depth")
     observation, _ = sim.reset(seed=0)
     depth_m = sim.depth_image_m()

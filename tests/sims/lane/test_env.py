@@ -69,7 +69,7 @@ def test_a_pose_is_kept() -> None:
     ("options", "words"),
     [
         ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: at most 3.5 m"),
-        ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s is 0 to 30, not -1.0"),
+        ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s must be 0 to 30, not -1.0"),
     ],
 )
 def test_a_bad_pose_is_refused(options: dict[str, Any], words: str) -> None:

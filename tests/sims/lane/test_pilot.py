@@ -14,7 +14,7 @@ from mcaprl.sims.lane.rules import DRIVING, drive, end_of, located
 
 
 def drive_through(start: str, seed: int) -> tuple[float, str, float]:
-    """Let the pilot drive one episode: return, reason, progress in metres."""
+    """Let the pilot drive one episode: return, reason, progress in meters."""
     env = make_sim("lane", start=start)
     pilot = make_pilot(env)
     observation, info = env.reset(seed=seed)

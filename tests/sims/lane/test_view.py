@@ -1,4 +1,4 @@
-"""The pictures of the lane sim from above, and the flattening of shapes behind them."""
+"""The images of the lane sim from above, and the flattening of shapes behind them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mcaprl.sims.lane.scene import GRASS, PAINT
 ENV_ID = mcaprl.sims.SIMS["lane"]
 RED: Color = (1.0, 0.0, 0.0, 1.0)
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
 
 @pytest.fixture(autouse=True)
@@ -27,27 +27,27 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
-def picture_at(pose: tuple[float, float, float]) -> Picture:
-    """Give the picture of a car at a pose."""
+def image_at(pose: tuple[float, float, float]) -> Image:
+    """Return the image of a car at a pose."""
     env = gym.make(ENV_ID, render_mode="rgb_array")
     env.reset(options={"pose": pose})
-    picture = env.render()
+    image = env.render()
     env.close()
-    assert isinstance(picture, np.ndarray)
-    return picture
+    assert isinstance(image, np.ndarray)
+    return image
 
 
-def near(picture: Picture, color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a colour, but for rounding."""
+def near(image: Image, color: Color) -> NDArray[np.bool_]:
+    """Say which pixels have a color, but for rounding."""
     wanted = np.round(255 * np.array(color[:3]))
-    return np.asarray(np.all(np.abs(picture - wanted) <= 2, axis=-1))
+    return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
-def test_a_picture_has_the_car_in_its_middle() -> None:
-    picture = picture_at((50.0, 1.0, 0.0))
-    assert picture.shape == (600, 600, 3)
-    assert picture.dtype == np.uint8
-    rows, columns = np.nonzero(near(picture, PAINT))
+def test_a_image_has_the_car_in_its_middle() -> None:
+    image = image_at((50.0, 1.0, 0.0))
+    assert image.shape == (600, 600, 3)
+    assert image.dtype == np.uint8
+    rows, columns = np.nonzero(near(image, PAINT))
     assert abs(rows.mean() - 300) < 12
     assert abs(columns.mean() - 300) < 12
 
@@ -55,17 +55,17 @@ def test_a_picture_has_the_car_in_its_middle() -> None:
 def test_the_car_points_where_it_is_heading() -> None:
     """Along x it is longer from left to right, along y from top to bottom."""
     for yaw_rad, wide in ((0.0, True), (math.pi / 2, False)):
-        rows, columns = np.nonzero(near(picture_at((50.0, 1.0, yaw_rad)), PAINT))
+        rows, columns = np.nonzero(near(image_at((50.0, 1.0, yaw_rad)), PAINT))
         assert (np.ptp(columns) > 1.5 * np.ptp(rows)) == wide
 
 
 def test_north_is_up_and_east_is_right() -> None:
     """10 m before the corner at (130, 1): grass 8 m to the north, none 8 m to the east."""
-    grass = near(picture_at((120.0, 1.0, 0.0)), GRASS)
-    ten_metres_px = round(10 * 600 / 55)
-    assert grass[300 - ten_metres_px // 2, 250]
-    assert not grass[300, 300 + ten_metres_px]
-    assert not grass[300 - ten_metres_px, 300 + ten_metres_px]
+    grass = near(image_at((120.0, 1.0, 0.0)), GRASS)
+    ten_meters_px = round(10 * 600 / 55)
+    assert grass[300 - ten_meters_px // 2, 250]
+    assert not grass[300, 300 + ten_meters_px]
+    assert not grass[300 - ten_meters_px, 300 + ten_meters_px]
 
 
 def test_a_window_shows_each_step() -> None:

@@ -20,8 +20,7 @@ from mcaprl.sims.powerline.camera import (
     world_mesh,
     world_wires,
 )
-from mcaprl.sims.powerline.quadrotor import Drone, cruising
-from mcaprl.sims.powerline.world import (
+from mcaprl.sims.powerline.course import (
     LENGTH_M,
     POINTS_M,
     WIRES_M,
@@ -29,6 +28,7 @@ from mcaprl.sims.powerline.world import (
     point_on_line,
     towers,
 )
+from mcaprl.sims.powerline.quadrotor import Drone, cruising
 
 Floats = NDArray[np.float64]
 ZERO = Vector(0.0, 0.0, 0.0)
@@ -39,7 +39,7 @@ def level_at(x: float, y: float, z: float) -> Drone:
 
 
 def cast(eye: Floats, ray: Floats) -> float:
-    """Give 1/distance of the nearest front of the world that a unit ray meets, or 0.
+    """Return 1/distance of the nearest front of the world that a unit ray meets, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -80,7 +80,7 @@ def test_the_world_looks_as_ray_casting_says(view: str) -> None:
 
 
 def test_the_ground_is_straight_below() -> None:
-    """Half a cell beside the line's wires, the middle of the picture shows the height."""
+    """Half a cell beside the line's wires, the middle of the image shows the height."""
     x, y = 250.0, 60.0
     drone = level_at(x, y, -ground_height(x, y) - 20.0)
     image = DroneCamera("down").image_m(drone)
@@ -108,7 +108,7 @@ def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
 
 @pytest.mark.parametrize("view", ["down", "front"])
 def test_conductors_are_seen_all_along_the_line(view: str) -> None:
-    """Above the middle of each span; without them, the same picture shows but the ground."""
+    """Above the middle of each span; without them, the same image shows but the ground."""
     camera = DroneCamera(view)
     bare = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
     for leg in range(4):
@@ -128,33 +128,33 @@ def test_the_conductor_below_has_its_distance() -> None:
 def test_a_wire_takes_one_pixel_of_each_column() -> None:
     """1 m below the axis at 10 m: row 6 + 8 x .1 = 6.8, so pixel 6, in all 16 columns."""
     wire = np.array([[[-99.0, 1.0, 10.0], [99.0, 1.0, 10.0]]])
-    picture = np.zeros((12, 16))
-    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, picture)
-    assert np.flatnonzero(picture.any(axis=1)).tolist() == [6]
-    np.testing.assert_allclose(picture[6], 0.1, rtol=1e-12)
+    image = np.zeros((12, 16))
+    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)
+    assert np.flatnonzero(image.any(axis=1)).tolist() == [6]
+    np.testing.assert_allclose(image[6], 0.1, rtol=1e-12)
 
 
 def test_a_steep_wire_takes_one_pixel_of_each_row() -> None:
     wire = np.array([[[1.0, -99.0, 10.0], [1.0, 99.0, 10.0]]])
-    picture = np.zeros((12, 16))
-    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, picture)
-    assert np.flatnonzero(picture.any(axis=0)).tolist() == [8]
-    assert np.all(picture[:, 8] > 0)
+    image = np.zeros((12, 16))
+    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)
+    assert np.flatnonzero(image.any(axis=0)).tolist() == [8]
+    assert np.all(image[:, 8] > 0)
 
 
 def test_a_wire_hides_behind_what_is_nearer_and_the_lens() -> None:
     wires = np.array([[[-9.0, 0.0, 10.0], [9.0, 0.0, 10.0]], [[-9.0, 0.0, -1.0], [9.0, 0.0, -1.0]]])
-    picture = np.full((12, 16), 0.5)
-    draw_wires(wires, np.zeros(3), np.eye(3), 8.0, 8.0, picture)
-    assert np.all(picture == 0.5)
+    image = np.full((12, 16), 0.5)
+    draw_wires(wires, np.zeros(3), np.eye(3), 8.0, 8.0, image)
+    assert np.all(image == 0.5)
 
 
 def test_a_wire_that_passes_the_lens_is_cut_and_linear_in_1_over_z() -> None:
     """Parallel to the axis, 1 m to the right, from behind: u = 8 + 8/z, so 1/z = (u - 8) / 8."""
     wire = np.array([[[1.0, 0.1, -5.0], [1.0, 0.1, 1000.0]]])
-    picture = np.zeros((12, 16))
-    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, picture)
-    np.testing.assert_allclose(picture.max(axis=0)[9:], (np.arange(9, 16) - 7.5) / 8, rtol=1e-9)
+    image = np.zeros((12, 16))
+    draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)
+    np.testing.assert_allclose(image.max(axis=0)[9:], (np.arange(9, 16) - 7.5) / 8, rtol=1e-9)
 
 
 def test_rays_through_oblong_pixels() -> None:

@@ -16,10 +16,10 @@ from mcaprl.sims.powerline.classic import (
     classic_end,
     classic_reward,
 )
+from mcaprl.sims.powerline.course import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.quadrotor import POINT
 from mcaprl.sims.powerline.rules import COLLISION, FLYING, OFF_LINE, begin
-from mcaprl.sims.powerline.world import LEG_LENGTHS_M, LENGTH_M, POINTS_M, TANGENTS, point_on_line
 
 ZERO = Vector(0.0, 0.0, 0.0)
 NORTH, SOUTH, NOTHING = 0, 3, 6
@@ -43,7 +43,7 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
         (beside(1, 60.0, 1.0), 2.0, False, 1.367879, FLYING),
         # 1 m beside it at rest: e^-1 - 1.
         (beside(1, 60.0, 1.0), 0.0, False, -0.632121, FLYING),
-        # 3 m beside it at half a metre per second: e^-3 - .5.
+        # 3 m beside it at half a meter per second: e^-3 - .5.
         (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
         # 6.99 m beside it: e^-6.99 - .5 + 9.5, for 10 m/s in any direction.
         (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
@@ -171,7 +171,7 @@ def test_fault_in_5_seconds_nothing_can_be_corrected() -> None:
         assert sim.step(action)[4]["reason"] == "off_line"
 
 
-def test_fault_half_of_the_picture_s_codes_are_for_1_to_2_m() -> None:
+def test_fault_half_of_the_image_s_codes_are_for_1_to_2_m() -> None:
     sim = make_sim("powerline", rules="classic", observation="depth").unwrapped
     assert isinstance(sim, PowerlineEnv)
     observation, _ = sim.reset(seed=0)

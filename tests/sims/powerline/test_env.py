@@ -11,8 +11,8 @@ import pytest
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.sims import make_sim
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
+from mcaprl.sims.powerline.course import LENGTH_M, POINTS_M, point_on_line
 from mcaprl.sims.powerline.env import PowerlineEnv
-from mcaprl.sims.powerline.world import LENGTH_M, POINTS_M, point_on_line
 
 NORTH, DOWN, NOTHING = 0, 2, 6
 
@@ -92,7 +92,7 @@ def test_a_pose_is_kept_and_told_in_ros_axes() -> None:
         ({"pose": (1.0, math.inf, 0.0)}, "is not \\(x_m, y_m, z_m\\)"),
         ({"pose": (0.0, -32.0, 19.0)}, "ends the episode at once: collision.*z points down"),
         ({"pose": (0.0, -32.0, -30.0)}, "ends the episode at once: off_line, .* m from the line"),
-        ({"pose": (0.0, -32.0, -19.0, 9.0, 0.0, 0.0)}, "speed in m/s is 0 to 8, not 9.0"),
+        ({"pose": (0.0, -32.0, -19.0, 9.0, 0.0, 0.0)}, "speed in m/s must be 0 to 8, not 9.0"),
         ({"place": (0.0, -32.0, -19.0)}, "only the option 'pose', not \\['place'\\]"),
     ],
 )
@@ -118,10 +118,10 @@ def test_an_unknown_value_is_refused(kwargs: dict[str, str], words: str) -> None
 @pytest.mark.parametrize(
     ("kwargs", "words"),
     [
-        ({"wind_m_s": -1.0}, "wind_m_s is 0 to 8, not -1.0"),
-        ({"wind_m_s": math.nan}, "wind_m_s is 0 to 8, not nan"),
-        ({"gust_m_s": 4.0}, "gust_m_s is 0 to 3, not 4.0"),
-        ({"gust_m_s": 1.0, "rules": "classic"}, "gust_m_s is 0 to 0, not 1.0"),
+        ({"wind_m_s": -1.0}, "wind_m_s must be 0 to 8, not -1.0"),
+        ({"wind_m_s": math.nan}, "wind_m_s must be 0 to 8, not nan"),
+        ({"gust_m_s": 4.0}, "gust_m_s must be 0 to 3, not 4.0"),
+        ({"gust_m_s": 1.0, "rules": "classic"}, "gust_m_s must be 0 to 0, not 1.0"),
     ],
 )
 def test_a_number_out_of_range_is_refused(kwargs: dict[str, Any], words: str) -> None:
@@ -168,10 +168,10 @@ def test_what_the_camera_sees_is_what_is_observed(camera: str) -> None:
     np.testing.assert_allclose(moved["motion"], expected, atol=1e-6)
 
 
-def test_the_classic_picture_has_the_published_code() -> None:
+def test_the_classic_image_has_the_published_code() -> None:
     """255 / max(1, d), rounded down; nothing is 0."""
-    metres = np.array([0.3, 1.0, 2.0, 6.0, 300.0, np.inf])
-    assert encode_nearness(metres).tolist() == [255, 255, 127, 42, 0, 0]
+    meters = np.array([0.3, 1.0, 2.0, 6.0, 300.0, np.inf])
+    assert encode_nearness(meters).tolist() == [255, 255, 127, 42, 0, 0]
     sim = powerline(rules="classic", observation="depth")
     seen, _ = sim.reset(seed=0)
     assert seen.shape == (84, 84, 1)

@@ -9,8 +9,8 @@ import pytest
 
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.powerline.course import TANGENTS, point_on_line
 from mcaprl.sims.powerline.pilot import corner_speed, wanted_velocity
-from mcaprl.sims.powerline.world import TANGENTS, point_on_line
 
 
 def fly_through(seed: int, **kwargs: Any) -> tuple[float, str, float]:
@@ -54,7 +54,7 @@ def test_on_the_line_it_wants_to_fly_along_it() -> None:
     np.testing.assert_allclose(np.array(wanted), 5.0 * TANGENTS[2], atol=1e-6)
 
 
-def test_it_flies_on_pictures_too_and_one_drone_at_a_time() -> None:
+def test_it_flies_on_images_too_and_one_drone_at_a_time() -> None:
     env = make_sim("powerline", observation="depth")
     observation, _ = env.reset(seed=0)
     pilot = make_pilot(env)

@@ -155,7 +155,7 @@ def test_a_free_spin_keeps_its_momentum_and_energy() -> None:
 
 
 def energy_j(drone: Drone) -> float:
-    """Give kinetic energy, of flying and turning, and that of height."""
+    """Return kinetic energy, of flying and turning, and that of height."""
     rates = drone.rates_rad_s
     moving = 0.5 * MASS_KG * dot(drone.velocity_m_s, drone.velocity_m_s)
     turning = 0.5 * dot(rates, angular_momentum(rates))

@@ -71,7 +71,7 @@ def their_body() -> Any:
 
 
 def to_theirs(drone: Drone, wind: Vector) -> dict[str, Floats]:
-    """Give a drone as a state of rotorpy's."""
+    """Return a drone as a state of rotorpy's."""
     w, x, y, z = drone.attitude
     return {
         "x": HALF_TURN * drone.position_m,

@@ -10,6 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaprl.sims.geometry.vectors import Vector
+from mcaprl.sims.powerline.course import (
+    ALONG_M,
+    LENGTH_M,
+    POINTS_M,
+    TANGENTS,
+    WIRES_M,
+    ground_height,
+    nearest_on_line,
+    point_on_line,
+    towers,
+)
 from mcaprl.sims.powerline.quadrotor import POINT, QUAD
 from mcaprl.sims.powerline.rules import (
     COLLISION,
@@ -30,17 +41,6 @@ from mcaprl.sims.powerline.rules import (
     reward_of,
     step_flights,
     store_flight,
-)
-from mcaprl.sims.powerline.world import (
-    ALONG_M,
-    LENGTH_M,
-    POINTS_M,
-    TANGENTS,
-    WIRES_M,
-    ground_height,
-    nearest_on_line,
-    point_on_line,
-    towers,
 )
 
 ZERO = Vector(0.0, 0.0, 0.0)

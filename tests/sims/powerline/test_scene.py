@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from mcaprl.sims import SIMS, make_sim
 from mcaprl.sims.drawing.scene import Color, Frame
+from mcaprl.sims.powerline.course import POINTS_M, point_on_line, to_ros
 from mcaprl.sims.powerline.env import PowerlineEnv
 from mcaprl.sims.powerline.scene import PAINT, ROUTE
-from mcaprl.sims.powerline.world import POINTS_M, point_on_line, to_ros
 
 DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "arrow": 2}
 NORTH, EAST = 0, 1
@@ -108,27 +108,27 @@ def test_the_offset_is_drawn_to_the_nearest_point() -> None:
     assert distance_m == pytest.approx(sim.telemetry()["line_distance_m"])
 
 
-def picture_at(along_m: float) -> NDArray[np.uint8]:
+def image_at(along_m: float) -> NDArray[np.uint8]:
     env = gym.make(SIMS["powerline"], render_mode="rgb_array")
     env.reset(options={"pose": tuple(point_on_line(along_m))})
-    picture = env.render()
+    image = env.render()
     env.close()
-    assert isinstance(picture, np.ndarray)
-    return picture
+    assert isinstance(image, np.ndarray)
+    return image
 
 
-def near(picture: NDArray[np.uint8], color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a colour, but for rounding."""
+def near(image: NDArray[np.uint8], color: Color) -> NDArray[np.bool_]:
+    """Say which pixels have a color, but for rounding."""
     wanted = np.round(255 * np.array(color[:3]))
-    return np.asarray(np.all(np.abs(picture - wanted) <= 3, axis=-1))
+    return np.asarray(np.all(np.abs(image - wanted) <= 3, axis=-1))
 
 
 @pytest.mark.parametrize("along_m", [5.0, 60.0, 300.0, 600.0])
-def test_a_picture_has_the_drone_in_its_middle_and_in_the_strip(along_m: float) -> None:
+def test_a_image_has_the_drone_in_its_middle_and_in_the_strip(along_m: float) -> None:
     """Where the line is low as well as where it is high: hills never cover the drone."""
-    picture = picture_at(along_m)
-    assert picture.shape == (600, 600, 3)
-    rows, columns = np.nonzero(near(picture, PAINT))
+    image = image_at(along_m)
+    assert image.shape == (600, 600, 3)
+    rows, columns = np.nonzero(near(image, PAINT))
     above, strip = rows < 430, rows >= 430
     assert abs(rows[above].mean() - 300) < 12
     assert abs(columns[above].mean() - 300) < 12
@@ -138,7 +138,7 @@ def test_a_picture_has_the_drone_in_its_middle_and_in_the_strip(along_m: float) 
 
 def test_north_is_right_and_west_is_up() -> None:
     """The last leg leads north-east: from lower right to upper left is across it."""
-    route = near(picture_at(500.0)[:430], ROUTE)
+    route = near(image_at(500.0)[:430], ROUTE)
     rows, columns = np.nonzero(route)
     assert np.corrcoef(rows, columns)[0, 1] > 0.9
 

@@ -10,10 +10,10 @@ import pytest
 
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims.racer.course import Track
 from mcaprl.sims.racer.env import RacerEnv
 from mcaprl.sims.racer.rays import RAY_NAMES, RAYS, measure
-from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, judge, observe
-from mcaprl.sims.racer.track import Track
+from mcaprl.sims.racer.rules import CRASH, DRIVING, NO_GATE, TIME_LIMIT, drive, observe, outcome_of
 from tests.support.racer_tracks import car_in, corridor
 
 NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
@@ -69,7 +69,7 @@ def test_rewards_and_ends_by_hand(
     track = corridor()
     before = car_in(track, x_px, y_px, heading_deg, speed_px)
     after = drive(track, before, action, True, False)
-    assert judge(track, before, after, True) == (reward, end)
+    assert outcome_of(track, before, after, True) == (reward, end)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_rewards_and_ends_by_hand(
 def test_time_runs_out(idle: float, steps: float, end: int) -> None:
     track = corridor()
     before = car_in(track, 50.0, 150.0)._replace(idle_steps=idle, steps=steps)
-    assert judge(track, before, drive(track, before, NONE, True, False), True) == (0, end)
+    assert outcome_of(track, before, drive(track, before, NONE, True, False), True) == (0, end)
 
 
 def test_fault_forward_drives_backward() -> None:
@@ -95,7 +95,7 @@ def test_fault_forward_drives_backward() -> None:
     assert observation[18] == pytest.approx(-0.2)
 
 
-def test_fault_corner_rays_cross_the_nose_and_start_at_the_centre() -> None:
+def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
     """From (500.5, 130.5): the corners are at 515.5, and what they see is floored to 515."""
     seen = lengths_of(corridor(), 500.5, 130.5)
     assert seen["left_corner_sideways"] == pytest.approx(math.hypot(14.5, 69.5))
@@ -130,8 +130,8 @@ def test_fault_a_joint_of_walls_costs_twice() -> None:
     track = corridor()
     before = car_in(track, 985.0, 115.0, -45)
     after = drive(track, before, NONE, True, False)
-    assert judge(track, before, after, True)[0] == -2
-    assert judge(track, before, after, False)[0] == -1
+    assert outcome_of(track, before, after, True)[0] == -2
+    assert outcome_of(track, before, after, False)[0] == -1
 
 
 def test_fault_a_gate_driven_over_without_a_look_is_lost() -> None:

@@ -81,7 +81,7 @@ def test_an_unknown_value_is_refused(kwargs: dict[str, Any], words: str) -> None
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "3", True])
 def test_a_tracks_seed_is_a_whole_number(seed: Any) -> None:
-    with pytest.raises(UsageError, match="track_seed is None or a whole number of 0 or more"):
+    with pytest.raises(UsageError, match="track_seed must be None or an integer of at least 0"):
         racer(track_seed=seed)
 
 
@@ -93,7 +93,7 @@ def test_fewer_actions_are_some_of_the_nine() -> None:
         sim.reset(options={"pose": (5.0, 30.0, -math.pi / 2)})
         sim.step(action)
         assert sim.telemetry()["speed_m_s"] == 2.0
-    with pytest.raises(UsageError, match="0 to 4 do"):
+    with pytest.raises(UsageError, match="actions are 0 to 4"):
         five.step(5)
 
 

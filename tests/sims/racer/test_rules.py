@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaprl.sims.racer.car import is_beyond, placed, racer_at
+from mcaprl.sims.racer.car import car_at, is_beyond, placed
+from mcaprl.sims.racer.course import make_track
 from mcaprl.sims.racer.rays import FAR_PX, RAY_NAMES, RAYS, cast, measure, ray_ends
 from mcaprl.sims.racer.rules import (
     ACTION_MEANINGS,
@@ -19,12 +20,11 @@ from mcaprl.sims.racer.rules import (
     OBSERVATION_NAMES,
     TIME_LIMIT,
     drive,
-    judge,
     observe,
-    step_racers,
+    outcome_of,
+    step_cars,
     walls_hit,
 )
-from mcaprl.sims.racer.track import make_track
 from tests.support.racer_tracks import car_in, corridor
 
 NONE, FORWARD, LEFT, RIGHT, BACK = range(5)
@@ -69,7 +69,7 @@ def test_rewards_and_ends_by_hand(
     track = corridor()
     before = car_in(track, x_px, y_px, heading_deg, speed_px)
     after = drive(track, before, action, False, False)
-    assert judge(track, before, after, False) == (reward, end)
+    assert outcome_of(track, before, after, False) == (reward, end)
 
 
 @pytest.mark.parametrize(
@@ -87,13 +87,13 @@ def test_time_runs_out(idle: float, steps: float, x_px: float, reward: float, en
     track = corridor()
     before = car_in(track, x_px, 150.0, 0, 2)._replace(idle_steps=idle, steps=steps)
     after = drive(track, before, NONE, False, False)
-    assert judge(track, before, after, False) == (reward, end)
+    assert outcome_of(track, before, after, False) == (reward, end)
 
 
 def test_a_crash_comes_before_running_out_of_time() -> None:
     track = corridor()
     before = car_in(track, 500.0, 106.0)._replace(idle_steps=99)
-    assert judge(track, before, drive(track, before, NONE, False, False), False) == (-1, CRASH)
+    assert outcome_of(track, before, drive(track, before, NONE, False, False), False) == (-1, CRASH)
 
 
 def test_actions_by_hand() -> None:
@@ -214,13 +214,13 @@ def test_many_cars_drive_as_one_does(
     cars, actions = np.array(before), np.array([action for _, action in starts])
     rewards, ends = np.zeros(len(cars)), np.zeros(len(cars), dtype=np.int64)
     observations = np.zeros((len(cars), 19), dtype=np.float32)
-    step_racers(track, cars, actions, rewards, ends, observations, classic, drift)
+    step_cars(track, cars, actions, rewards, ends, observations, classic, drift)
     for i, car in enumerate(before):
         alone = drive(track, car, actions[i], classic, drift)
         seen = np.zeros(19, dtype=np.float32)
         observe(track, alone, classic, seen)
-        assert racer_at(cars[i]) == alone
-        assert (rewards[i], ends[i]) == judge(track, car, alone, classic)
+        assert car_at(cars[i]) == alone
+        assert (rewards[i], ends[i]) == outcome_of(track, car, alone, classic)
         assert seen.tobytes() == observations[i].tobytes()
 
 

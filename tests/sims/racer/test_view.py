@@ -1,4 +1,4 @@
-"""What the racer sim shows: its scene, and its pictures from above."""
+"""What the racer sim shows: its scene, and its images from above."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.sim_shapes import rotated
 ENV_ID = mcaprl.sims.SIMS["racer"]
 START = (5.0, 30.0, -math.pi / 2)
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 
 
 @pytest.fixture(autouse=True)
@@ -27,35 +27,35 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
-def picture_after(actions: list[int]) -> Picture:
-    """Give the picture of a car that did this from the start line."""
+def image_after(actions: list[int]) -> Image:
+    """Return the image of a car that did this from the start line."""
     env = gym.make(ENV_ID, render_mode="rgb_array")
     env.reset(options={"pose": START})
     for action in actions:
         env.step(action)
-    picture = env.render()
+    image = env.render()
     env.close()
-    assert isinstance(picture, np.ndarray)
-    return picture
+    assert isinstance(image, np.ndarray)
+    return image
 
 
-def near(picture: Picture, color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a colour, but for rounding."""
+def near(image: Image, color: Color) -> NDArray[np.bool_]:
+    """Say which pixels have a color, but for rounding."""
     wanted = np.round(255 * np.array(color[:3]))
-    return np.asarray(np.all(np.abs(picture - wanted) <= 2, axis=-1))
+    return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
-def test_the_picture_is_the_rules_own() -> None:
-    """Pixels of the rules are those of the picture: the car at (50, 300), the infield at 300."""
-    picture = picture_after([])
-    assert picture.shape == (600, 1000, 3)
-    assert picture.dtype == np.uint8
-    rows, columns = np.nonzero(near(picture, PAINT))
+def test_the_image_is_the_rules_own() -> None:
+    """Pixels of the rules are those of the image: the car at (50, 300), the infield at 300."""
+    image = image_after([])
+    assert image.shape == (600, 1000, 3)
+    assert image.dtype == np.uint8
+    rows, columns = np.nonzero(near(image, PAINT))
     assert abs(rows.mean() - 300) < 8
     assert abs(columns.mean() - 50) < 3
-    assert near(picture, GRASS)[300, 300]
-    assert near(picture, ASPHALT)[:, 65].sum() > 50
-    rows, columns = np.nonzero(near(picture, NEXT_GATE))
+    assert near(image, GRASS)[300, 300]
+    assert near(image, ASPHALT)[:, 65].sum() > 50
+    rows, columns = np.nonzero(near(image, NEXT_GATE))
     assert abs(rows.mean() - 333) < 8
 
 
@@ -64,17 +64,17 @@ def test_the_picture_is_the_rules_own() -> None:
     [(0, []), (1, [(1, 0)]), (2, [(0, 1)]), (3, [(2, 1)]), (4, [(1, 1)]), (8, [(1, 0), (2, 1)])],
 )
 def test_the_keys_light_up(action: int, pressed: list[tuple[int, int]]) -> None:
-    picture = picture_after([1, action])
+    image = image_after([1, action])
     for key in ((1, 0), (0, 1), (1, 1), (2, 1)):
         column = PANEL_PX[0] + 115 + key[0] * (KEY_PX + 5) + 4
         row = PANEL_PX[1] + key[1] * (KEY_PX + 5) + 4
-        assert (tuple(picture[row, column]) == PRESSED) == (key in pressed)
-        middle = picture[row + KEY_PX // 2 - 4, column + KEY_PX // 2 - 4]
+        assert (tuple(image[row, column]) == PRESSED) == (key in pressed)
+        middle = image[row + KEY_PX // 2 - 4, column + KEY_PX // 2 - 4]
         assert tuple(middle) == INK, "an arrow on each key"
 
 
 def test_score_speed_and_step_are_written() -> None:
-    ink = [np.all(picture_after([1] * count) == INK, axis=-1) for count in (0, 5)]
+    ink = [np.all(image_after([1] * count) == INK, axis=-1) for count in (0, 5)]
     left, top = PANEL_PX
     for line in range(3):
         text = [each[top + 26 * line : top + 26 * (line + 1), left : left + 112] for each in ink]
@@ -97,7 +97,7 @@ def test_rendering_needs_a_mode() -> None:
     assert env.render() is None
 
 
-def test_the_scene_is_in_metres_where_the_car_is() -> None:
+def test_the_scene_is_in_meters_where_the_car_is() -> None:
     sim = gym.make(ENV_ID).unwrapped
     assert isinstance(sim, RacerEnv)
     sim.reset(options={"pose": START})

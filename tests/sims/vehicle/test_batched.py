@@ -95,7 +95,7 @@ def test_a_batch_does_what_single_sims_do(
 
 @every_batch
 def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, Any]) -> None:
-    """Vehicle i is the single sim of seed + i, whatever its neighbours do."""
+    """Vehicle i is the single sim of seed + i, whatever its neighbors do."""
     batch = make_sims(name, COUNT, **kwargs)
     batch.action_space.seed(0)
     seen, _ = batch.reset(seed=40)
@@ -207,15 +207,15 @@ def test_any_other_environment_is_batched_by_gymnasium() -> None:
 @pytest.mark.parametrize(
     ("name", "kwargs", "words"),
     [
-        ("lane", {"num_envs": 0}, "num_envs is a whole number of 1 or more, not 0"),
-        ("lane", {"num_envs": 2.5}, "num_envs is a whole number of 1 or more, not 2.5"),
-        ("lane", {"max_episode_steps": 0}, "max_episode_steps is a whole number of 1 or more"),
+        ("lane", {"num_envs": 0}, "num_envs must be an integer of at least 1, not 0"),
+        ("lane", {"num_envs": 2.5}, "num_envs must be an integer of at least 1, not 2.5"),
+        ("lane", {"max_episode_steps": 0}, "max_episode_steps must be an integer of at least 1"),
         ("lane", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
         ("CartPole-v1", {"autoreset_mode": "never"}, "unknown autoreset_mode 'never': .*SameStep"),
         ("lane", {"rules": "mine"}, "unknown rules 'mine': known: classic, classic-code, default"),
-        ("lane", {"colour": "red"}, "cannot make sim 'lane' with .*colour"),
-        ("racer", {"render_mode": "human"}, "batched sims draw no pictures"),
-        ("powerline", {"wind_m_s": 99.0}, "wind_m_s is 0 to 8, not 99.0"),
+        ("lane", {"color": "red"}, "cannot make sim 'lane' with .*color"),
+        ("racer", {"render_mode": "human"}, "batched sims do not render"),
+        ("powerline", {"wind_m_s": 99.0}, "wind_m_s must be 0 to 8, not 99.0"),
         ("boat", {}, "unknown sim 'boat'"),
     ],
 )
@@ -227,11 +227,11 @@ def test_a_bad_request_is_refused(name: str, kwargs: dict[str, Any], words: str)
 @pytest.mark.parametrize(
     ("actions", "words"),
     [
-        ([1, 2, 3], "an array of 2 whole numbers, not int64 of shape \\(3,\\)"),
-        ([1.0, 2.0], "an array of 2 whole numbers, not float64 of shape \\(2,\\)"),
-        (1, "an array of 2 whole numbers"),
-        ([0, 6], "action 6 does not exist: 0 to 5 do"),
-        ([-1, 0], "action -1 does not exist: 0 to 5 do"),
+        ([1, 2, 3], "an array of 2 integers, not int64 of shape \\(3,\\)"),
+        ([1.0, 2.0], "an array of 2 integers, not float64 of shape \\(2,\\)"),
+        (1, "an array of 2 integers"),
+        ([0, 6], "action 6 does not exist: actions are 0 to 5"),
+        ([-1, 0], "action -1 does not exist: actions are 0 to 5"),
     ],
 )
 def test_bad_actions_are_refused_and_change_nothing(actions: Any, words: str) -> None:
@@ -247,9 +247,9 @@ def test_bad_actions_are_refused_and_change_nothing(actions: Any, words: str) ->
     ("request_", "words"),
     [
         ({"seed": [1, 2, 3]}, "3 seeds for 2 environments"),
-        ({"options": {"reset_mask": np.array([True])}}, "reset_mask is an array of 2 bools"),
-        ({"options": {"reset_mask": np.zeros(2, bool)}}, "one of them true"),
-        ({"options": {"reset_mask": np.ones(2)}}, "reset_mask is an array of 2 bools"),
+        ({"options": {"reset_mask": np.array([True])}}, "reset_mask must be an array of 2 bools"),
+        ({"options": {"reset_mask": np.zeros(2, bool)}}, "at least one of them true"),
+        ({"options": {"reset_mask": np.ones(2)}}, "reset_mask must be an array of 2 bools"),
         ({"options": {"pose": [(50.0, 1.0, 0.0)] * 3}}, "3 poses for 2 environments"),
         ({"options": {"pose": (50.0, 9.0, 0.0)}}, "8.0 m from the path"),
         ({"options": {"place": 3}}, "only the option 'pose'"),

@@ -13,6 +13,7 @@ import pytest
 from tests.support.paths import ROOT
 
 CODE = "from mcaprl.sims.geometry.paths import wrap_angle; print(wrap_angle(4.0))"
+CACHE = Path("sims", "geometry", "__pycache__")
 RESULT = "-2.2831853071795862\n"
 
 
@@ -45,20 +46,20 @@ def run(package: Path, user_cache: Path) -> list[str]:
 def test_compiling_is_announced_once_and_kept(package: Path, tmp_path: Path) -> None:
     assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
     assert run(package, tmp_path) == []
-    assert list((package / "sims" / "__pycache__").glob("geometry.wrap_angle*.nbi"))
+    assert list((package / CACHE).glob("paths.wrap_angle*.nbi"))
 
 
 def test_where_the_package_cannot_be_written_the_user_s_folder_keeps_it(
     package: Path, tmp_path: Path
 ) -> None:
     # A file in the folder's place keeps even root from writing there.
-    (package / "sims" / "__pycache__").touch()
+    (package / CACHE).touch()
     assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
     assert run(package, tmp_path) == []
 
 
 def test_where_nothing_can_be_written_it_works_all_the_same(package: Path, tmp_path: Path) -> None:
-    (package / "sims" / "__pycache__").touch()
+    (package / CACHE).touch()
     nowhere = tmp_path / "file"
     nowhere.touch()
     for _ in range(2):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mcaprl.sims.racer.track import (
+from mcaprl.sims.racer.course import (
     GATES,
     HALF_WIDTH_PX,
     WALLS_PER_SIDE,
@@ -31,7 +31,7 @@ def area(corners: Floats) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_two_closed_walls_on_the_picture(seed: int | None) -> None:
+def test_two_closed_walls_on_the_image(seed: int | None) -> None:
     track = make_track(seed)
     assert track.walls_px.shape == (48, 4)
     for side in sides(track):
@@ -88,5 +88,5 @@ def test_seeds_make_different_tracks_and_the_same_again() -> None:
     assert first.gates_px.tobytes() == again.gates_px.tobytes()
 
 
-def test_the_maps_axes_are_those_of_the_picture_turned_up() -> None:
+def test_the_maps_axes_are_those_of_the_image_turned_up() -> None:
     assert to_map(np.array([[0.0, 600.0], [1000.0, 0.0]])).tolist() == [[0, 0], [100, 60]]

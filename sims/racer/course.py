@@ -1,8 +1,8 @@
-"""The tracks of the racer sim: a closed spline, walls along both sides of it, and gates across.
+"""Tracks of the racer sim: a closed spline with walls on both sides and gates across it.
 
-Pixels are those of a 1000 x 600 picture: x to the right, y down, angles clockwise. One pixel is
-0.1 m; the map of viewers has its origin in the picture's lower left corner, y up, and angles
-counter-clockwise.
+Pixels are those of a 1000 x 600 image: x to the right, y down, angles clockwise. One pixel is
+0.1 m. The map for viewers has its origin in the image's lower left corner, y up, and
+counter-clockwise angles.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mcaprl.sims.geometry.paths import Path, closed_path, project
 
 Floats = NDArray[np.float64]
 
-PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX = 1000, 600
-METRES_PER_PX = 0.1
+IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX = 1000, 600
+METERS_PER_PX = 0.1
 HALF_WIDTH_PX = 41.5
 GATES = 37
 WALLS_PER_SIDE = 24
@@ -50,43 +50,43 @@ CONTROL_POINTS_PX = (
     (125.0, 150.0),
     (58.0, 205.0),
 )
-"""Of the track that all know; counter-clockwise on the picture, from the start line on."""
+"""Control points of the default track, counter-clockwise in the image, from the start line."""
 
 _SAMPLES_PER_SPAN = 32
 _STRAIGHT_PX = 220.0
-"""A straight wall of this length counts as much as a turn of 1 rad when walls are shared out."""
+"""Length of a straight that has as many walls as a turn of 1 rad."""
 _MARGIN_PX = 6.0
 _TIGHTEST_PX = 62.0
-"""Random tracks keep clear of the picture's edge, and turn no tighter than this radius."""
+"""Minimum distance of random tracks from the image's edge, and minimum radius of their turns."""
 
 
 class Track(NamedTuple):
-    """Where the walls and gates of one track are."""
+    """Walls, gates and center line of one track."""
 
     walls_px: Floats
     """(W, 4) x1, y1, x2, y2 of each wall."""
     gates_px: Floats
-    """(G, 4) likewise, from the left wall to the right one; gate i of G stands (i + 1/2) / G of a
-    lap behind the start line."""
+    """(G, 4) x1, y1, x2, y2 of each gate, from the left wall to the right one; gate i of G is
+    (i + 1/2) / G of a lap after the start line."""
     path: Path
-    """The centre line in the map, in the direction of travel, from the start line on."""
+    """Center line in the map, in the direction of travel, from the start line."""
     start_px: tuple[float, float, float]
     """x, y and heading (radians, clockwise from x) on the start line."""
 
 
 def to_map(points_px: Floats) -> Floats:
-    """Give the map coordinates, metres, of picture points (..., 2)."""
+    """Return the map coordinates, meters, of points (..., 2) of the image."""
     return np.stack(
         [
-            METRES_PER_PX * points_px[..., 0],
-            METRES_PER_PX * (PICTURE_HEIGHT_PX - points_px[..., 1]),
+            METERS_PER_PX * points_px[..., 0],
+            METERS_PER_PX * (IMAGE_HEIGHT_PX - points_px[..., 1]),
         ],
         axis=-1,
     )
 
 
 def asphalt(track: Track) -> Floats:
-    """Cover the track between its walls with one triangle a wall: corners (3 walls, 2), pixels."""
+    """Return triangles between the walls, one for each wall: corners (3 walls, 2), pixels."""
     left, right = track.walls_px[:WALLS_PER_SIDE, :2], track.walls_px[WALLS_PER_SIDE:, :2]
     left_m, right_m = _progress(track.path, left), _progress(track.path, right)
     i = j = 0
@@ -103,14 +103,17 @@ def asphalt(track: Track) -> Floats:
 
 
 def _progress(path: Path, corners_px: Floats) -> list[float]:
-    """Give how far along the path a wall's corners are, and the first one again a lap later."""
+    """Return the distances along the path of the corners of the walls of one side.
+
+    The first corner is repeated at the end, a lap later.
+    """
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
 
 
 @functools.cache
 def make_track(seed: int | None = None) -> Track:
-    """Build the track of a seed; None is the one that all know."""
+    """Return the random track of a seed, or the default track for None."""
     if seed is None:
         return track_through(np.array(CONTROL_POINTS_PX))
     random = np.random.default_rng(seed)
@@ -121,16 +124,16 @@ def make_track(seed: int | None = None) -> Track:
 
 
 def track_through(controls_px: Floats) -> Track:
-    """Build the track whose centre line runs through control points (N, 2)."""
-    centre = _spline(controls_px)
-    normals = _left_normals(centre)
-    walls = np.concatenate([_wall(centre + side * HALF_WIDTH_PX * normals) for side in (1.0, -1.0)])
-    along = _along(centre)
+    """Return the track whose center line passes through control points (N, 2)."""
+    center = _spline(controls_px)
+    normals = _left_normals(center)
+    walls = np.concatenate([_wall(center + side * HALF_WIDTH_PX * normals) for side in (1.0, -1.0)])
+    along = _along(center)
     places = (np.arange(GATES) + 0.5) / GATES * along[-1]
-    middles = _at(centre, along, places)
+    middles = _at(center, along, places)
     across = _at(normals, along, places)
     gates = np.array([_gate(*pair, walls) for pair in zip(middles, across, strict=True)])
-    corners = _at(centre, along, np.linspace(0.0, along[-1], PATH_LEGS + 1))
+    corners = _at(center, along, np.linspace(0.0, along[-1], PATH_LEGS + 1))
     corners[-1] = corners[0]
     path = closed_path(to_map(corners))
     toward = controls_px[1] - controls_px[-1]
@@ -139,7 +142,7 @@ def track_through(controls_px: Floats) -> Track:
 
 
 def _spline(controls: Floats) -> Floats:
-    """Sample the closed Catmull-Rom spline through (N, 2) points; the last sample is the first.
+    """Sample the closed Catmull-Rom spline through (N, 2) points; the last sample equals the first.
 
     E. Catmull and R. Rom, "A class of local interpolating splines", 1974.
     """
@@ -156,33 +159,33 @@ def _spline(controls: Floats) -> Floats:
     return np.concatenate([*spans, controls[:1]])
 
 
-def _tangents(centre: Floats) -> Floats:
-    """Give the unit tangents (M, 2) of a closed line whose last point is the first."""
-    around = np.concatenate([centre[-2:-1], centre, centre[1:2]])
+def _tangents(center: Floats) -> Floats:
+    """Return the unit tangents (M, 2) of a closed line whose last point equals the first."""
+    around = np.concatenate([center[-2:-1], center, center[1:2]])
     chords = around[2:] - around[:-2]
     tangents: Floats = chords / np.hypot(chords[:, 0], chords[:, 1])[:, None]
     return tangents
 
 
-def _left_normals(centre: Floats) -> Floats:
-    """Give the unit vectors to the left, as a driver sees it on a picture whose y points down."""
-    tangents = _tangents(centre)
+def _left_normals(center: Floats) -> Floats:
+    """Return the unit normals to the left of the direction of travel, in an image with y down."""
+    tangents = _tangents(center)
     return np.column_stack([tangents[:, 1], -tangents[:, 0]])
 
 
 def _along(line: Floats) -> Floats:
-    """Give the distance of each point from the first, along the line."""
+    """Return the distance of each point from the first, along the line."""
     steps = np.diff(line, axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
 
 
 def _at(values: Floats, along: Floats, places: Floats) -> Floats:
-    """Interpolate values (M, 2), known at distances `along`, at other distances."""
+    """Interpolate values (M, 2) at distances `along` to the distances `places`."""
     return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
 
 
 def _wall(line: Floats) -> Floats:
-    """Replace a closed line by `WALLS_PER_SIDE` straight walls (.., 4), shorter where it bends."""
+    """Approximate a closed line by `WALLS_PER_SIDE` straight walls (W, 4), shorter in bends."""
     tangents = _tangents(line)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(yaw)))])
@@ -193,17 +196,19 @@ def _wall(line: Floats) -> Floats:
 
 
 def _gate(middle: Floats, normal: Floats, walls: Floats) -> Floats:
-    """Reach from a point of the centre line to the walls on both sides."""
-    ends = [middle + side * _reach(middle, side * normal, walls) * normal for side in (1.0, -1.0)]
+    """Return the gate from wall to wall through a point of the center line."""
+    ends = [
+        middle + side * _distance(middle, side * normal, walls) * normal for side in (1.0, -1.0)
+    ]
     return np.concatenate(ends)
 
 
-def _reach(start: Floats, direction: Floats, walls: Floats) -> float:
-    """Give the distance to the nearest wall in a direction, pixels."""
+def _distance(start: Floats, direction: Floats, walls: Floats) -> float:
+    """Return the distance to the nearest wall in a direction, pixels."""
     edge = walls[:, 2:] - walls[:, :2]
     to_wall = walls[:, :2] - start
     cross = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
-    # Parallel walls are never met.
+    # A parallel wall is at an infinite distance.
     cross[cross == 0.0] = math.inf
     distance = (to_wall[:, 0] * edge[:, 1] - to_wall[:, 1] * edge[:, 0]) / cross
     share = (to_wall[:, 0] * direction[1] - to_wall[:, 1] * direction[0]) / cross
@@ -212,38 +217,38 @@ def _reach(start: Floats, direction: Floats, walls: Floats) -> float:
 
 
 def _random_controls(random: np.random.Generator) -> Floats:
-    """Draw control points around the picture's middle, counter-clockwise from the left."""
+    """Draw control points around the image's middle, counter-clockwise from the left."""
     count = int(random.integers(11, 16))
     angles = math.pi - (np.arange(count) + random.uniform(-0.25, 0.25, count)) * (
         2 * math.pi / count
     )
     radii = random.uniform(0.45, 1.0, count)
-    half = np.array([PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX]) / 2
+    half = np.array([IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX]) / 2
     room = half - HALF_WIDTH_PX - _MARGIN_PX
     away: Floats = radii[:, None] * room * np.column_stack([np.cos(angles), np.sin(angles)])
     return half + away
 
 
 def _drivable(controls: Floats) -> bool:
-    """Say whether a track through these points is on the picture, wide and not too tight."""
-    centre = _spline(controls)
+    """Return whether a track through these points fits into the image and can be driven."""
+    center = _spline(controls)
     room = HALF_WIDTH_PX + _MARGIN_PX
-    limits = np.array([PICTURE_WIDTH_PX, PICTURE_HEIGHT_PX]) - room
-    if (centre < room).any() or (centre > limits).any():
+    limits = np.array([IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX]) - room
+    if (center < room).any() or (center > limits).any():
         return False
-    tangents = _tangents(centre)
+    tangents = _tangents(center)
     turns = np.abs(np.diff(np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))))
-    steps = np.diff(_along(centre))
+    steps = np.diff(_along(center))
     if (turns > steps / _TIGHTEST_PX).any():
         return False
-    return _apart(centre)
+    return _apart(center)
 
 
-def _apart(centre: Floats) -> bool:
-    """Say whether parts of the line that are far apart along it are so across, too."""
-    along = _along(centre)
+def _apart(center: Floats) -> bool:
+    """Return whether distant parts of the line are at least a track's width apart."""
+    along = _along(center)
     places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
-    points = _at(centre, along, places)
+    points = _at(center, along, places)
     for i, j in itertools.combinations(range(len(points)), 2):
         between = min(places[j] - places[i], along[-1] - places[j] + places[i])
         distance = math.hypot(*(points[i] - points[j]))

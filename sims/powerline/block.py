@@ -1,7 +1,7 @@
-"""Many quadrotors at once: the same bits as one by one, in a quarter of the time.
+"""Vectorized flight of many quadrotors.
 
-They stand side by side in blocks of memory, number by number, so that the compiler can advance
-several with each instruction.
+Drones are stored in blocks, as structures of arrays, so that the compiler can vectorize over them.
+The results equal those of single drones bit for bit, in a quarter of the time.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from mcaprl.sims.powerline.quadrotor import (
 )
 
 LANES = 8
-"""Drones that fly side by side in one block of memory."""
-_ENOUGH = 3
-"""Fewer drones than that fly sooner one by one."""
+"""Number of drones in a block."""
+_MIN_BLOCK = 3
+"""Number of drones from which a block is faster than single drones."""
 _COMMAND, _WIND = DRONE_SIZE * LANES, (DRONE_SIZE + 3) * LANES
 _BLOCK_NUMBERS = DRONE_SIZE + 6
-"""A block also has each drone's command and wind."""
+"""Numbers of each drone in a block: its state, command and wind."""
 
 
 @compiled
@@ -44,17 +44,17 @@ def fly_all(
     """Fly K of N drones, in place, as `fly` does.
 
     Args:
-        plant: as of `fly`.
+        plant: As in `fly`.
         drones: (N, 23 or more) rows that begin with a `Drone`.
-        chosen: (K,) which.
-        commands_m_s: (N, 3).
-        winds_m_s: (N, 3).
-        duration_s: as of `fly`.
+        chosen: (K,) indices of the drones.
+        commands_m_s: (N, 3) commanded velocities.
+        winds_m_s: (N, 3) velocities of the air.
+        duration_s: As in `fly`.
     """
     first, count = 0, len(chosen)
     if plant == QUAD:
         block = np.empty(_BLOCK_NUMBERS * LANES)
-        while count - first >= _ENOUGH:
+        while count - first >= _MIN_BLOCK:
             together = chosen[first : first + LANES]
             _gather(drones, commands_m_s, winds_m_s, together, block)
             for _ in range(round(duration_s / TIME_STEP_S)):
@@ -75,7 +75,7 @@ def _gather(
     chosen: NDArray[np.int64],
     block: NDArray[np.float64],
 ) -> None:
-    """Lay drones into a block, number by number; where they are few, the last one several times."""
+    """Copy drones into a block; the last one fills the lanes that are left over."""
     for lane in range(LANES):
         i = chosen[min(lane, len(chosen) - 1)]
         for k in range(DRONE_SIZE):
@@ -98,23 +98,23 @@ def _scatter(
 def _advance_block(block: NDArray[np.float64]) -> None:
     """Advance the drones of a block by 2 ms.
 
-    Nothing in this loop may branch or be called: then the compiler does several lanes at once. That
-    the distances between a lane's numbers are constants tells it that no two lanes share any.
+    The loop has no branches and no calls, and all offsets are constants, so that the compiler can
+    prove that lanes do not overlap in memory and vectorize it.
     """
     for lane in range(LANES):
         command = _vector_in(block, _COMMAND + lane)
         wind = _vector_in(block, _WIND + lane)
         after = advance(_drone_in(block, lane), command, wind)
-        _keep_vector(after.position_m, block, lane)
-        _keep_vector(after.velocity_m_s, block, 3 * LANES + lane)
+        _store_vector(after.position_m, block, lane)
+        _store_vector(after.velocity_m_s, block, 3 * LANES + lane)
         attitude, thrusts = after.attitude, after.thrusts_n
         block[6 * LANES + lane], block[7 * LANES + lane] = attitude.w, attitude.x
         block[8 * LANES + lane], block[9 * LANES + lane] = attitude.y, attitude.z
-        _keep_vector(after.rates_rad_s, block, 10 * LANES + lane)
+        _store_vector(after.rates_rad_s, block, 10 * LANES + lane)
         block[13 * LANES + lane], block[14 * LANES + lane] = thrusts[0], thrusts[1]
         block[15 * LANES + lane], block[16 * LANES + lane] = thrusts[2], thrusts[3]
-        _keep_vector(after.reference_m_s, block, 17 * LANES + lane)
-        _keep_vector(after.integral_m_s2, block, 20 * LANES + lane)
+        _store_vector(after.reference_m_s, block, 17 * LANES + lane)
+        _store_vector(after.integral_m_s2, block, 20 * LANES + lane)
 
 
 @inlined
@@ -147,6 +147,6 @@ def _vector_in(block: NDArray[np.float64], start: int) -> Vector:
 
 
 @inlined
-def _keep_vector(vector: Vector, block: NDArray[np.float64], start: int) -> None:
+def _store_vector(vector: Vector, block: NDArray[np.float64], start: int) -> None:
     block[start], block[start + LANES] = vector.x, vector.y
     block[start + 2 * LANES] = vector.z

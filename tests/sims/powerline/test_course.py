@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mcaprl.sims.geometry.vectors import Vector
 from mcaprl.sims.powerline.camera import ground_triangles
-from mcaprl.sims.powerline.world import (
+from mcaprl.sims.powerline.course import (
     ALONG_M,
     BEAMS_M,
     BELOW_LINE_M,
@@ -21,8 +21,8 @@ from mcaprl.sims.powerline.world import (
     SAG,
     WIRES_M,
     catenary,
-    distance_to_endless_line,
-    distance_to_piece,
+    distance_to_infinite_line,
+    distance_to_segment,
     ground_height,
     nearest_on_line,
     point_on_line,
@@ -62,7 +62,7 @@ def test_beyond_the_end_the_endless_line_is_nearer() -> None:
     beside = np.cross(along, [0, 0, 1.0])
     beside /= np.linalg.norm(beside)
     position = Vector(*(POINTS_M[1] + 50 * along + 3 * beside).tolist())
-    assert distance_to_endless_line(position, 0) == pytest.approx(3.0)
+    assert distance_to_infinite_line(position, 0) == pytest.approx(3.0)
     assert nearest_on_line(position).distance_m > 20.0
 
 
@@ -97,14 +97,16 @@ def test_the_distance_to_wires_is_the_smallest_of_all_pieces(
     chord = int(place)
     start, end = WIRES_M[wire, chord], WIRES_M[wire, chord + 1]
     position = Vector(*(start + (place - chord) * (end - start) + away).tolist())
-    pieces = [distance_to_piece(position, one[i], one[i + 1]) for one in WIRES_M for i in range(16)]
+    pieces = [
+        distance_to_segment(position, one[i], one[i + 1]) for one in WIRES_M for i in range(16)
+    ]
     assert wire_distance(position) == min(pieces)
 
 
 def test_the_distance_to_a_piece_by_hand() -> None:
     start, end = np.zeros(3), np.array([10.0, 0.0, 0.0])
     for position, distance_m in (((4, 3, 0), 3.0), ((-3, 0, 4), 5.0), ((13, 4, 0), 5.0)):
-        assert distance_to_piece(Vector(*map(float, position)), start, end) == distance_m
+        assert distance_to_segment(Vector(*map(float, position)), start, end) == distance_m
 
 
 def test_towers_stand_on_the_ground_under_the_line() -> None:

@@ -1,7 +1,7 @@
-"""The world of the powerline sim: the line to follow, its towers, conductors, and the ground.
+"""Course of the powerline sim: the line to follow, its towers and conductors, and the ground.
 
-Axes are those of the published line, NED: x north, y east, z down; metres. `to_ros` turns them
-into ROS axes for viewers. Nothing here is random: the same world stands on every machine.
+Axes are those of the published line, NED: x north, y east, z down; meters. `to_ros` transforms to
+ROS axes for viewers. Nothing is random: the course is the same on every machine.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ POINTS_M: Floats = np.array(
         (541.3474, 143.6714, -32.07256),
     ]
 )
-"""(5, 3) the flight line; a tower stands under each point."""
+"""(5, 3) points of the flight line; there is a tower under each point."""
 LEGS = len(POINTS_M) - 1
 _LEG_M = np.diff(POINTS_M, axis=0)
 LEG_LENGTHS_M: Floats = np.sqrt((_LEG_M**2).sum(axis=1))
@@ -37,23 +37,23 @@ ALONG_M: Floats = np.concatenate([[0.0], np.cumsum(LEG_LENGTHS_M)])
 LENGTH_M = float(ALONG_M[-1])
 
 BELOW_LINE_M = 6.0
-"""The conductors' ends hang this far below the points of the flight line."""
+"""Vertical distance of the conductors' ends from the points of the flight line."""
 PHASES_M = (-4.0, 0.0, 4.0)
-"""Sideways places of the three conductors, right positive."""
+"""Lateral positions of the three conductors, right positive."""
 SAG = 0.02
-"""Of a conductor in the middle of its span, as a share of the span's length."""
+"""Sag of a conductor in the middle of its span, as a share of the span's length."""
 CHORDS = 16
-"""Straight pieces that a conductor is made of."""
+"""Number of straight segments of a conductor."""
 
 ARM_BELOW_WIRES_M = 1.0
-"""Length of the insulators, which stand on the towers' arms."""
+"""Length of the insulators on the towers' arms."""
 ARM_HALF_LENGTH_M = 4.8
 TOWER_HEIGHTS_M = (21.0, 26.0, 24.0, 28.0, 23.0)
 TREE_COUNT = 240
 
 
 class Place(NamedTuple):
-    """The point of the line nearest to a position."""
+    """Nearest point of the line to a position."""
 
     leg: int
     along_m: float
@@ -63,7 +63,7 @@ class Place(NamedTuple):
 
 
 class Tower(NamedTuple):
-    """A mast with an arm on top, across the line."""
+    """Mast with an arm on top, across the line."""
 
     x_m: float
     y_m: float
@@ -74,7 +74,7 @@ class Tower(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """A fir."""
+    """Fir beside the line."""
 
     x_m: float
     y_m: float
@@ -82,14 +82,14 @@ class Tree(NamedTuple):
 
 
 def to_ros(ned: Floats) -> Floats:
-    """Turn NED coordinates (..., 3) into ROS axes: x stays, y and z change sign."""
+    """Transform NED coordinates (..., 3) to ROS axes: y and z change sign."""
     turned: Floats = ned * np.array([1.0, -1.0, -1.0])
     return turned
 
 
 @compiled
 def point_on_line(along_m: float) -> Vector:
-    """Give the point at a distance along the line; its ends are the limits."""
+    """Return the point at a distance along the line, clipped to its ends."""
     rest_m = min(max(along_m, 0.0), LENGTH_M)
     leg = 0
     while leg + 1 < LEGS and ALONG_M[leg + 1] <= rest_m:
@@ -104,7 +104,7 @@ def point_on_line(along_m: float) -> Vector:
 
 @compiled
 def nearest_on_line(position_m: Vector) -> Place:
-    """Find the nearest point of the line, between its ends."""
+    """Return the nearest point of the line to a position."""
     best = Place(0, 0.0, Vector(0.0, 0.0, 0.0), math.inf)
     for leg in range(LEGS):
         rest_m = 0.0
@@ -119,8 +119,8 @@ def nearest_on_line(position_m: Vector) -> Place:
 
 
 @compiled
-def distance_to_endless_line(position_m: Vector, leg: int) -> float:
-    """Give the distance to the straight line through a leg, without its ends; metres.
+def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
+    """Return the distance to the infinite line through a leg, meters.
 
     For a point p, |(p - a) x t|, with a on the line and the unit vector t along it.
     """
@@ -131,9 +131,9 @@ def distance_to_endless_line(position_m: Vector, leg: int) -> float:
 
 @compiled
 def ground_height(x_m: float, y_m: float) -> float:
-    """Give how high the ground is, metres above z = 0.
+    """Return the height of the ground, meters above z = 0.
 
-    Under the line it rises and falls smoothly between the towers' feet; hills stand beside it.
+    Below the line it is a smooth curve through the towers' feet; beside the line there are hills.
     """
     span = 0
     while span + 1 < LEGS and POINTS_M[span + 1, 0] <= x_m:
@@ -156,10 +156,10 @@ def _foot_height(tower: int) -> float:
 
 @compiled
 def wire_distance(position_m: Vector) -> float:
-    """Give the distance to the nearest conductor, metres.
+    """Return the distance to the nearest conductor, meters.
 
-    In each span, only the pieces around the one beside the position are tried. Of wires nearer than
-    4 m, the distance is exact; a farther one may be a little nearer than the answer.
+    In each span, only the segments around the one beside the position are evaluated. The result is
+    exact if it is below 4 m; otherwise the true distance may be slightly smaller.
     """
     nearest_m = math.inf
     for wire in range(len(WIRES_M)):
@@ -168,24 +168,26 @@ def wire_distance(position_m: Vector) -> float:
         along = (position_m.x - start[0]) * ux + (position_m.y - start[1]) * uy
         middle = math.floor(min(max(along / (ux * ux + uy * uy), 0.0), 1.0) * CHORDS)
         for chord in range(max(0, middle - 2), min(CHORDS, middle + 3)):
-            chord_m = distance_to_piece(position_m, WIRES_M[wire, chord], WIRES_M[wire, chord + 1])
+            chord_m = distance_to_segment(
+                position_m, WIRES_M[wire, chord], WIRES_M[wire, chord + 1]
+            )
             nearest_m = min(nearest_m, chord_m)
     return nearest_m
 
 
 @compiled
 def tower_distance(position_m: Vector) -> float:
-    """Give the distance to the nearest axis of a tower's mast or arm, metres."""
+    """Return the distance to the axis of the nearest mast or arm of a tower, meters."""
     nearest_m = math.inf
     for beam in range(len(BEAMS_M)):
-        beam_m = distance_to_piece(position_m, BEAMS_M[beam, 0], BEAMS_M[beam, 1])
+        beam_m = distance_to_segment(position_m, BEAMS_M[beam, 0], BEAMS_M[beam, 1])
         nearest_m = min(nearest_m, beam_m)
     return nearest_m
 
 
 @compiled
-def distance_to_piece(position_m: Vector, start_m: Floats, end_m: Floats) -> float:
-    """Give the distance to a straight piece between two points (3,), metres."""
+def distance_to_segment(position_m: Vector, start_m: Floats, end_m: Floats) -> float:
+    """Return the distance to the segment between two points (3,), meters."""
     along, length = 0.0, 0.0
     for k in range(3):
         piece = end_m[k] - start_m[k]
@@ -199,15 +201,15 @@ def distance_to_piece(position_m: Vector, start_m: Floats, end_m: Floats) -> flo
 
 
 def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
-    """Give the heights of a hanging wire over the level through its first end, metres.
+    """Return the heights of a hanging wire relative to its first end, meters.
 
-    y = a cosh((x - x0) / a) + c. With a given, x0 follows from the rise; and a, found by halving,
-    from the sag: how far the wire's middle is below the straight line between its ends.
+    y = a cosh((x - x0) / a) + c. For a given a, x0 follows from the rise. Bisection finds the a
+    with the wanted sag, the distance of the wire's middle below the straight line between its ends.
 
     Args:
-        span_m: horizontal distance of the ends.
-        rise_m: the second end's height over the first one's.
-        sag_m: above 0.
+        span_m: Horizontal distance of the ends.
+        rise_m: Height of the second end relative to the first.
+        sag_m: Sag, above 0.
         x_m: (N,) horizontal distances from the first end.
     """
 
@@ -228,7 +230,7 @@ def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
 
 
 def towers() -> tuple[Tower, ...]:
-    """Give the five towers; the arms halve the angle of the spans."""
+    """Return the five towers; each arm bisects the angle between the adjacent spans."""
     level = TANGENTS[:, :2] / np.hypot(*TANGENTS[:, :2].T)[:, None]
     forward = np.vstack([level[:1], level[:-1] + level[1:], level[-1:]])
     forward /= np.hypot(*forward.T)[:, None]
@@ -245,7 +247,7 @@ def towers() -> tuple[Tower, ...]:
 
 
 def _wires() -> Floats:
-    """Hang the conductors: (12, CHORDS + 1, 3), three for each span, along the line."""
+    """Return the conductors (12, CHORDS + 1, 3), three for each span, along the line."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     found = towers()
     wires = []
@@ -266,7 +268,7 @@ def _wires() -> Floats:
 
 
 def _beams() -> Floats:
-    """Give each tower's mast and arm as pairs of ends, (10, 2, 3)."""
+    """Return the mast and the arm of each tower as pairs of ends, (10, 2, 3)."""
     beams = []
     for x_m, y_m, foot_z_m, arm_z_m, right in towers():
         across = ARM_HALF_LENGTH_M * np.array([*right, 0.0])
@@ -280,12 +282,12 @@ BEAMS_M: Floats = _beams()
 
 
 def _spread(index: int, low: float, high: float) -> float:
-    """Give the index-th number of an evenly spread sequence (multiples of the golden ratio)."""
+    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
     return low + (high - low) * (index * 0.6180339887498949 % 1.0)
 
 
 def trees() -> tuple[Tree, ...]:
-    """Give the firs: bushes in the cleared strip under the line, tall trees on both its sides."""
+    """Return the firs: small ones in the strip under the line, tall ones on both sides of it."""
     found = []
     for index in range(TREE_COUNT):
         along_m = (index + 0.5) / TREE_COUNT * LENGTH_M

@@ -1,0 +1,76 @@
+"""Shapes that several sims use: the ground, labels, and the parts of cars.
+
+The parts of a car are fixed to the frame `car`: x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from mcaprl.sims.drawing.scene import Color, Shape
+
+Vector = tuple[float, float, float]
+
+
+def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, float]) -> Shape:
+    """Return a flat box just below z = 0, with its middle and edges in x and y."""
+    at = (float(middle_m[0]), float(middle_m[1]), -0.1)
+    size = (float(size_m[0]), float(size_m[1]), 0.1)
+    return Shape("ground", "box", color, size=size, position=at)
+
+
+def label(text: str, color: Color, height_m: float, frame: str = "car") -> Shape:
+    """Return the text `speed` above the origin of a frame."""
+    at = (0.0, 0.0, height_m)
+    return Shape("speed", "text", color, size=(1.0, 1.0, 0.8), position=at, frame=frame, text=text)
+
+
+def steering_arrow(color: Color, axle_m: float, wheel_rad: float) -> Shape:
+    """Return an arrow above the front axle in the direction of the front wheels."""
+    axle = np.array([axle_m, 0.0, 1.0])
+    tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
+    ends = np.array([axle, tip])
+    return Shape("steering", "arrow", color, ends, size=(0.12, 0.3, 0.4), frame="car")
+
+
+def car_part(name: str, color: Color, size_m: Vector, middle_m: Vector) -> Shape:
+    """Return a box that is a part of a car."""
+    return Shape(f"car_{name}", "box", color, size=size_m, position=middle_m, frame="car")
+
+
+def wheels(
+    color: Color, front_m: float, rear_m: float, side_m: float, radius_m: float, width_m: float
+) -> list[Shape]:
+    """Return the four wheels of a car.
+
+    Args:
+        color: Color of the tires.
+        front_m: Position of the front axle, x.
+        rear_m: Position of the rear axle, x.
+        side_m: Distance of the wheels from the car's middle, y.
+        radius_m: Radius of a wheel.
+        width_m: Width of a wheel.
+    """
+    hubs = {
+        "front_left": (front_m, side_m, radius_m),
+        "front_right": (front_m, -side_m, radius_m),
+        "rear_left": (rear_m, side_m, radius_m),
+        "rear_right": (rear_m, -side_m, radius_m),
+    }
+    return [_wheel(name, color, hub, radius_m, width_m) for name, hub in hubs.items()]
+
+
+def _wheel(name: str, color: Color, hub_m: Vector, radius_m: float, width_m: float) -> Shape:
+    """Return a wheel as triangles: the tread and both sides of a 16-gon."""
+    turn = np.linspace(0.0, 2 * math.pi, 17)
+    rim = radius_m * np.column_stack([np.cos(turn), np.zeros(17), np.sin(turn)])
+    half = np.array([0.0, width_m / 2, 0.0])
+    triangles = []
+    for a, b in itertools.pairwise(rim):
+        triangles += [a - half, b - half, b + half, a - half, b + half, a + half]
+        triangles += [-half, b - half, a - half, half, a + half, b + half]
+    points = np.array(hub_m) + np.array(triangles)
+    return Shape(f"car_wheel_{name}", "triangles", color, points, frame="car")

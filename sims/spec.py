@@ -1,0 +1,154 @@
+"""The sims by name: our own, and those that installed packages add through entry points."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+import gymnasium as gym
+
+from mcaprl.errors import UsageError
+
+GROUP: Final = "mcaprl.sims"
+"""Entry point group; each entry point is named after its sim."""
+
+
+@dataclass(frozen=True)
+class SimSpec:
+    """Description of one sim: its names, how it is made, and who drives it.
+
+    A package adds a sim to `mcaprl` with an entry point in its `pyproject.toml`. The entry point's
+    name is the sim's short name; its object is a `SimSpec`, or a function without arguments that
+    returns one:
+
+        [project.entry-points."mcaprl.sims"]
+        boat = "boats.sim:SPEC"
+    """
+
+    name: str
+    """Short name, as in `mcaprl record NAME`."""
+    env_id: str
+    """Gymnasium id, as in `boats/Boat-v0`."""
+    entry_point: str | Callable[..., gym.Env[Any, Any]]
+    """Environment class, or `module:class`."""
+    vector_entry_point: str | None = None
+    """`module:class` of the environment that steps many vehicles together, if there is one."""
+    max_episode_steps: int | None = None
+    """Steps after which an episode is truncated."""
+    pilot: str | Callable[[Any], Any] | None = None
+    """Class or function, or `module:name` of it, that takes the unwrapped environment and returns
+    its scripted policy (`mcaprl.sims.evaluation.rollout.Policy`)."""
+    engine: str | None = None
+    """Module of the extra `sims` without which the sim cannot be made."""
+
+    def register(self) -> None:
+        """Register the environment with Gymnasium, unless its id is registered already.
+
+        Gymnasium's passive checker stays off: it takes time in each step.
+        """
+        if self.env_id not in gym.registry:
+            gym.register(
+                id=self.env_id,
+                entry_point=self.entry_point,
+                vector_entry_point=self.vector_entry_point,
+                max_episode_steps=self.max_episode_steps,
+                disable_env_checker=True,
+            )
+
+    def make_pilot(self, env: gym.Env[Any, Any]) -> Any:
+        """Return the scripted policy of an unwrapped environment; the sim must have one."""
+        pilot: Any = self.pilot
+        if isinstance(pilot, str):
+            module, _, attribute = pilot.partition(":")
+            pilot = getattr(importlib.import_module(module), attribute)
+        return pilot(env)
+
+
+class SimCatalog(Mapping[str, str]):
+    """Mapping from short names to Gymnasium ids; a sim is registered when it is looked up.
+
+    Our own sims are registered at once. An installed package is imported only when its sim is
+    asked for by name, or when an id is asked for that nobody has registered.
+    """
+
+    def __init__(self, own: Iterable[SimSpec]) -> None:
+        """Register our own sims."""
+        self._specs = {spec.name: spec for spec in own}
+        for spec in self._specs.values():
+            spec.register()
+
+    def __getitem__(self, name: str) -> str:
+        """Return the id of a sim.
+
+        Raises:
+            KeyError: There is no sim of this name.
+            UsageError: The sim's entry point cannot be loaded.
+        """
+        return self._spec(name).env_id
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of our own sims, then of the others."""
+        return iter([*self._specs, *(name for name in _installed() if name not in self._specs)])
+
+    def __len__(self) -> int:
+        """Return the number of sims."""
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a sim of this name; loads nothing."""
+        return name in self._specs or name in _installed()
+
+    def find(self, env_id: str, *, loads: bool = True) -> SimSpec | None:
+        """Return the description of the sim that has an id; None for any other environment.
+
+        Args:
+            env_id: Gymnasium id.
+            loads: Whether to import the installed sims if no sim in use has the id. One that
+                cannot be loaded causes a warning.
+        """
+        specs = self._specs
+        if loads and all(spec.env_id != env_id for spec in specs.values()):
+            for name in self:
+                try:
+                    self._spec(name)
+                except UsageError as error:
+                    warnings.warn(str(error), stacklevel=2)
+        return next((spec for spec in specs.values() if spec.env_id == env_id), None)
+
+    def _spec(self, name: str) -> SimSpec:
+        if name not in self._specs:
+            found = _installed()[name]
+            spec = _load(found)
+            spec.register()
+            self._specs[name] = spec
+        return self._specs[name]
+
+
+@functools.cache
+def _installed() -> dict[str, EntryPoint]:
+    """Return the entry points of installed packages by name."""
+    return {found.name: found for found in entry_points(group=GROUP)}
+
+
+def _load(found: EntryPoint) -> SimSpec:
+    """Import what an entry point names.
+
+    Raises:
+        UsageError: It cannot be imported, or does not describe a sim of its name.
+    """
+    package = f" of package '{found.dist.name}'" if found.dist else ""
+    place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"
+    try:
+        spec = found.load()
+        spec = spec if isinstance(spec, SimSpec) else spec()
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise UsageError(f"{place} cannot be loaded: {reason}") from error
+    if not isinstance(spec, SimSpec) or spec.name != found.name:
+        raise UsageError(f"{place} must return a SimSpec named '{found.name}', not {spec!r}")
+    return spec
