@@ -15,7 +15,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,17 +54,48 @@ class RunSummary:
     seconds: float
 
 
-class Identity(Protocol):
-    """What has to be the same for a run to be resumed."""
+@dataclass(frozen=True)
+class RunIdentity:
+    """What has to be the same for a run to be resumed.
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON types."""
+    Attributes:
+        parts: Algorithm (`algo`), settings (`config`) and source of experience as plain JSON types.
+        other_data: Whether the part `data`, a fingerprint, may differ.
+    """
+
+    parts: dict[str, Any]
+    other_data: bool = False
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Raise `TrainingError` if `found`, read from the file `where`, is of another run."""
+        """Compare with the identity in a file.
+
+        Args:
+            found: Identity in the file; it may have further parts.
+            where: Path of the file.
+
+        Raises:
+            TrainingError: They differ; the message names the first difference.
+        """
+        mine = self.parts
+        theirs: dict[str, Any] = {name: found.get(name) for name in mine}
+        if isinstance(theirs.get("config"), dict):
+            mine, theirs = ({**side, **side["config"], "config": None} for side in (mine, theirs))
+        for name in [*mine, *theirs]:
+            old, new = theirs.get(name), mine.get(name)
+            if old == new or (name == "data" and self.other_data):
+                continue
+            if name == "data":
+                raise TrainingError(
+                    f"cannot resume: {where} was trained on other data; resume with the same data"
+                    " and weights, train into another folder, or allow other data (--other-data)"
+                )
+            raise TrainingError(
+                f"cannot resume: {where} has {name} {old!r}, not {new!r}; resume with the same"
+                " settings, or train into another folder"
+            )
 
 
-def open_run(folder: Path, identity: Identity, resume: bool, **source: Any) -> None:
+def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -> None:
     """Create a run folder, or check that it is this run's, and write its `config.json`.
 
     Files of a run that ended before its first checkpoint are removed.
@@ -90,7 +121,7 @@ def open_run(folder: Path, identity: Identity, resume: bool, **source: Any) -> N
         raise OutputExistsError(f"{folder} exists: choose another folder{hint}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / CONFIG_NAME, {**identity.to_json(), **source})
+        write_json(folder / CONFIG_NAME, {**identity.parts, **source})
     except OSError as error:
         raise TrainingError(f"cannot write {folder}: {error.strerror}") from error
 
@@ -116,29 +147,6 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise TrainingError(f"cannot resume: {path} is not a JSON object")
     return found
-
-
-def check_same(mine: Mapping[str, Any], found: Mapping[str, Any], where: Path) -> None:
-    """Compare the parts of a run's identity, and each setting in its `config`.
-
-    Args:
-        mine: Parts of this run.
-        found: Identity in a file; it may have further parts.
-        where: Path of that file.
-
-    Raises:
-        TrainingError: They differ; the message names the first difference.
-    """
-    theirs: Mapping[str, Any] = {name: found.get(name) for name in mine}
-    if isinstance(theirs.get("config"), dict):
-        mine, theirs = ({**parts, **parts["config"], "config": None} for parts in (mine, theirs))
-    for name in [*mine, *theirs]:
-        old, new = theirs.get(name), mine.get(name)
-        if old != new:
-            raise TrainingError(
-                f"cannot resume: {where} has {name} {old!r}, not {new!r}; resume with the same"
-                " settings, or train into another folder"
-            )
 
 
 def broken_checkpoint(path: Path, error: Exception) -> TrainingError:

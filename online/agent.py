@@ -240,7 +240,6 @@ class _EveryInterval(BaseCallback):
     """A callback that calls a function every `interval` environment steps, and at the end."""
 
     def __init__(self, interval: int, function: Callable[[], None]) -> None:
-        """Call `function` when a step of the batch reaches or crosses a multiple of `interval`."""
         super().__init__()
         self._interval = interval
         self._function = function
@@ -259,7 +258,7 @@ class _EveryInterval(BaseCallback):
             self._call()
 
     def _call(self) -> None:
-        self._called_at = self.num_timesteps
+        self._called_at = self.model.num_timesteps
         self._function()
 
 
@@ -267,7 +266,6 @@ class _TargetUpdateByEpisodes(BaseCallback):
     """A callback that updates a DQN's target network every `episodes` finished episodes."""
 
     def __init__(self, episodes: int) -> None:
-        """Update the target network every `episodes` finished episodes."""
         super().__init__()
         self._episodes = episodes
         self._finished = 0
@@ -281,26 +279,18 @@ class _TargetUpdateByEpisodes(BaseCallback):
         return True
 
 
-class _BetweenRollouts(BaseCallback):
-    """A callback that calls a function between two rollouts, when all steps have been processed."""
-
-    def __init__(self, interval: int, function: Callable[[], None]) -> None:
-        """Call `function` when at least `interval` steps have passed since the last call."""
-        super().__init__()
-        self._interval = interval
-        self._function = function
-        self._called_at = 0
-
-    def _on_training_start(self) -> None:
-        self._called_at = self.num_timesteps
-
-    def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps - self._called_at >= self._interval:
-            self._called_at = self.model.num_timesteps
-            self._function()
+class _BetweenRollouts(_EveryInterval):
+    """A callback between two rollouts, when all steps have been processed."""
 
     def _on_step(self) -> bool:
         return True
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps - self._called_at >= self._interval:
+            self._call()
+
+    def _on_training_end(self) -> None:
+        pass
 
 
 def _stacked(env: VecEnv, count: int) -> VecEnv:

@@ -57,7 +57,12 @@ def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[st
         **{f"buffer.{name}": value for name, value in _buffer_tensors(model).items()},
     }
     counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
-    description = {**task.to_json(), "counters": counters, "generators": states, "extra": extra}
+    description = {
+        **task.identity.parts,
+        "counters": counters,
+        "generators": states,
+        "extra": extra,
+    }
     write_tensors(path, tensors, description)
 
 
@@ -72,7 +77,7 @@ def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, A
     """
     try:
         tensors, description = read_tensors(path)
-        task.check_same(description, path)
+        task.identity.check_same(description, path)
         model.policy.load_state_dict(_below(tensors, "policy"))
         _load_optimizer(model.policy.optimizer, _below(tensors, "optimizer"))
         _load_buffer(model, _below(tensors, "buffer"))

@@ -119,54 +119,12 @@ class DoubleDQNConfig(DQNConfig):
 
 
 @dataclass(frozen=True)
-class PPOConfig(OnlineConfig):
-    """Settings of PPO."""
+class RolloutConfig(OnlineConfig):
+    """Settings of algorithms that learn from rollouts of the current policy."""
 
-    learning_rate: float = 3e-4
-    max_grad_norm: float = 0.5
-    rollout_steps: int = 2_048
-    """environment steps, summed over all environments, between two rounds of updates"""
-    batch_size: int = 64
-    """transitions in one gradient step"""
-    epochs: int = 10
-    """passes over each rollout"""
-    gae_lambda: float = 0.95
-    """lambda of the advantages: 0 uses one step, 1 the whole return"""
-    clip_range: float = 0.2
-    """largest relative change of an action's probability in one round"""
-    entropy_coefficient: float = 0.0
-    """weight of the policy's entropy in the loss"""
-
-    def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
-        super().__post_init__()
-        self._require_positive("batch_size", "epochs")
-        whole = self.rollout_steps >= 2 * self.envs and self.rollout_steps % self.envs == 0
-        self._require("rollout_steps", whole, f"a multiple of envs ({self.envs}), above envs")
-        fits = self.rollout_steps % self.batch_size == 0
-        self._require("batch_size", fits, f"a divisor of rollout_steps ({self.rollout_steps})")
-
-    def arguments(self) -> dict[str, Any]:
-        """Return arguments of SB3's constructor, except learning rate and networks."""
-        return {
-            **super().arguments(),
-            "n_steps": self.rollout_steps // self.envs,
-            "batch_size": self.batch_size,
-            "n_epochs": self.epochs,
-            "gae_lambda": self.gae_lambda,
-            "clip_range": self.clip_range,
-            "ent_coef": self.entropy_coefficient,
-        }
-
-
-@dataclass(frozen=True)
-class A2CConfig(OnlineConfig):
-    """Settings of A2C, with RMSProp as in the paper."""
-
-    learning_rate: float = 7e-4
     max_grad_norm: float = 0.5
     rollout_steps: int = 40
-    """environment steps, summed over all environments, for each gradient step"""
+    """environment steps, summed over all environments, between two rounds of updates"""
     gae_lambda: float = 1.0
     """lambda of the advantages: 0 uses one step, 1 the whole return"""
     entropy_coefficient: float = 0.0
@@ -186,3 +144,43 @@ class A2CConfig(OnlineConfig):
             "gae_lambda": self.gae_lambda,
             "ent_coef": self.entropy_coefficient,
         }
+
+
+@dataclass(frozen=True)
+class PPOConfig(RolloutConfig):
+    """Settings of PPO."""
+
+    learning_rate: float = 3e-4
+    rollout_steps: int = 2_048
+    gae_lambda: float = 0.95
+    batch_size: int = 64
+    """transitions in one gradient step"""
+    epochs: int = 10
+    """passes over each rollout"""
+    clip_range: float = 0.2
+    """largest relative change of an action's probability in one round"""
+
+    def __post_init__(self) -> None:
+        """Refuse settings outside their ranges."""
+        super().__post_init__()
+        self._require_positive("batch_size", "epochs")
+        enough = self.rollout_steps >= 2 * self.envs
+        self._require("rollout_steps", enough, f"at least twice envs ({self.envs})")
+        fits = self.rollout_steps % self.batch_size == 0
+        self._require("batch_size", fits, f"a divisor of rollout_steps ({self.rollout_steps})")
+
+    def arguments(self) -> dict[str, Any]:
+        """Return arguments of SB3's constructor, except learning rate and networks."""
+        return {
+            **super().arguments(),
+            "batch_size": self.batch_size,
+            "n_epochs": self.epochs,
+            "clip_range": self.clip_range,
+        }
+
+
+@dataclass(frozen=True)
+class A2CConfig(RolloutConfig):
+    """Settings of A2C, with RMSProp as in the paper."""
+
+    learning_rate: float = 7e-4

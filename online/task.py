@@ -13,7 +13,7 @@ from mcaprl.errors import TrainingError, UsageError
 from mcaprl.online.algorithms import find_algorithm
 from mcaprl.online.config import OnlineConfig
 from mcaprl.online.presets import find_preset, settings_for
-from mcaprl.runs import CONFIG_NAME, check_same, read_config
+from mcaprl.runs import CONFIG_NAME, RunIdentity, read_config
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
 
@@ -114,22 +114,11 @@ class Task:
         mode = AutoresetMode.SAME_STEP.value
         return make_sims(self.sim, count, autoreset_mode=mode, **self.sim_options)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON types."""
-        return {
-            "algo": self.algo,
-            "sim": self.sim,
-            "sim_options": self.sim_options,
-            "config": self.config.to_json(),
-        }
-
-    def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Compare with the task in a file.
-
-        Raises:
-            TrainingError: The file is of another task; the message names the first difference.
-        """
-        check_same(self.to_json(), found, where)
+    @property
+    def identity(self) -> RunIdentity:
+        """What has to be the same for a run of this task to be resumed."""
+        parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
+        return RunIdentity({**parts, "config": self.config.to_json()})
 
 
 def choose_task(
@@ -160,7 +149,7 @@ def choose_task(
         task = Task.of_run(resumed, **given)
         options = {**task.sim_options, **sim_options}
         task = Task(algo or task.algo, task.config, sim or task.sim, options)
-        task.check_same(read_config(resumed), resumed / CONFIG_NAME)
+        task.identity.check_same(read_config(resumed), resumed / CONFIG_NAME)
         return task
     if preset is not None:
         task = Task.of_preset(preset, sim_options, **given)

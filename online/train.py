@@ -129,7 +129,7 @@ class _Run:
 
     def open(self, resume: bool) -> None:
         """Create the folder, or check that it is this run's, and the folders of the logs."""
-        open_run(self.folder, self.task, resume)
+        open_run(self.folder, self.task.identity, resume)
         try:
             for path in self.logs.values():
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,53 +7,15 @@ because a kill between two writes could separate them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from safetensors import SafetensorError
 from torch import Tensor
 
-from mcaprl.errors import TrainingError
-from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.runs import CHECKPOINT_NAME, broken_checkpoint, check_same
+from mcaprl.runs import CHECKPOINT_NAME, RunIdentity, broken_checkpoint
 from mcaprl.tensor_files import read_tensors, write_tensors
-
-
-@dataclass(frozen=True)
-class RunIdentity:
-    """What has to be the same for a run to be resumed.
-
-    Attributes:
-        algo: Name of the algorithm.
-        config: Settings of the algorithm.
-        data: Fingerprint of the data and their weights.
-        other_data: Whether the run may be resumed with other data.
-    """
-
-    algo: str
-    config: TrainingConfig
-    data: str
-    other_data: bool = False
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON types."""
-        return {"algo": self.algo, "config": self.config.to_json(), "data": self.data}
-
-    def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Compare with the identity in a file.
-
-        Raises:
-            TrainingError: The file is from another run; the message names the first difference.
-        """
-        check_same({"algo": self.algo, "config": self.config.to_json()}, found, where)
-        if not self.other_data and found.get("data") != self.data:
-            raise TrainingError(
-                f"cannot resume: {where} was trained on other data; resume with the same data and"
-                " weights, train into another folder, or allow other data (--other-data)"
-            )
 
 
 @dataclass(frozen=True)
@@ -84,7 +46,7 @@ class Checkpoint:
 
 def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIdentity) -> None:
     """Replace the checkpoint in a folder with the current state of a seed."""
-    description = {"step": learner.step, **identity.to_json()}
+    description = {"step": learner.step, **identity.parts}
     write_tensors(folder / CHECKPOINT_NAME, learner.state(seed), description)
 
 

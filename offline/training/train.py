@@ -26,7 +26,6 @@ from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
 from mcaprl.offline.training.checkpoint import (
     Checkpoint,
-    RunIdentity,
     read_checkpoint,
     save_checkpoint,
 )
@@ -40,7 +39,7 @@ from mcaprl.offline.training.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
-from mcaprl.runs import CHECKPOINT_NAME, open_run, policy_files, seed_folder
+from mcaprl.runs import CHECKPOINT_NAME, RunIdentity, open_run, policy_files, seed_folder
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -96,7 +95,9 @@ def train(
     learner_type, config = choose_algorithm(algo)
     weights = np.ones(len(dataset.episodes)) if weights is None else weights
     _check_weights(weights, len(dataset.episodes))
-    identity = RunIdentity(learner_type.name, config, _fingerprint(dataset, weights), other_data)
+    data = _fingerprint(dataset, weights)
+    parts = {"algo": learner_type.name, "config": config.to_json(), "data": data}
+    identity = RunIdentity(parts, other_data)
     folder = Path(out)
     held_out = choose_held_out(len(weights), config.held_out)
     buffer = TransitionBuffer.from_dataset(
@@ -110,7 +111,7 @@ def train(
         warnings.warn(message, stacklevel=2)
     run = _Run.create(folder, identity, dataset, buffer, held_out, follow)
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-        return run.train(learner_type, range(seed, seed + seeds), report)
+        return run.train(learner_type, config, range(seed, seed + seeds), report)
 
 
 @dataclass(frozen=True)
@@ -154,12 +155,16 @@ class _Run:
         return cls(folder, identity, dataset, buffer, watched, limit, held_out, follow)
 
     def train(
-        self, learner_type: type[Learner], seeds: range, report: ProgressCallback
+        self,
+        learner_type: type[Learner],
+        config: TrainingConfig,
+        seeds: range,
+        report: ProgressCallback,
     ) -> list[OfflineSummary]:
         """Train seeds, in parallel if their checkpoints are at the same update."""
         summaries = []
         for start in self._starts(seeds):
-            learner = learner_type(self.identity.config, self.buffer, list(start))
+            learner = learner_type(config, self.buffer, list(start))
             for seed, checkpoint in start.items():
                 if checkpoint is not None:
                     checkpoint.restore(learner, seed)

@@ -145,7 +145,7 @@ def test_an_offline_policy_that_stacks_is_taken_over(tmp_path: Path) -> None:
         assert model.replay_buffer.frames[""].shape[2:] == (12,)
     with (
         closing(agent(tmp_path, frame_stack=1)) as other,
-        pytest.raises(PolicyError, match=r"looks at 3 observations in a row.*--frame-stack"),
+        pytest.raises(PolicyError, match=r"stacks 3 observations.*--frame-stack"),
     ):
         other.start_from(None, policy)
 

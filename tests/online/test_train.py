@@ -220,4 +220,4 @@ def test_the_command_knows_which_settings_an_algorithm_has(
 ) -> None:
     out = str(tmp_path / "run")
     assert run(["train-online", "lane", "--algo", "dqn", "--out", out, "--epochs", "3"]) == 2
-    assert "dqn has no setting --epochs; it has --steps" in capsys.readouterr().err
+    assert "dqn has no setting --epochs; it has --learning-rate" in capsys.readouterr().err

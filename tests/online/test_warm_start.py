@@ -244,7 +244,7 @@ def test_weights_that_mean_other_values_are_refused(tmp_path: Path) -> None:
             def q_values(self, observations: Any) -> Any:
                 return 2 * model.q_net(torch.from_numpy(observations)).detach().numpy()
 
-        with pytest.raises(PolicyError, match="a network of another form"):
+        with pytest.raises(PolicyError, match="a network of another architecture"):
             begun.start_from(None, Doubled())
 
 
