@@ -2,7 +2,7 @@
 
 Everything here is for topics with few messages, or that only viewers read; rosbags encodes them,
 but for the three that each episode ends with: a recorder is waited for. Transitions and images go
-another way (`schema`, `message_records`).
+another way (`schema`, `message_rows`).
 """
 
 from __future__ import annotations

@@ -5,16 +5,13 @@ from __future__ import annotations
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunk_check import (
     Contradiction,
-    Piece,
-    check_piece,
+    check_chunk,
     check_statistics,
     place,
 )
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.joined import packed
-from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES
-from mcaprl.recorder.columns.message_spans import Span, joined_index
+from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import (
     contents_of,
@@ -35,12 +32,11 @@ __all__ = [
     "Damage",
     "Decoder",
     "McapReader",
-    "Piece",
+    "MessageRange",
     "Scratch",
     "SoundRecord",
-    "Span",
     "Topic",
-    "check_piece",
+    "check_chunk",
     "check_statistics",
     "chunk_header",
     "chunk_records",
@@ -48,10 +44,8 @@ __all__ = [
     "crc32",
     "intact_summary",
     "is_intact_attachment",
-    "joined_index",
     "map_file",
     "only",
-    "packed",
     "parse_record",
     "place",
     "sound_records",

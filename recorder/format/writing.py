@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from mcaprl.recorder.columns.append import what_is_written
+from mcaprl.recorder.columns.append import written_state
+from mcaprl.recorder.columns.cdr import ENCAPSULATION
 from mcaprl.recorder.columns.file_lock import refuse_if_taken
 from mcaprl.recorder.columns.message_rows import message_rows
-from mcaprl.recorder.columns.ros_types import ENCAPSULATION
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 
@@ -16,5 +16,5 @@ __all__ = [
     "McapWriter",
     "message_rows",
     "refuse_if_taken",
-    "what_is_written",
+    "written_state",
 ]

@@ -4,7 +4,7 @@
     its chunks   CRCs, indexes against contents, what the summary tells of them  (chunk_check)
     the log      metadata against schema, episodes, steps in order, pictures     (episode_check)
 
-Each chunk is decompressed once, and looked at as a whole; small ones together.
+Each chunk is decompressed once.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
@@ -26,13 +27,11 @@ from mcaprl.recorder.format.reading import (
     RECORD_HEADER_BYTES,
     Contradiction,
     McapReader,
-    Piece,
     Scratch,
-    check_piece,
+    check_chunk,
     check_statistics,
     crc32,
     is_intact_attachment,
-    packed,
     place,
 )
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
@@ -85,56 +84,44 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
 
 
 def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Contradiction]:
-    """Chunk by chunk: what stands in each, and what the log says with all of them."""
+    """Check each chunk, and what the log says across chunks."""
     found: list[Contradiction] = []
     log = EpisodeCheck(reader) if whole else None
-    for numbers, read in _decompressed(reader, threads):
+    for chunk, read in _decompressed(reader, threads):
         try:
-            piece = read()
-            found += check_piece(reader, piece)
-        except CorruptLogError:
-            found += _check_alone(reader, numbers)
+            records = read()
+            found += check_chunk(reader, chunk, records)
+        except CorruptLogError as error:
+            found.append(Contradiction(_without_path(error, reader.path), place(reader, chunk)))
             continue
         if log is not None and not found:
-            log.take(piece)
+            log.take(chunk, records)
     if log is not None and not found:
         found += [*check_statistics(reader), *log.finish()]
     return found
 
 
-def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Contradiction]:
-    """Chunks of which one is damaged, each by itself."""
-    scratch = Scratch()
-    for number in range(numbers.start, numbers.stop):
-        try:
-            piece = Piece.read(reader, slice(number, number + 1), scratch)
-            yield from check_piece(reader, piece)
-        except CorruptLogError as error:
-            where = place(reader, reader.chunks[number])
-            yield Contradiction(_without_path(error, reader.path), where)
-
-
-def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Callable[[], Piece]]]:
-    """Yield numbers of chunks with what gives them, which are there until the next ones are."""
-    sizes = reader.table.rows["raw_bytes"].tolist()
-    several = packed(range(len(sizes)), sizes.__getitem__)
-    pieces = (slice(numbers[0], numbers[-1] + 1) for numbers in several)
+def _decompressed(
+    reader: McapReader, threads: int
+) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
+    """Yield chunks with functions that return their records, valid until the next chunk."""
     if threads == 1:
         scratch = Scratch()
-        for numbers in pieces:
-            yield numbers, partial(Piece.read, reader, numbers, scratch)
+        for chunk in reader.chunks:
+            yield chunk, partial(reader.chunk_records, chunk, scratch)
         return
+    chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
-        ahead = deque[tuple[slice, Future[Piece]]]()
-        # One for each thread, and one at hand: memory does not grow with the file.
+        ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
+        # One for each thread and one for the caller: memory does not grow with the file.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
-            for numbers in islice(pieces, threads + 1 - len(ahead)):
-                ahead.append((numbers, pool.submit(Piece.read, reader, numbers, next(scratches))))
+            for chunk in islice(chunks, threads + 1 - len(ahead)):
+                ahead.append((chunk, pool.submit(reader.chunk_records, chunk, next(scratches))))
             if not ahead:
                 return
-            numbers, future = ahead.popleft()
-            yield numbers, future.result
+            chunk, future = ahead.popleft()
+            yield chunk, future.result
 
 
 def _check_file(reader: McapReader) -> list[Contradiction]:

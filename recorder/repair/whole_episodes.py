@@ -33,7 +33,7 @@ from mcaprl.recorder.format.reading import (
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
-from mcaprl.recorder.format.writing import McapWriter, what_is_written
+from mcaprl.recorder.format.writing import McapWriter, written_state
 
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Topics that tell of episodes; the others are kept as they are.
@@ -153,8 +153,8 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
 
 def write_planned(reader: McapReader, writer: McapWriter, plan: EpisodePlan) -> None:
     """Write what is kept to another file."""
-    standing = what_is_written(reader.path).standing
-    for record in sorted(standing, key=lambda record: not isinstance(record, Metadata)):
+    top_level = written_state(reader.path).top_level
+    for record in sorted(top_level, key=lambda record: not isinstance(record, Metadata)):
         writer.announce(record)
     for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
         records = reader.chunk_records(chunk)
@@ -274,19 +274,19 @@ def _told_ends(reader: McapReader) -> set[int]:
 
 def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
     return sum(
-        int((~_is_inside(plan, span.index["log_time"])).sum())
+        int((~_is_inside(plan, part.index["log_time"])).sum())
         for channel in reader.channels.values()
         if channel.topic.startswith(_OF_EPISODES) and channel.topic != STEP_TOPIC
-        for span in reader.spans(channel)
+        for part in reader.message_ranges(channel)
     )
 
 
 def _by_place(steps: Topic, fates: NDArray[np.uint8]) -> Iterator[tuple[Place, NDArray[np.uint8]]]:
     start = 0
-    for decoder, span in steps.parts:
-        stop = start + len(span)
-        assert span.chunk is not None, "all messages are in chunks"
-        yield (span.chunk.chunk_start_offset, decoder.channel.id), fates[start:stop]
+    for decoder, part in steps.parts:
+        stop = start + len(part)
+        assert part.chunk is not None, "all messages are in chunks"
+        yield (part.chunk.chunk_start_offset, decoder.channel.id), fates[start:stop]
         start = stop
 
 
