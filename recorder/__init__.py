@@ -7,6 +7,6 @@
                         -> check
     damaged file -> salvage -> valid_copy -> whole_episodes -> file   (recover)
 
-`chunks`, `message_records`, `schema` and `messages` are the codec of both directions, `spaces` and
+`chunks`, `message_rows`, `schema` and `messages` are the codec of both directions, `spaces` and
 `metadata` say what is in a log, `scene` and `layout` what a viewer makes of it.
 """

@@ -48,3 +48,9 @@ def need(available: bool, reason: str) -> None:
         pytest.fail(f"CI must have it: {reason}")
     if not available:
         pytest.skip(reason)
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let writers leave their small chunks, as one that is killed does."""
+    monkeypatch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)

@@ -40,7 +40,7 @@ class GrowingLogs:
         """
         self._data = data
         self._counts: dict[Path, int] = {}
-        self._sizes: dict[Path, int] = {}
+        self._states: dict[Path, tuple[int, int, int]] = {}
         give_up_s = time.monotonic() + patience_s
         while True:
             parts = self._read_more()
@@ -64,15 +64,23 @@ class GrowingLogs:
             paths = find_logs(self._data)
         except LogError:
             return []
-        grown = [path for path in paths if path.stat().st_size != self._sizes.get(path)]
         parts = []
-        for path in grown:
-            self._sizes[path] = path.stat().st_size
+        for path in paths:
+            state = _state_of(path)
+            if state == self._states.get(path):
+                continue
+            self._states[path] = state
             part = _read_from(path, self._counts.get(path, 0))
             if part is not None:
                 self._counts[path] = self._counts.get(path, 0) + len(part.episodes)
                 parts.append(part)
         return parts
+
+
+def _state_of(path: Path) -> tuple[int, int, int]:
+    """Return what changes when a log grows, or when its writer replaces it by a compacted file."""
+    found = path.stat()
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def with_more_data(learner: Learner, dataset: Dataset, never_drawn: NDArray[np.int64]) -> Learner:

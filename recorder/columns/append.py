@@ -1,4 +1,4 @@
-"""Takes up a finished MCAP file where its writer left it, so that more can be written behind it."""
+"""State of a finished MCAP file, from which a writer can append to it."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import parse_record
 from mcaprl.recorder.columns.summary import Summary
 
-Standing = Metadata | Schema | Channel | Attachment
-"""Records that stand outside of chunks."""
+TopLevelRecord = Metadata | Schema | Channel | Attachment
+"""Records that writers store outside of chunks."""
 _DATA_END = struct.Struct("<BQI")
 
 
 @dataclass
-class Written:
-    """What a writer knows when it has written a file.
+class WrittenState:
+    """State of the writer of a finished file.
 
     Attributes:
-        summary: of what is in the file.
-        end: of its data, where more can be written.
+        summary: Summary of the file.
+        end: First byte after the data, where a writer can append.
         crc: CRC-32 of the data.
-        standing: the records outside of chunks.
+        top_level: Top-level records in file order.
     """
 
     summary: Summary
     end: int
     crc: int
-    standing: list[Standing] = field(default_factory=list)
+    top_level: list[TopLevelRecord] = field(default_factory=list)
 
 
-def what_is_written(path: Path) -> Written:
-    """Read what the writer of a file knew when it finished it.
+def written_state(path: Path) -> WrittenState:
+    """Read the state that the writer of a file had at its end.
 
     Raises:
-        LogError: the file is damaged or not finished, or others wrote it in ways of their own.
+        LogError: The file is damaged or not finished, or has messages outside of chunks.
     """
     try:
         reader = McapReader(path)
@@ -51,9 +51,10 @@ def what_is_written(path: Path) -> Written:
         if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
             raise CorruptLogError("its writer did not finish it")
         (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
-        written = Written(Summary(chunks=list(reader.chunks)), end, crc or crc32(reader.view[:end]))
-        _take_topics(reader, written)
-        _take_other_records(reader, written)
+        summary = Summary(chunks=list(reader.chunks))
+        written = WrittenState(summary, end, crc or crc32(reader.view[:end]))
+        _add_topics(reader, written)
+        _add_other_records(reader, written)
     except CorruptLogError as error:
         what = str(error).removeprefix(f"{path}: ")
         raise LogError(
@@ -63,23 +64,23 @@ def what_is_written(path: Path) -> Written:
     return written
 
 
-def _take_topics(reader: McapReader, written: Written) -> None:
-    topics: list[Standing] = [*reader.schemas.values(), *reader.channels.values()]
+def _add_topics(reader: McapReader, written: WrittenState) -> None:
+    topics: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
     for topic in topics:
-        written.summary.note(topic, 0, 0)
-        written.standing.append(topic)
+        written.summary.add(topic, 0, 0)
+        written.top_level.append(topic)
     for channel in reader.channels.values():
-        spans = reader.spans(channel)
-        if any(span.chunk is None for span in spans):
+        ranges = reader.message_ranges(channel)
+        if any(messages.chunk is None for messages in ranges):
             raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
-        written.summary.counts[channel.id] = sum(len(span) for span in spans)
+        written.summary.counts[channel.id] = sum(map(len, ranges))
 
 
-def _take_other_records(reader: McapReader, written: Written) -> None:
+def _add_other_records(reader: McapReader, written: WrittenState) -> None:
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
         if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            record: Standing = parse_record(opcode, content)
-            written.summary.note(record, offset, RECORD_HEADER_BYTES + len(content))
-            written.standing.append(record)
+            record: TopLevelRecord = parse_record(opcode, content)
+            written.summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
+            written.top_level.append(record)
         elif opcode == Opcode.DATA_END:
             return

@@ -1,14 +1,14 @@
-"""Where the fields of CDR messages are: any ROS 2 type, read by columns or one by one.
+"""Field positions in CDR messages of any ROS 2 type.
 
-Messages of one type and one length nearly always have one form: all their strings and sequences
-have the lengths of the first. The form of an example is a `Layout`, a NumPy structured dtype, and
-the lengths in it are words that every other message is compared with. Those that agree are read as
-one array; any other is decoded by rosbags, with the same values.
+Messages of one type and one length nearly always have equal string and sequence lengths. The
+`Layout` of an example is a NumPy structured dtype together with these lengths, which are compared
+with those of every other message. Messages with equal lengths are read as one array; all others are
+decoded by rosbags, with the same values.
 
-CDR begins with an encapsulation header of 4 bytes, whose second says the byte order. Behind it
-each number is aligned to its own size, counted from there; a string is a uint32 length and that
-many bytes, the last of them 0; a sequence is a uint32 count and its elements. Up to three bytes of
-padding may follow.
+CDR starts with an encapsulation header of 4 bytes, of which the second is the byte order. After it,
+each number is aligned to its own size, counted from the end of the header. A string is a uint32
+length and this number of bytes, of which the last is 0; a sequence is a uint32 count and its
+elements. Up to three bytes of padding may follow.
 """
 
 from __future__ import annotations
@@ -26,42 +26,61 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.ros_types import ENCAPSULATION_BYTES, ROS_TO_NUMPY
+
+# The encapsulation header of little-endian plain CDR, bytes 00 01 00 00, as a uint32.
+ENCAPSULATION = 0x0100
+ENCAPSULATION_BYTES = 4
+ROS_TO_NUMPY = {
+    "float64": "<f8",
+    "int64": "<i8",
+    "uint64": "<u8",
+    "float32": "<f4",
+    "int32": "<i4",
+    "uint32": "<u4",
+    "int16": "<i2",
+    "uint16": "<u2",
+    "int8": "i1",
+    "uint8": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "bool": "u1",
+}
+"""NumPy type code of each ROS primitive type."""
 
 MAX_PADDING_BYTES = 3
-# The encapsulation headers of plain CDR; the two bytes behind them are options without effect.
+# The encapsulation headers of plain CDR; the two bytes after them are options without effect.
 BIG_ENDIAN, LITTLE_ENDIAN = b"\0\0", b"\0\1"
-# A message of more nested parts than this is not worth a layout of its own.
+# Messages with more nested parts than this are decoded one by one.
 _MAX_PARTS = 256
 _MAX_LAYOUTS = 64
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where wanted fields are in messages of one form.
+    """Positions of the wanted fields in messages with equal string and sequence lengths.
 
     Attributes:
-        dtype: of a message, padding included: the wanted fields, and those of `constants`.
-        constants: what is the same in all messages of the form: the byte order, and the length of
-            each string and sequence.
+        dtype: Structured dtype of a message with its padding: wanted fields and `constants`.
+        constants: Values that all these messages share: byte order, and the length of each string
+            and sequence.
     """
 
     dtype: np.dtype[Any]
     constants: dict[str, int]
 
     def fits(self, payloads: NDArray[Any]) -> bool:
-        """Whether all messages have this form."""
-        return all(bool((payloads[name] == told).all()) for name, told in self.constants.items())
+        """Return whether all messages have this layout."""
+        return all(bool((payloads[name] == value).all()) for name, value in self.constants.items())
 
 
 class MessageType:
-    """A message type, from the schema that stands in a log."""
+    """Message type that is parsed from a schema of a log."""
 
     def __init__(self, name: str, text: str) -> None:
-        """Parse a ROS 2 message definition, with the types that it nests.
+        """Parse a ROS 2 message definition with its nested types.
 
         Raises:
-            LogError: it does not parse.
+            LogError: The definition does not parse.
         """
         self.name = name
         self._layouts: dict[tuple[object, ...], Layout | None] = {}
@@ -72,34 +91,34 @@ class MessageType:
             self._store.register(own)
             self._fields = dict(self._store.fielddefs[name][1])
             self._store.get_msgdef(name)
-        # The library raises whatever its parsing meets; none of it is more than "does not parse".
+        # The library raises errors of many types when a definition does not parse.
         except Exception as error:
             raise LogError(f"the definition of {name} does not parse: {error}") from error
 
     @cached_property
     def dtypes(self) -> dict[str, np.dtype[Any]]:
-        """The message's own fields: of numbers or arrays their dtype, of all else `object`."""
+        """Dtype of each top-level field; `object` for all but numbers and arrays."""
         return {name: _dtype_of(description) for name, description in self._fields.items()}
 
     def decode(self, data: bytes) -> Any:
-        """One message as an object with an attribute for each field.
+        """Decode one message to an object with an attribute for each field.
 
         Raises:
-            CorruptLogError: the bytes do not fit the type.
+            CorruptLogError: The bytes do not fit the type.
         """
         try:
             return self._store.deserialize_cdr(data, self.name)
-        # As above: "does not fit".
+        # As above, errors of many types.
         except Exception as error:
-            raise CorruptLogError(f"{len(data)} bytes are no {self.name}: {error}") from error
+            raise CorruptLogError(f"{len(data)} bytes are not a {self.name}: {error}") from error
 
     def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
-        """The form of the last example of that length; None if there was none."""
+        """Return the last layout of messages of this length; None if there is none."""
         return self._layouts.get((length, *wanted))
 
     def layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
-        """The form of an example; None if it has none that could be told."""
-        # Making one takes as long as decoding a few messages.
+        """Return the layout of an example; None if the message has no layout."""
+        # A new layout takes as long as decoding a few messages.
         key = (len(example), *wanted)
         known = self._layouts.get(key)
         if known is None or not known.fits(np.frombuffer(example, known.dtype)):
@@ -123,7 +142,7 @@ class MessageType:
         return walk.layout()
 
     def _pass(self, walk: _Walk, description: Any, name: str | None) -> None:
-        """Go past one field, and note where it is if it has a name."""
+        """Skip one field; record its position if it has a name."""
         kind, what = description
         match kind:
             case Nodetype.BASE if what[0] == "string":
@@ -146,16 +165,16 @@ class MessageType:
                     self._pass(walk, element, None)
 
     def _refuse(self, name: str | None) -> None:
-        """Nested messages and lists of texts make no column."""
+        """Raise LogError for a wanted field that is a nested message or a list of strings."""
         if name is not None:
             raise LogError(f"field {name} of {self.name} is neither a number, array nor text")
 
 
 class _Walk:
-    """Goes through one message and notes where fields are."""
+    """Cursor that moves through one message and records the positions of fields."""
 
     def __init__(self, data: bytes) -> None:
-        """Stand behind the encapsulation header."""
+        """Start after the encapsulation header."""
         self.position = ENCAPSULATION_BYTES
         self._data = data
         self._order: Literal["<", ">"] = "<" if data[:2] == LITTLE_ENDIAN else ">"
@@ -164,7 +183,7 @@ class _Walk:
         self._fields: dict[str, tuple[Any, int]] = {"_encapsulation": ("<u2", 0)}
 
     def take(self, code: str, count: int, name: str | None, *, scalar: bool = False) -> None:
-        """Pass `count` numbers, or a text."""
+        """Skip `count` numbers, or a string."""
         self._parts += 1
         if self._parts > _MAX_PARTS:
             raise _NoLayout
@@ -180,15 +199,15 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def length(self) -> int:
-        """Pass the length of a string or sequence, which other messages have to share."""
+        """Skip the length of a string or sequence; the layout requires it of other messages."""
         name = f"_length_{len(self._constants)}"
         self.take("u4", 1, name, scalar=True)
-        (told,) = struct.unpack_from(f"{self._order}I", self._data, self.position - 4)
-        self._constants[name] = told
-        return int(told)
+        (value,) = struct.unpack_from(f"{self._order}I", self._data, self.position - 4)
+        self._constants[name] = value
+        return int(value)
 
     def layout(self) -> Layout:
-        """What was noted."""
+        """Return the layout of the recorded fields."""
         formats, offsets = zip(*self._fields.values(), strict=True)
         dtype = np.dtype(
             {
@@ -202,14 +221,14 @@ class _Walk:
 
 
 class _NoLayout(Exception):
-    """A message is too short for its type, or of too many parts."""
+    """Error for a message that is too short for its type or has too many parts."""
 
 
 def message_type(schema: Schema) -> MessageType:
-    """The type that a schema defines, parsed once.
+    """Return the type of a schema; each schema is parsed once.
 
     Raises:
-        LogError: its encoding is not `ros2msg`, or it does not parse.
+        LogError: The encoding is not `ros2msg`, or the definition does not parse.
     """
     if schema.encoding != "ros2msg":
         raise LogError(f"its schema {schema.name} is {schema.encoding!r}; known is 'ros2msg'")

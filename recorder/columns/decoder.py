@@ -1,4 +1,4 @@
-"""Decodes the messages of one channel: where all have one form as arrays, else one by one."""
+"""Decoder of the messages of one channel: arrays where layouts are equal, else one by one."""
 
 from __future__ import annotations
 
@@ -12,49 +12,58 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.cdr import Layout, MessageType, message_type
 from mcaprl.recorder.columns.chunks import Scratch
-from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, are_messages, gather, record_dtype
-from mcaprl.recorder.columns.message_spans import Span
+from mcaprl.recorder.columns.message_rows import (
+    MESSAGE_HEADER,
+    MessageRange,
+    are_messages,
+    gather,
+    record_dtype,
+)
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
 
-# Messages of a chunk that are of more lengths than this are decoded one by one.
+# Messages of a chunk with more different lengths than this are decoded one by one.
 _MAX_LENGTHS = 16
 
 Columns = dict[str, NDArray[Any]]
-"""Arrays of one length, by field name; texts are arrays of `str` objects."""
+"""Arrays of one length by field name; strings are arrays of `str` objects."""
 Rows = slice | NDArray[np.int64]
-"""Which rows of a column."""
+"""Rows of a column."""
 
 
 class Decoder:
-    """Makes columns of a channel's messages.
+    """Decoder of the messages of one channel to columns.
 
     Attributes:
-        channel: whose.
-        type: of the messages.
+        channel: Channel of the messages.
+        type: Type of the messages.
     """
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
-        """Look up their type.
+        """Parse the message type.
 
         Raises:
-            LogError: they are encoded in a way that is not known.
+            LogError: The encoding of the messages is not supported.
         """
         self.channel, self.type = channel, _type_of(reader, channel)
         self._reader = reader
 
     def empty_columns(
-        self, wanted: Collection[str], count: int, span: Span, scratch: Scratch | None = None
+        self,
+        wanted: Collection[str],
+        count: int,
+        messages: MessageRange,
+        scratch: Scratch | None = None,
     ) -> Columns:
-        """Columns with the dtypes and shapes of a span's first message."""
-        records = self._reader.records_of(span, scratch)
-        example = self._values(records, span.index[0], wanted)
+        """Return columns with `count` rows and the dtypes and shapes of the first message."""
+        records = self._reader.records_of(messages, scratch)
+        example = self._values(records, messages.index[0], wanted)
         return {
             name: np.empty((count, *value.shape), value.dtype) for name, value in example.items()
         }
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
-        """Put copies of the messages that an index points at into rows of the columns."""
+        """Copy the messages of index entries to rows of the columns."""
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -63,13 +72,13 @@ class Decoder:
         for entry, row in zip(index, rows.tolist(), strict=True):
             for name, value in self._values(records, entry, columns).items():
                 self._check_shape(name, value, columns[name], entry)
-                # A text out of its array: a column of objects would keep that.
+                # A string instead of an array that holds it.
                 columns[name][row] = value[()]
 
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Put the messages of one length after the other; gives back those that are of no form."""
+        """Copy messages length by length; return index and rows of those that are left."""
         if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
             return index, rows
         lengths = gather(records, index, MESSAGE_HEADER)["length"]
@@ -83,7 +92,7 @@ class Decoder:
     def _put_alike(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
-        """Put messages that have the form of the first; does nothing if one has not."""
+        """Copy messages with the layout of the first; return False if there are others."""
         found = self.alike(records, index, columns)
         if found is None:
             return False
@@ -99,8 +108,8 @@ class Decoder:
     def alike(
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
     ) -> NDArray[Any] | None:
-        """The messages as one structured array; None if they have not one form."""
-        # Mostly they have the form of those before them.
+        """Return the messages as one structured array; None if their layouts differ."""
+        # Most messages have the layout of earlier ones.
         known = self.type.known_layout(self._length(records, index), wanted)
         found = None if known is None else self._laid_out(records, index, known)
         if found is not None:
@@ -111,7 +120,7 @@ class Decoder:
         return self._laid_out(records, index, layout)
 
     def _length(self, records: memoryview, index: NDArray[Any]) -> int:
-        """Bytes of the first message, as its record tells; -1 if there is none."""
+        """Return the length of the first message; -1 if there is none."""
         offset = int(index["offset"][0])
         if offset + MESSAGE_HEADER.itemsize > len(records):
             return -1
@@ -125,13 +134,13 @@ class Decoder:
         try:
             rows = gather(records, index, dtype)
         except CorruptLogError:
-            # The last ones may be shorter than this form.
+            # The last messages may be shorter than this layout.
             return None
-        are_told = are_messages(rows, self.channel.id) and bool(
+        are_valid = are_messages(rows, self.channel.id) and bool(
             (rows["log_time"] == index["log_time"]).all()
         )
         payloads: NDArray[Any] = rows["payload"]
-        return payloads if are_told and layout.fits(payloads) else None
+        return payloads if are_valid and layout.fits(payloads) else None
 
     def _message(self, records: memoryview, entry: Any) -> bytes:
         return self._reader.message(
@@ -139,7 +148,7 @@ class Decoder:
         )
 
     def _values(self, records: memoryview, entry: Any, wanted: Collection[str]) -> Columns:
-        """Fields of one message, decoded by itself."""
+        """Decode fields of one message."""
         data = self._message(records, entry)
         try:
             message = self.type.decode(data)
@@ -152,13 +161,13 @@ class Decoder:
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
-            # Often all are the same.
+            # Often all are equal.
             if (values == values[0]).all():
                 return [bytes(values[0]).decode()] * len(values)
             return [text.decode() for text in values.tolist()]
         except UnicodeDecodeError as error:
             raise CorruptLogError(
-                f"{self._reader.path}: {self.channel.topic} has a text that is no UTF-8"
+                f"{self._reader.path}: {self.channel.topic} has a string that is not UTF-8"
             ) from error
 
     def _check_shape(
@@ -172,7 +181,7 @@ class Decoder:
 
 
 def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
-    """Set rows of a column. Vectors are moved as a whole, not number by number."""
+    """Set rows of a column; copy each vector as one item, not number by number."""
     if values.ndim == 2 and values.size and values.dtype == column.dtype:
         row = np.dtype((np.void, values.shape[1] * values.itemsize))
         column, values = column.view(row)[:, 0], values.view(row)[:, 0]

@@ -1,12 +1,13 @@
-"""Opens the file that a log is written to: for one writer at a time.
+"""Files that are opened by one writer at a time.
 
-The lock is advisory: it keeps out other writers of this library, on systems that have `flock`.
-Readers need none, since a file only ever grows by whole records.
+The lock is advisory: it keeps out other writers of this library, on systems with `flock`. Readers
+need no lock, since a file only grows by whole records or is replaced as a whole.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from io import FileIO
 from pathlib import Path
@@ -18,15 +19,15 @@ if sys.platform != "win32":
 
 
 def create(path: Path, *, overwrite: bool) -> FileIO:
-    """Create a file and lock it; folders above it are made.
+    """Create and lock a file and the missing folders of its path.
 
     Args:
-        path: where to.
-        overwrite: replace a file that is there. Who reads that one keeps it to the end.
+        path: Path of the file.
+        overwrite: Whether to replace an existing file; its readers keep the old contents.
 
     Raises:
-        OutputExistsError: there is a file, and `overwrite` is not set.
-        LogError: it cannot be created, or another writer is at work on it.
+        OutputExistsError: The file exists, and `overwrite` is not set.
+        LogError: The file cannot be created, or another writer has locked it.
     """
     if path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
@@ -42,30 +43,44 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
 
 
 def reopen(path: Path) -> FileIO:
-    """Open a file to change it, and lock it.
+    """Open a file for reading and writing, and lock it.
 
     Raises:
-        LogError: it cannot be written, or another writer is at work on it.
+        LogError: The file cannot be written, or another writer has locked it.
     """
     try:
-        return _locked(FileIO(path, "r+"), path)
+        while True:
+            file = _locked(FileIO(path, "r+"), path)
+            # A writer that has just finished may have replaced the file before its lock was free.
+            if is_at(file, path):
+                return file
+            release(file)
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror}") from error
 
 
 def release(file: FileIO) -> None:
-    """Unlock and close a file, even one that a child process still holds."""
+    """Unlock and close a file, even if a child process still has it open."""
     if not file.closed and sys.platform != "win32":
         with contextlib.suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_UN)
     file.close()
 
 
-def refuse_if_taken(path: Path) -> None:
-    """Make sure that nobody writes to the file.
+def is_at(file: FileIO, path: Path) -> bool:
+    """Return whether an open file is the one at a path.
 
     Raises:
-        LogError: another writer is at work on it.
+        OSError: There is no file at the path.
+    """
+    return os.path.samestat(os.fstat(file.fileno()), path.stat())
+
+
+def refuse_if_taken(path: Path) -> None:
+    """Raise an error if another writer has locked the file.
+
+    Raises:
+        LogError: Another writer has locked it.
     """
     if path.is_file():
         with contextlib.suppress(OSError):
@@ -82,7 +97,7 @@ def _locked(file: FileIO, path: Path) -> FileIO:
                 f"{path} is being written by another recording; wait for its end, or choose"
                 " another path"
             ) from error
-        # File systems without locks, as some of networks are: then there is none.
+        # Some network file systems have no locks.
         except OSError:
             pass
     return file

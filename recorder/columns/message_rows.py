@@ -1,19 +1,20 @@
-"""The hot path: a chunk's messages of one length are one NumPy array.
+"""Message records and message indexes as NumPy structured arrays.
 
-In an MCAP chunk each message is a record: opcode 0x05, the record's length, channel, sequence
-number, two times, then the payload. Where payloads have one length, a run of messages is a
-structured array of `record_dtype(payload)`; the rows of a MessageIndex are one of `INDEX_ENTRY`.
+In an MCAP chunk each message is a record: opcode 0x05, record length, channel, sequence number,
+log_time, publish_time, payload. Consecutive messages with payloads of one length form a structured
+array of `record_dtype(payload)`; the entries of a MessageIndex form one of `INDEX_ENTRY`.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import Any
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+from typing import Any, Self
 
 import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
@@ -28,31 +29,26 @@ MESSAGE_HEADER = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-# A record's length counts what follows its opcode and length.
+# Opcode and length, which the length of a record does not include.
 RECORD_HEADER_BYTES = 9
 INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
-# What a MessageIndex record has before its entries.
-INDEX_HEAD = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel_id", "<u2"), ("entries_bytes", "<u4")]
-)
-# So few of something are sooner looked at one by one than as an array.
-FEW = 8
+# The fields of a MessageIndex record before its entries.
 _INDEX_START = struct.Struct("<BQHI")
-# What all records of one channel and length begin with: opcode, length, channel.
+# The first fields of a Message record, equal for all records of one channel and length.
 _HEAD = struct.Struct("<BQH")
 _MESSAGE = struct.Struct("<BQHIQQ")
 
 
 @lru_cache(maxsize=64)
 def record_dtype(payload: np.dtype[Any]) -> np.dtype[Any]:
-    """A message record: its header's fields, then `payload`."""
+    """Return the dtype of a message record: the fields of its header, then `payload`."""
     return np.dtype(
         [*((n, MESSAGE_HEADER[n]) for n in MESSAGE_HEADER.names or ()), ("payload", payload)]
     )
 
 
 def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDArray[Any]:
-    """Preallocate message records; what is the same in all of them is filled in."""
+    """Preallocate message records and set opcode, length and channel."""
     dtype = record_dtype(payload)
     rows = np.zeros(capacity, dtype)
     rows["opcode"] = Opcode.MESSAGE
@@ -62,23 +58,23 @@ def message_rows(capacity: int, payload: np.dtype[Any], channel_id: int) -> NDAr
 
 
 def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) -> bytes:
-    """One Message record, logged and published at one time."""
+    """Return a Message record whose log_time and publish_time are `time_ns`."""
     length = _MESSAGE.size - RECORD_HEADER_BYTES + len(data)
     head = _MESSAGE.pack(Opcode.MESSAGE, length, channel_id, sequence, time_ns, time_ns)
     return head + data
 
 
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
-    """Whether all rows of a `record_dtype` begin as messages of that length and channel do."""
+    """Return whether all rows of a `record_dtype` are messages of this channel and length."""
     size = rows.dtype.itemsize
-    told = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
-    words, expected = rows.view(_words(size)), np.frombuffer(told, _words(_HEAD.size))[0]
+    head = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
+    words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]
     return all(bool((words[name] == expected[name]).all()) for name in ("front", "back"))
 
 
 @lru_cache(maxsize=64)
 def _words(size: int) -> np.dtype[Any]:
-    """A record's first bytes as two words that overlap: faster to compare than its fields."""
+    """View the first bytes of a record as two overlapping words, which compare faster."""
     formats, offsets = ["<u8", "<u8"], [0, _HEAD.size - 8]
     return np.dtype(
         {"names": ["front", "back"], "formats": formats, "offsets": offsets, "itemsize": size}
@@ -86,114 +82,105 @@ def _words(size: int) -> np.dtype[Any]:
 
 
 def message_index_head(channel_id: int, entries_bytes: int) -> bytes:
-    """The MessageIndex record of a channel up to its entries, which follow it."""
+    """Return the MessageIndex record of a channel without its entries, which follow it."""
     length = _INDEX_START.size - RECORD_HEADER_BYTES + entries_bytes
     head: bytes = _INDEX_START.pack(Opcode.MESSAGE_INDEX, length, channel_id, entries_bytes)
     return head
 
 
-def message_index(file: memoryview, offset: int, channel_id: int) -> memoryview:
-    """The entries of the MessageIndex record at `offset`, as bytes: see `INDEX_ENTRY`.
+def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any]:
+    """Return the entries of the MessageIndex record at `offset`, an array of `INDEX_ENTRY`.
 
     Raises:
-        CorruptLogError: there is none of that channel.
+        CorruptLogError: The record is not a message index of this channel.
     """
     try:
         opcode, _, channel, entries_bytes = _INDEX_START.unpack_from(file, offset)
-    # The latter from 2**63 on.
+    # Offsets from 2**63 on overflow.
     except (struct.error, OverflowError):
         opcode = None
     if opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
         start = offset + _INDEX_START.size
         entries = file[start : start + entries_bytes]
         if len(entries) == entries_bytes and entries_bytes % INDEX_ENTRY.itemsize == 0:
-            return entries
+            return np.frombuffer(entries, INDEX_ENTRY)
     raise CorruptLogError(f"no message index of channel {channel_id} at byte {offset}")
 
 
-def index_bounds(
-    file: memoryview, offsets: Sequence[int], channel_ids: Sequence[int]
-) -> NDArray[np.int64]:
-    """Where the entries of MessageIndex records at several offsets begin and end.
+class MessageRange:
+    """Messages of one channel that are stored in one chunk; `len()` is their number.
 
-    Args:
-        file: the bytes of the file.
-        offsets: N of them.
-        channel_ids: whose each must be.
-
-    Returns:
-        (N, 2).
-
-    Raises:
-        CorruptLogError: there is no such record.
+    Attributes:
+        chunk: Chunk with the messages; None for unchunked messages.
     """
-    if len(offsets) < FEW or max(offsets) > len(file) - INDEX_HEAD.itemsize:
-        found = []
-        for offset, channel_id in zip(offsets, channel_ids, strict=True):
-            start = offset + INDEX_HEAD.itemsize
-            found.append((start, start + len(message_index(file, offset, channel_id))))
-        return np.array(found, np.int64).reshape(-1, 2)
-    starts = np.array(offsets, np.int64)
-    heads = windows(file, starts, INDEX_HEAD)
-    starts += INDEX_HEAD.itemsize
-    stops = starts + heads["entries_bytes"]
-    is_wrong = (heads["opcode"] != Opcode.MESSAGE_INDEX) | (heads["channel_id"] != channel_ids)
-    is_wrong |= (heads["entries_bytes"] % INDEX_ENTRY.itemsize != 0) | (stops > len(file))
-    if is_wrong.any():
-        wrong = int(np.argmax(is_wrong))
-        # Says what is wrong.
-        message_index(file, offsets[wrong], channel_ids[wrong])
-    return np.stack([starts, stops], axis=1)
 
+    def __init__(
+        self, chunk: ChunkIndex | None, count: int, read: Callable[[], NDArray[Any]]
+    ) -> None:
+        """Store the number of messages and the function that reads their index."""
+        self.chunk, self._count, self._read = chunk, count, read
 
-def parts_of(file: memoryview, bounds: NDArray[np.int64]) -> Iterator[memoryview]:
-    """The bytes between bounds (N, 2)."""
-    return (file[start:stop] for start, stop in bounds.tolist())
+    @classmethod
+    def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
+        """Return the range of an index that is in memory."""
+        return cls(chunk, len(index), lambda: index)
+
+    @cached_property
+    def index(self) -> NDArray[Any]:
+        """Entries of `INDEX_ENTRY`, one for each message, read at the first access.
+
+        Raises:
+            CorruptLogError: The index is damaged.
+        """
+        return self._read()
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return self._count
 
 
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The messages that an index points at, as one structured array.
+    """Return the messages of index entries as one structured array.
 
-    Without copying where they lie one behind the other; else by one fancy index of void items,
-    which is memcpy's speed (a structured one is twenty times slower).
+    Adjacent messages are not copied. Others are copied by a fancy index of void items, which runs
+    at the speed of memcpy; one of structured items takes twenty times as long.
 
     Args:
-        records: a chunk's uncompressed records.
-        index: entries of the MessageIndex.
-        dtype: `record_dtype` of the channel's payload.
+        records: Uncompressed records of a chunk.
+        index: Entries of `INDEX_ENTRY`.
+        dtype: `record_dtype` of the payload.
 
     Raises:
-        CorruptLogError: an entry points outside the chunk.
+        CorruptLogError: An entry points outside of the chunk.
     """
     offsets, size = index["offset"], dtype.itemsize
     if len(offsets) == 0:
         return np.empty(0, dtype)
-    if _touch_each_other(offsets, size, len(records)):
+    if _are_adjacent(offsets, size, len(records)):
         return np.frombuffer(records, dtype, len(offsets), int(offsets[0]))
-    # Compared without adding: an offset near 2**64 must not wrap around.
+    # Subtract instead of adding: an offset near 2**64 would wrap around.
     if len(records) < size or offsets.max() > len(records) - size:
         raise CorruptLogError("a message index points outside its chunk")
     return windows(records, offsets, dtype)
 
 
 def windows(data: memoryview, offsets: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copies of structures that begin at offsets, each of them wholly inside the data."""
+    """Copy structures that start at offsets; each of them must end within the data."""
     size = dtype.itemsize
     first = np.frombuffer(data, np.dtype((np.void, size)), 1)
     every = np.lib.stride_tricks.as_strided(first, (len(data) - size + 1,), (1,))
     return every[offsets.astype(np.intp)].view(dtype)
 
 
-def _touch_each_other(offsets: NDArray[Any], size: int, end: int) -> bool:
-    """Whether messages of one size lie one behind the other, and before `end`."""
+def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
+    """Return whether messages of one size follow each other without gaps and end before `end`."""
     first, last = int(offsets[0]), int(offsets[-1])
     if last - first != size * (len(offsets) - 1) or last + size > end:
         return False
-    # The ends are right, so only what is between them is looked at.
-    return bool((offsets == touching_offsets(first, last, size)).all())
+    return bool((offsets == adjacent_offsets(first, last, size)).all())
 
 
 @lru_cache(maxsize=2)
-def touching_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """The offsets of messages that touch each other; all full chunks of a topic have the same."""
+def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
+    """Return the offsets of adjacent messages; all full chunks of a topic have the same."""
     return np.arange(first, last + 1, size, dtype=np.uint64)

@@ -1,25 +1,22 @@
-"""Reads an MCAP file chunk by chunk; knows MCAP and nothing of what the messages mean.
+"""Reader of MCAP files: summary, channels, and positions of messages.
 
-The file is mapped into memory, and only the chunks that hold an asked-for topic are touched. Every
-chunk read is checked against its CRC, every message against the index that led to it.
+The file is mapped into memory, and only the chunks of requested topics are read. Each chunk is
+checked against its CRC, each message against its index entry.
 
-Files of any writer are read. What the summary leaves out is looked for: chunks and messages between
-the chunks it tells of, and schemas, channels and messages inside of them. So a file without a
-summary, because its writer was killed or is still at work, is scanned from the start.
+Files of any writer are read. Records that the summary does not list are searched for: chunks and
+messages between the listed chunks, and schemas, channels and messages inside of chunks. A file
+without a summary, whose writer was killed or is still at work, is scanned from the start.
 """
 
 from __future__ import annotations
 
 import struct
-from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
@@ -27,70 +24,76 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunk_table import ChunkTable
-from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
+from mcaprl.recorder.columns.chunks import (
+    Scratch,
+    chunk_header,
+    chunk_records,
+    parse_chunk_index,
+)
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
     RECORD_HEADER_BYTES,
+    MessageRange,
     message_index,
 )
-from mcaprl.recorder.columns.message_spans import Span, Spans, indexed_spans, told_spans
 from mcaprl.recorder.columns.records import (
     MESSAGE_START,
     RECORD_HEADER,
     ChunkContents,
-    LooseMessages,
+    UnindexedMessages,
     attachment_of,
     contents_of,
     footer_of,
     map_file,
     parse_record,
     records_of,
-    runs_of,
 )
 
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
-_STANDING = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
+# The fields of a MessageIndex record before its entries.
+_INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
+_TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
 class McapReader:
-    """One MCAP file, open for reading.
+    """MCAP file that is open for reading.
 
     Attributes:
-        path: of the file.
-        complete: whether the file ends as it should; if not, it was cut off or is being written.
-        summary_start: where the summary begins; 0 if there is none.
-        data_end: where the records that precede it end, as far as they were read.
-        table: its chunks.
-        schemas: by id.
-        channels: by id.
-        metadata: metadata records, by name; of several with one name, the first.
+        path: Path of the file.
+        view: Bytes of the file.
+        complete: Whether the file ends with a footer; if not, it was cut off or is being written.
+        summary_start: First byte of the summary; 0 if there is none.
+        data_end: First byte after the records that were read before the summary.
+        chunks: Indexes of all chunks, in file order.
+        schemas: Schemas by id.
+        channels: Channels by id.
+        metadata: Metadata records by name; the first of several with one name.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Map the file, read its summary, and look for what that leaves out.
+        """Map the file, read its summary, and search for records that it does not list.
 
         Raises:
-            NotMcapError: it is no MCAP file.
-            CorruptLogError: its summary is damaged.
-            LogError: it cannot be opened.
+            NotMcapError: The file is not an MCAP file.
+            CorruptLogError: The summary is damaged.
+            LogError: The file cannot be opened.
         """
         self.path = Path(path)
         self.view = map_file(self.path)
         if bytes(self.view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
-            raise NotMcapError(f"{self.path} is no MCAP file: it does not begin with MCAP's magic")
+            raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        self.table = ChunkTable(np.empty(0, np.int64))
+        self.chunks: list[ChunkIndex] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self.data_end = 0
         self._counts: dict[int, int] = {}
-        self._loose = LooseMessages()
-        # Who asks for a chunk's example asks for all of it next.
+        unchunked = UnindexedMessages()
+        # A caller that reads the first message of a chunk usually reads the others next.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
-        self._spans: dict[int, Spans] = {}
+        self._ranges: dict[int, list[MessageRange]] = {}
         with self._named():
             footer = footer_of(self.view)
         self.complete = footer is not None
@@ -98,27 +101,22 @@ class McapReader:
         if self.summary_start:
             self._read_summary()
         self._summary_has_topics = bool(self.channels)
-        self._read_between_chunks()
-        self._loose_indexes = self._loose.indexes()
-        if self._loose_indexes:
+        self._read_between_chunks(unchunked)
+        self._unchunked = unchunked.indexes()
+        if self._unchunked:
             self._check_data_crc()
         self._find_topics_in_chunks()
 
-    @property
-    def chunks(self) -> list[ChunkIndex]:
-        """Indexes of all chunks, in file order."""
-        return self.table.chunks
-
     def channels_of(self, topic: str) -> list[Channel]:
-        """The channels of a topic, by id; more than one where several writers took part."""
+        """Return the channels of a topic by id; several writers may have one channel each."""
         found = [channel for channel in self.channels.values() if channel.topic == topic]
         return sorted(found, key=lambda channel: channel.id)
 
     def channel_of(self, topic: str) -> Channel | None:
-        """The channel of a topic; None if the file has no such topic.
+        """Return the channel of a topic; None if the file does not have the topic.
 
         Raises:
-            LogError: several channels have that topic.
+            LogError: Several channels have the topic.
         """
         found = self.channels_of(topic)
         if len(found) > 1:
@@ -128,75 +126,79 @@ class McapReader:
         return found[0] if found else None
 
     def schema_of(self, channel: Channel) -> Schema:
-        """The schema of a channel.
+        """Return the schema of a channel.
 
         Raises:
-            CorruptLogError: the file has none.
+            CorruptLogError: The file does not have the schema.
         """
         schema = self.schemas.get(channel.schema_id)
         if schema is None:
             raise CorruptLogError(f"{self.path}: {channel.topic} has no schema")
         return schema
 
-    def spans(self, channel: Channel) -> Spans:
-        """Where the messages of a channel are, in file order. No chunk is read that has an index.
+    def message_ranges(self, channel: Channel) -> list[MessageRange]:
+        """Return the positions of the messages of a channel, in file order.
+
+        Chunks with an index are not read, and neither is the index of a chunk of one channel if the
+        summary confirms the number of messages: who reads a few rows of a large file then reads
+        only a few indexes.
 
         Raises:
-            CorruptLogError: an index is damaged, or tells of fewer messages than the summary does.
+            CorruptLogError: An index is damaged, or the indexes and the summary disagree.
         """
-        if channel.id not in self._spans:
-            self._spans[channel.id] = self._spans_of(channel)
-        return self._spans[channel.id]
+        if channel.id not in self._ranges:
+            count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
+            if sum(map(len, ranges)) != count:
+                ranges = self._find_ranges(channel.id, lazily=False)
+            found = sum(map(len, ranges))
+            if count not in (None, found):
+                raise CorruptLogError(
+                    f"{self.path}: the summary counts {count} messages of {channel.topic}, its"
+                    f" indexes {found}"
+                )
+            self._ranges[channel.id] = ranges
+        return self._ranges[channel.id]
 
-    def _spans_of(self, channel: Channel) -> Spans:
-        told, table = self._counts.get(channel.id), self.table
-        with self._named():
-            indexes = table.indexes_of(channel.id)
-            spans = told_spans(table, indexes, partial(self._index_at, channel.id))
-            if spans is not None and int(spans.counts.sum()) == told:
-                return spans
-            unsure = table.unsure(is_complete=self.complete)
-            numbers, spans = indexed_spans(self.view, table, indexes, unsure, channel.id)
-        others = list(self._unindexed(channel.id, unsure))
-        if others:
-            every = sorted([*zip(numbers.tolist(), spans, strict=True), *others], key=itemgetter(0))
-            spans = Spans.of([span for _, span in every])
-        count = int(spans.counts.sum())
-        if told not in (None, count):
-            raise CorruptLogError(
-                f"{self.path}: the summary tells of {told} messages of {channel.topic}, its indexes"
-                f" of {count}"
-            )
-        return spans
+    def _find_ranges(self, channel_id: int, *, lazily: bool) -> list[MessageRange]:
+        ranges = []
+        # A writer that was killed may have written only some indexes of the last chunk.
+        uncertain = None if self.complete else self.chunks[-1:]
+        for chunk in self.chunks:
+            offsets = chunk.message_index_offsets
+            if not offsets or [chunk] == uncertain:
+                index = self._contents_of(chunk).indexes.get(channel_id)
+                if index is not None:
+                    ranges.append(MessageRange.of_index(chunk, index))
+            elif channel_id in offsets:
+                read = partial(self._index_at, channel_id, offsets[channel_id])
+                if lazily and len(offsets) == 1:
+                    entries_bytes = chunk.message_index_length - _INDEX_HEAD_BYTES
+                    count = max(entries_bytes, 0) // INDEX_ENTRY.itemsize
+                    ranges.append(MessageRange(chunk, count, partial(read, count)))
+                else:
+                    ranges.append(MessageRange.of_index(chunk, read()))
+        if channel_id in self._unchunked:
+            ranges.append(MessageRange.of_index(None, self._unchunked[channel_id]))
+        return ranges
 
-    def _unindexed(self, channel_id: int, unsure: NDArray[np.int64]) -> Iterator[tuple[int, Span]]:
-        """What is in chunks of these numbers, and behind that what is in none."""
-        for number, chunk in zip(unsure.tolist(), self.table.some(unsure), strict=True):
-            index = self._contents_of(chunk).indexes.get(channel_id)
-            if index is not None:
-                yield number, Span.of_index(chunk, index)
-        loose = self._loose_indexes.get(channel_id)
-        if loose is not None:
-            yield len(self.table), Span.of_index(None, loose)
-
-    def records_of(self, span: Span, scratch: Scratch | None = None) -> memoryview:
-        """The bytes that the offsets of a span's index point into; see `chunk_records`.
+    def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
+        """Return the bytes that the offsets of an index refer to; see `chunk_records`.
 
         Raises:
-            CorruptLogError: the chunk is damaged.
+            CorruptLogError: The chunk is damaged.
         """
-        return self.view if span.chunk is None else self.chunk_records(span.chunk, scratch)
+        return self.view if messages.chunk is None else self.chunk_records(messages.chunk, scratch)
 
     def chunk_records(self, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
-        """The records of a chunk, decompressed and checked against their CRC.
+        """Return the records of a chunk, decompressed and checked against their CRC.
 
         Args:
-            chunk: one of `chunks`.
-            scratch: where they may be decompressed to; then they are there until it is used again.
-                It is for chunks of this file alone.
+            chunk: Element of `chunks`.
+            scratch: Memory for the records, which are valid until its next use. It must not be used
+                for other files.
 
         Raises:
-            CorruptLogError: the chunk is damaged.
+            CorruptLogError: The chunk is damaged.
         """
         start = chunk.chunk_start_offset
         last, kept = self._last_chunk if scratch is None else scratch.kept
@@ -211,21 +213,21 @@ class McapReader:
         return records
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Yield log_time and bytes of a topic's messages, one by one.
+        """Yield log_time and bytes of each message of a channel.
 
         Raises:
-            CorruptLogError: a chunk is damaged, or a message is not what the index says.
+            CorruptLogError: A chunk is damaged, or a message does not match its index entry.
         """
-        for span in self.spans(channel):
-            records = self.records_of(span)
-            for time_ns, offset in span.index.tolist():
+        for part in self.message_ranges(channel):
+            records = self.records_of(part)
+            for time_ns, offset in part.index.tolist():
                 yield time_ns, self.message(records, channel, time_ns, offset)
 
     def message(self, records: memoryview, channel: Channel, time_ns: int, offset: int) -> bytes:
-        """The bytes of the message that an index entry points at.
+        """Return the bytes of the message of an index entry.
 
         Raises:
-            CorruptLogError: it is not what the entry says.
+            CorruptLogError: The message does not match the entry.
         """
         start = offset + MESSAGE_HEADER.itemsize
         if start <= len(records):
@@ -236,15 +238,15 @@ class McapReader:
             if found == (Opcode.MESSAGE, channel.id, time_ns) and start <= end <= len(records):
                 return bytes(records[start:end])
         raise CorruptLogError(
-            f"{self.path}: the message of {channel.topic} at byte {offset} of its chunk is not"
-            " what the index says"
+            f"{self.path}: the message of {channel.topic} at byte {offset} of its chunk does not"
+            " match its index entry"
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """The last attachment of a name; None if there is none.
+        """Return the data of the last attachment with a name; None if there is none.
 
         Raises:
-            CorruptLogError: it is damaged.
+            CorruptLogError: The attachment is damaged.
         """
         with self._named():
             return attachment_of(self.view, name)
@@ -252,17 +254,17 @@ class McapReader:
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.
 
-        Ends before a record that reaches beyond the end of the file.
+        Stops before a record that ends after the file.
         """
         return records_of(self.view, start)
 
-    def _index_at(self, channel_id: int, offset: int, count: int) -> memoryview:
+    def _index_at(self, channel_id: int, offset: int, count: int | None = None) -> NDArray[Any]:
         with self._named():
             entries = message_index(self.view, offset, channel_id)
-            if len(entries) != count * INDEX_ENTRY.itemsize:
+            if count not in (None, len(entries)):
                 raise CorruptLogError(
-                    f"the message index at byte {offset} has not the {count} messages that the"
-                    " summary tells of"
+                    f"the message index at byte {offset} has {len(entries)} entries, not the"
+                    f" {count} of the summary"
                 )
             return entries
 
@@ -277,71 +279,72 @@ class McapReader:
         return self._contents[start]
 
     def _read_summary(self) -> None:
-        runs = array("q")
-        for offset, opcode, length, count in runs_of(self.view, self.summary_start):
-            start, size = offset + RECORD_HEADER_BYTES, RECORD_HEADER_BYTES + length
+        for offset, opcode, content in records_of(self.view, self.summary_start):
             if opcode == Opcode.CHUNK_INDEX:
-                runs.extend((start, length, count))
+                with self._named():
+                    self.chunks.append(parse_chunk_index(content))
             elif opcode in _SUMMARY:
-                for first in range(start, start + count * size, size):
-                    self._keep(self._parse(opcode, self.view[first : first + length], first))
-        if runs:
-            with self._named():
-                self.table = ChunkTable.read(self.view, np.array(runs, np.int64).reshape(-1, 3))
+                self._keep(self._parse(opcode, content, offset))
+        self.chunks.sort(key=_start_of)
 
-    def _read_between_chunks(self) -> None:
-        """Read what the summary does not tell of: everything, if there is none."""
-        table = self.table
-        with self._named():
-            stops = table.stops(len(self.view))
-        starts = np.concatenate([np.array([len(MCAP0_MAGIC)], np.uint64), stops])
-        offsets = table.rows["offset"]
-        found: dict[int, ChunkIndex] = {}
-        # Mostly they stand one behind the other.
-        for number in np.flatnonzero(starts[:-1] != offsets).tolist():
-            self._read_records(int(starts[number]), int(offsets[number]), found, number - 1)
-        self._read_records(int(starts[-1]), None, found, len(table) - 1)
+    def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
+        """Read the records that the summary does not list; all records if there is no summary."""
+        start, before = len(MCAP0_MAGIC), None
+        found: list[ChunkIndex] = []
+        for chunk in self.chunks:
+            # Most chunks follow each other without a gap.
+            if start != chunk.chunk_start_offset:
+                found += self._read_records(start, chunk.chunk_start_offset, before, unchunked)
+            before, start = chunk, end_of(chunk)
+            if start > len(self.view):
+                raise CorruptLogError(
+                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} ends after the file"
+                )
+        found += self._read_records(start, None, before, unchunked)
         if found:
-            every = {chunk.chunk_start_offset: chunk for chunk in table.chunks} | found
-            self.table = ChunkTable.of([every[offset] for offset in sorted(every)])
+            self.chunks = sorted([*self.chunks, *found], key=_start_of)
 
     def _read_records(
-        self, start: int, stop: int | None, found: dict[int, ChunkIndex], before: int
-    ) -> None:
-        """Read the data section from `start` on, to `stop` or its end.
+        self,
+        start: int,
+        stop: int | None,
+        chunk: ChunkIndex | None,
+        unchunked: UnindexedMessages,
+    ) -> list[ChunkIndex]:
+        """Read a part of the data section and return its chunks.
 
         Args:
-            start: first byte.
-            stop: where it ends; None for the end of the section.
-            found: takes up chunks, by their first byte.
-            before: the number of the known chunk in front of these records; -1 if there is none.
+            start: First byte.
+            stop: First byte after the part; None for the end of the section.
+            chunk: Chunk before the part, to which message indexes at its start belong.
+            unchunked: Collection to which messages outside of chunks are added.
 
         Raises:
-            CorruptLogError: there are no whole records in a file that has a summary.
+            CorruptLogError: A file with a summary has an incomplete record here.
         """
-        self.data_end, chunk = start, None
+        self.data_end, found = start, []
         for offset, opcode, content in records_of(self.view, start, stop):
             if opcode == Opcode.CHUNK:
                 with self._named():
                     header = chunk_header(self.view, offset)
-                chunk = found[offset] = header.to_index(offset, len(content))
-            elif opcode == Opcode.MESSAGE_INDEX and (chunk is not None or before >= 0):
-                chunk = chunk or next(self.table.some(np.arange(before, before + 1)))
+                chunk = header.to_index(offset, len(content))
+                found.append(chunk)
+            elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 (channel_id,) = struct.unpack_from("<H", content)
                 chunk.message_index_offsets[channel_id] = offset
-                found[chunk.chunk_start_offset] = chunk
             elif opcode == Opcode.MESSAGE:
-                self._loose.add(offset, content)
+                unchunked.add(offset, content)
             elif opcode == Opcode.DATA_END:
-                return
-            elif opcode in _STANDING and not self._is_told(opcode, content):
+                return found
+            elif opcode in _TOP_LEVEL and not self._is_listed(opcode, content):
                 self._keep(self._parse(opcode, content, offset))
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
             raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
+        return found
 
     def _check_data_crc(self) -> None:
-        """The only one that covers messages outside of chunks."""
+        """Check the CRC of the data section, the only one that covers unchunked messages."""
         for offset, opcode, content in records_of(self.view, self.data_end):
             if opcode == Opcode.DATA_END:
                 (crc,) = struct.unpack_from("<I", content)
@@ -350,12 +353,10 @@ class McapReader:
             break
 
     def _find_topics_in_chunks(self) -> None:
-        """Look into chunks for schemas and channels that stand nowhere else."""
-        if all(map(self._is_known, self.table.channel_ids)) and not len(self.table.bare):
-            return
+        """Search chunks for schemas and channels that are stored nowhere else."""
         for chunk in self.chunks:
             ids = chunk.message_index_offsets
-            if not all(map(self._is_known, ids)) or not (ids or self._summary_has_topics):
+            if not (all(map(self._is_known, ids)) if ids else self._summary_has_topics):
                 for topic in self._contents_of(chunk).topics:
                     self._keep(topic)
 
@@ -363,15 +364,15 @@ class McapReader:
         channel = self.channels.get(channel_id)
         return channel is not None and channel.schema_id in self.schemas
 
-    def _is_told(self, opcode: int, content: memoryview) -> bool:
-        """Whether the summary has this schema or channel; both records begin with an id."""
+    def _is_listed(self, opcode: int, content: memoryview) -> bool:
+        """Return whether the summary has this schema or channel; both begin with an id."""
         number = int.from_bytes(content[:2], "little")
         return (opcode == Opcode.SCHEMA and number in self.schemas) or (
             opcode == Opcode.CHANNEL and number in self.channels
         )
 
     def _keep(self, record: McapRecord) -> None:
-        """Note a record. What the summary says comes first: it has a CRC of its own."""
+        """Store a record unless the summary, which has its own CRC, had one with its id or name."""
         match record:
             case Schema():
                 self.schemas.setdefault(record.id, record)
@@ -384,7 +385,7 @@ class McapReader:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Say of which file it is what is damaged, if that is not said yet."""
+        """Add the path of the file to the message of a CorruptLogError."""
         try:
             yield
         except CorruptLogError as error:
@@ -397,3 +398,12 @@ class McapReader:
             return parse_record(opcode, content)
         except CorruptLogError as error:
             raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
+
+
+def end_of(chunk: ChunkIndex) -> int:
+    """Return the first byte after a chunk and its message indexes."""
+    return chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+
+
+def _start_of(chunk: ChunkIndex) -> int:
+    return chunk.chunk_start_offset

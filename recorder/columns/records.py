@@ -1,4 +1,4 @@
-"""The records of an MCAP file, one by one: opcode, length, content."""
+"""Records of an MCAP file: opcode, length, content."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from mcaprl.recorder.columns.message_rows import (
 )
 
 RECORD_HEADER = struct.Struct("<BQ")
-# Of a message behind its record header: channel, sequence number, log_time.
+# The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _PARSERS: dict[int, Any] = {
@@ -52,16 +52,16 @@ _PARSERS: dict[int, Any] = {
 
 
 def map_file(path: Path) -> memoryview:
-    """The bytes of a file, mapped into memory.
+    """Map a file into memory.
 
     Raises:
-        NotMcapError: it is empty.
-        LogError: it cannot be read.
+        NotMcapError: The file is empty.
+        LogError: The file cannot be read.
     """
     try:
         with path.open("rb") as file:
             if not file.seek(0, io.SEEK_END):
-                raise NotMcapError(f"{path} is no MCAP file: it is empty")
+                raise NotMcapError(f"{path} is not an MCAP file: it is empty")
             return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror}") from error
@@ -72,7 +72,7 @@ def records_of(
 ) -> Iterator[tuple[int, int, memoryview]]:
     """Yield offset, opcode and content of each record from `start` on.
 
-    Ends before a record that reaches beyond `stop`, or the end of the view.
+    Stops before a record that ends after `stop`, by default the end of the view.
     """
     offset, stop = start, len(view) if stop is None else stop
     while offset + RECORD_HEADER.size <= stop:
@@ -84,59 +84,24 @@ def records_of(
         offset = content + length
 
 
-def runs_of(view: memoryview, start: int) -> Iterator[tuple[int, int, int, int]]:
-    """Likewise, but of records of one kind and length that follow each other, the first.
-
-    Yields:
-        Its offset and opcode, the length of its content, and how many they are.
-    """
-    offset, end = start, len(view)
-    while offset + RECORD_HEADER.size <= end:
-        head = RECORD_HEADER.unpack_from(view, offset)
-        opcode, length = head
-        size = RECORD_HEADER.size + length
-        following = offset + size
-        if opcode == 0 or following > end:
-            return
-        count, room = 1, end - RECORD_HEADER.size
-        # Mostly there is one, or there are very many.
-        if following <= room and RECORD_HEADER.unpack_from(view, following) == head:
-            count = _run_length(view, offset, size)
-        yield offset, opcode, length, count
-        offset += count * size
-
-
-def _run_length(view: memoryview, offset: int, size: int) -> int:
-    """How many records like that at `offset`, of so many bytes, follow each other."""
-    count, most = 1, (len(view) - offset) // size
-    while count < most:
-        look_at = min(8 * count, most)
-        heads = np.ndarray(look_at, f"V{RECORD_HEADER.size}", view, offset, (size,))
-        others = np.flatnonzero(heads != heads[0])
-        if len(others):
-            return int(others[0])
-        count = look_at
-    return count
-
-
 def parse_record(opcode: int, content: memoryview) -> Any:
-    """A record of the `mcap` library from its content.
+    """Parse the content of a record with the `mcap` library.
 
     Raises:
-        CorruptLogError: the content is no such record.
+        CorruptLogError: The record is damaged.
     """
     try:
         return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
-    # The library raises whatever its parsing meets; none of it is more than "damaged".
+    # The library raises errors of many types when a record is damaged.
     except Exception as error:
         raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
 
 
 def attachment_of(view: memoryview, name: str) -> bytes | None:
-    """The last attachment of a name in a file; None if there is none.
+    """Return the data of the last attachment with a name; None if there is none.
 
     Raises:
-        CorruptLogError: it is damaged.
+        CorruptLogError: The attachment is damaged.
     """
     found = None
     for offset, opcode, content in records_of(view, len(MCAP0_MAGIC)):
@@ -152,23 +117,23 @@ def attachment_of(view: memoryview, name: str) -> bytes | None:
 
 
 def is_intact_attachment(content: memoryview) -> bool:
-    """Whether an Attachment record matches its CRC, if it has one."""
+    """Return whether an Attachment record has no CRC or matches it."""
     (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
     return not crc or crc32(content[:-4]) == crc
 
 
 @dataclass
-class LooseMessages:
-    """Messages that were found without an index, by channel id, in the order of the file."""
+class UnindexedMessages:
+    """Messages that a scan found, by channel id, in file order."""
 
     _times: dict[int, array[int]] = field(default_factory=dict)
     _offsets: dict[int, array[int]] = field(default_factory=dict)
 
     def add(self, offset: int, content: memoryview) -> None:
-        """Note the Message record at `offset`.
+        """Add the Message record at `offset`.
 
         Raises:
-            CorruptLogError: it is shorter than its header.
+            CorruptLogError: The record is shorter than its header.
         """
         if len(content) < MESSAGE_HEADER.itemsize - RECORD_HEADER_BYTES:
             raise CorruptLogError(f"the message at byte {offset} is shorter than its header")
@@ -177,7 +142,7 @@ class LooseMessages:
         self._offsets.setdefault(channel_id, array("Q")).append(offset)
 
     def indexes(self) -> dict[int, NDArray[Any]]:
-        """What a MessageIndex would tell, by channel id: arrays of `INDEX_ENTRY`."""
+        """Return an index, an array of `INDEX_ENTRY`, for each channel id."""
         found = {}
         for channel_id, times in self._times.items():
             index = np.empty(len(times), INDEX_ENTRY)
@@ -188,37 +153,42 @@ class LooseMessages:
 
 @dataclass
 class ChunkContents:
-    """What stands in a chunk: schemas and channels, and indexes of its messages by channel id."""
+    """Contents of a chunk.
+
+    Attributes:
+        topics: Schemas and channels.
+        indexes: Arrays of `INDEX_ENTRY` by channel id.
+    """
 
     topics: list[Schema | Channel]
     indexes: dict[int, NDArray[Any]]
 
 
 def contents_of(chunk: memoryview) -> ChunkContents:
-    """Go through the records of a chunk, for one whose index is missing or not enough.
+    """Scan the records of a chunk.
 
     Raises:
-        CorruptLogError: a record is damaged, or reaches beyond the chunk.
+        CorruptLogError: A record is damaged, or ends after the chunk.
     """
-    uniform = uniform_indexes(chunk)
+    uniform = _uniform_indexes(chunk)
     if uniform is not None:
         return ChunkContents([], uniform)
-    topics, loose, end = [], LooseMessages(), 0
+    topics, messages, end = [], UnindexedMessages(), 0
     for offset, opcode, content in records_of(chunk, 0):
         if opcode == Opcode.MESSAGE:
-            loose.add(offset, content)
+            messages.add(offset, content)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             topics.append(parse_record(opcode, content))
         end = offset + RECORD_HEADER_BYTES + len(content)
     if end != len(chunk):
-        raise CorruptLogError("a record reaches beyond its chunk")
-    return ChunkContents(topics, loose.indexes())
+        raise CorruptLogError("a record ends after its chunk")
+    return ChunkContents(topics, messages.indexes())
 
 
 def only(
     records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Copies of those records that indexes lead to, one behind the other, and their indexes."""
+    """Copy the records of index entries; return the copies and their indexes."""
     kept, new = bytearray(), {}
     for channel_id, index in indexes.items():
         entries = []
@@ -230,8 +200,8 @@ def only(
     return memoryview(kept), new
 
 
-def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
-    """Indexes of a chunk of nothing but messages of one length; None if it is another."""
+def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
+    """Return the indexes of a chunk of messages of one length; None for any other chunk."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None
     size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]
@@ -250,10 +220,10 @@ def uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
 
 
 def footer_of(view: memoryview) -> Footer | None:
-    """The footer, if a file ends with one.
+    """Return the footer; None if the file does not end with one.
 
     Raises:
-        CorruptLogError: the summary that it points at is not there, or does not match its CRC.
+        CorruptLogError: The summary is outside of the file, or does not match its CRC.
     """
     start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
     if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:

@@ -1,4 +1,4 @@
-"""What the end of an MCAP file tells of the rest: gathered while it is written."""
+"""Summary section of an MCAP file, collected while the file is written."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunk_table import chunk_index_record
+from mcaprl.recorder.columns.chunks import chunk_index_record
 
 
 @dataclass
 class Summary:
-    """Of a file.
+    """Summary of a file.
 
     Attributes:
-        schemas: by id.
-        channels: by id.
-        counts: messages of each channel, by its id.
-        chunks: in the order of the file.
-        metadata: likewise.
-        attachments: likewise.
+        schemas: Schemas by id.
+        channels: Channels by id.
+        counts: Numbers of messages by channel id.
+        chunks: Chunk indexes in file order.
+        metadata: Metadata indexes in file order.
+        attachments: Attachment indexes in file order.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -46,8 +46,8 @@ class Summary:
     metadata: list[MetadataIndex] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
 
-    def note(self, record: McapRecord, offset: int, length: int) -> None:
-        """Take up a record that was written outside of chunks."""
+    def add(self, record: McapRecord, offset: int, length: int) -> None:
+        """Add a top-level record of `length` bytes at `offset`."""
         match record:
             case Schema():
                 self.schemas[record.id] = record
@@ -70,13 +70,13 @@ class Summary:
                 )
 
     def to_bytes(self, start: int) -> bytes:
-        """All that stands behind the data section; `start` is where it will stand."""
+        """Return all records after the data section, which will be written at `start`."""
         builder = RecordBuilder()
         groups: list[SummaryOffset] = []
         for opcode, records in self._groups():
             group_start = builder.count
             for record in records:
-                # A log of short episodes has very many of these.
+                # The chunk indexes are the most numerous records.
                 if isinstance(record, ChunkIndex):
                     builder.write(chunk_index_record(record))
                 else:

@@ -1,108 +1,115 @@
-"""A topic's messages as columns: one array for each wanted field, in the order of log_time.
+"""Messages of a topic as columns: one array for each wanted field, in the order of log_time.
 
-Messages of one length are gathered from a chunk at once, by their offsets, whatever stands between
-them; the rest are decoded one by one. Which way a message went cannot be seen in the columns.
+Messages of one length in a chunk are read as one array, whatever is stored between them; all others
+are decoded one by one, with the same values.
 """
 
 from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.chunks import Scratch
-from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.joined import Chosen, join, neighbors
-from mcaprl.recorder.columns.message_spans import Span, joined_index, joined_spans
+from mcaprl.recorder.columns.decoder import Columns, Decoder, Rows
+from mcaprl.recorder.columns.message_rows import MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 
-# Shorter indexes are joined to so much: each by itself costs as much as some hundred entries.
-_BYTES_AT_ONCE = 2**16
 LOG_TIME = "log_time"
 
 
+class _Selected(NamedTuple):
+    """Messages of a chunk, their decoder, and their rows in the columns."""
+
+    decoder: Decoder
+    messages: MessageRange
+    rows: Rows
+
+
 class Topic:
-    """A topic of a log: where its messages are, and of which types.
+    """Topic of a file: types and positions of its messages.
 
     Attributes:
-        name: of the topic.
-        spans: its messages, as they stand together in the file; one channel after the other.
+        name: Name of the topic.
+        parts: Message ranges with their decoders, channel by channel, in file order.
     """
 
     def __init__(self, reader: McapReader, name: str) -> None:
-        """Find the messages. Only indexes are read.
+        """Find the messages. No chunk with an index is read.
 
         Raises:
-            CorruptLogError: an index is damaged.
-            LogError: messages of the topic are encoded in a way that is not known.
+            CorruptLogError: An index is damaged.
+            LogError: The encoding of messages is not supported.
         """
         self.name = name
         self._reader = reader
-        found = [(channel, reader.spans(channel)) for channel in reader.channels_of(name)]
-        # A channel without messages may be of any type.
-        found = [(channel, spans) for channel, spans in found if len(spans)]
-        self._decoders = [Decoder(reader, channel) for channel, _ in found]
-        # Which of these each span is for.
-        sizes = np.array([len(spans) for _, spans in found], np.int64)
-        self._owners = np.repeat(np.arange(len(found)), sizes)
-        self.spans = joined_spans([spans for _, spans in found])
-        self._stops = np.cumsum(self.spans.counts)
-        # Who asks for a column of a chunk may ask for another next.
+        found = [(channel, reader.message_ranges(channel)) for channel in reader.channels_of(name)]
+        # A channel without messages may have any type.
+        by_decoder = [(Decoder(reader, channel), ranges) for channel, ranges in found if ranges]
+        self._decoders = [decoder for decoder, _ in by_decoder]
+        self.parts = [(decoder, part) for decoder, ranges in by_decoder for part in ranges]
+        self._counts = np.array([len(part) for _, part in self.parts], np.int64)
+        self._stops = np.cumsum(self._counts)
+        # The scratch memory still has the last chunk, of which another column may be read next.
         self._scratch, self._reading = Scratch(), threading.Lock()
 
     def __len__(self) -> int:
-        """Messages."""
+        """Return the number of messages."""
         return int(self._stops[-1]) if len(self._stops) else 0
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
-        """(N,) log_time of each message in the order of its channels and of the file."""
-        times, start = np.empty(len(self), np.int64), 0
-        for entries in _groups(self.spans.entries()):
-            index = joined_index(entries)
-            times[start : start + len(index)] = index["log_time"]
-            start += len(index)
+        """(N,) log_time of each message, in the order of `parts`.
+
+        Raises:
+            CorruptLogError: An index is damaged.
+        """
+        times = np.empty(len(self), np.int64)
+        for (_, part), stop in zip(self.parts, self._stops.tolist(), strict=True):
+            times[stop - len(part) : stop] = part.index["log_time"]
         if (times < 0).any():
             raise CorruptLogError(
-                f"{self._reader.path}: {self.name} has a log_time beyond the year 2262"
+                f"{self._reader.path}: {self.name} has a log_time after the year 2262"
             )
         return times
 
     @property
-    def parts(self) -> Iterator[tuple[Decoder, Span]]:
-        """Its spans, each with what decodes its messages."""
-        decoders = [self._decoders[owner] for owner in self._owners.tolist()]
-        return zip(decoders, self.spans, strict=True)
-
-    @property
     def channels(self) -> int:
-        """How many channels have messages of it."""
+        """Number of channels with messages."""
         return len(self._decoders)
 
     @property
     def channel_ids(self) -> NDArray[np.uint16]:
-        """(N,) of each message, likewise."""
-        ids = np.array([decoder.channel.id for decoder in self._decoders], np.uint16)
-        return np.repeat(ids[self._owners], self.spans.counts)
+        """(N,) channel of each message, in the order of `parts`."""
+        ids = np.array([decoder.channel.id for decoder, _ in self.parts], np.uint16)
+        return np.repeat(ids, self._counts)
 
-    @property
+    @cached_property
     def chunks_rise(self) -> bool:
-        """Whether it is one channel in chunks, none of which begins before its forerunner ends."""
-        return self.channels == 1 and self.spans.are_in_order
+        """Whether all messages are of one channel, in chunks whose times do not overlap."""
+        chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
+        return (
+            self.channels == 1
+            and len(chunks) == len(self.parts)
+            and all(
+                before.message_end_time <= after.message_start_time
+                for before, after in itertools.pairwise(chunks)
+            )
+        )
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
-        """Fields of its messages, with their dtypes; `object` for texts.
+        """Dtypes of the fields; `object` for strings.
 
         Raises:
-            LogError: its channels do not agree on them.
+            LogError: The channels of the topic have different types.
         """
         dtypes = [decoder.type.dtypes for decoder in self._decoders]
         if any(other != dtypes[0] for other in dtypes[1:]):
@@ -114,20 +121,20 @@ class Topic:
     def read(
         self, wanted: Collection[str], order: NDArray[np.int64] | None = None, *, threads: int = 1
     ) -> Columns:
-        """Read columns: `log_time`, and those of fields.
+        """Read columns: `log_time` and the wanted fields.
 
         Args:
-            wanted: names of fields.
-            order: which messages, by their place in `times`; default: all. Only chunks with one
-                of them are read.
-            threads: that decompress and copy at a time.
+            wanted: Names of fields.
+            order: Places of the messages in `times`; default: all. Chunks without any of them are
+                not read.
+            threads: Number of threads that decompress and copy.
 
         Raises:
-            CorruptLogError: a chunk is damaged, or a message does not fit its type.
-            LogError: a field has not the same shape in all messages.
+            CorruptLogError: A chunk is damaged, or a message does not fit its type.
+            LogError: The shape of a field is not the same in all messages.
         """
-        parts = self._all() if order is None else self._chosen(order)
-        first = next(parts, None)
+        selected = self._all() if order is None else self._select(order)
+        first = next(selected, None)
         if first is None:
             return {LOG_TIME: np.empty(0, np.int64), **{name: np.empty(0) for name in wanted}}
         local = threading.local()
@@ -135,77 +142,46 @@ class Topic:
         count = len(self) if order is None else len(order)
         times = self.times if order is None else np.empty(count, np.int64)
 
-        def fill(together: list[Chosen]) -> None:
+        def fill(part: _Selected) -> None:
             if not hasattr(local, "scratch"):
                 local.scratch = Scratch()
-            scratch, decoder = local.scratch, together[0].decoder
-            joint = join(self._reader, together, scratch) if len(together) > 1 else None
-            if joint is not None:
-                records, index, rows = joint
-                decoder.fill(columns, records, index, rows)
-                return
-            for one in together:
-                records = self._reader.records_of(one.span, scratch)
-                one.decoder.fill(columns, records, one.span.index, one.rows)
-
-        def visit(together: list[Chosen]) -> None:
-            fill(together)
-            for one in together if order is not None else ():
-                times[one.rows] = one.span.index["log_time"]
+            records = self._reader.records_of(part.messages, local.scratch)
+            part.decoder.fill(columns, records, part.messages.index, part.rows)
+            if order is not None:
+                times[part.rows] = part.messages.index["log_time"]
 
         with self._reading:
-            columns = first.decoder.empty_columns(wanted, count, first.span, self._scratch)
-            _for_each(visit, neighbors(itertools.chain([first], parts)), threads)
+            columns = first.decoder.empty_columns(wanted, count, first.messages, self._scratch)
+            every = itertools.chain([first], selected)
+            if threads <= 1:
+                for part in every:
+                    fill(part)
+            else:
+                with ThreadPoolExecutor(threads) as pool:
+                    try:
+                        for _ in pool.map(fill, every):
+                            pass
+                    except BaseException:
+                        pool.shutdown(cancel_futures=True)
+                        raise
         return {LOG_TIME: times, **columns}
 
-    def _all(self) -> Iterator[Chosen]:
-        stops = self._stops.tolist()
-        for (decoder, span), stop in zip(self.parts, stops, strict=True):
-            yield Chosen(decoder, span, slice(stop - len(span), stop))
+    def _all(self) -> Iterator[_Selected]:
+        for (decoder, part), stop in zip(self.parts, self._stops.tolist(), strict=True):
+            yield _Selected(decoder, part, slice(stop - len(part), stop))
 
-    def _chosen(self, order: NDArray[np.int64]) -> Iterator[Chosen]:
-        """The spans with messages that are wanted, and where those go."""
+    def _select(self, order: NDArray[np.int64]) -> Iterator[_Selected]:
+        """Yield the selected messages chunk by chunk."""
         is_rising = len(order) < 2 or bool((order[1:] > order[:-1]).all())
         by_place = None if is_rising else np.argsort(order, kind="stable")
         places = order if by_place is None else order[by_place]
         highs = np.searchsorted(places, self._stops)
         lows = np.concatenate([[0], highs[:-1]])
-        numbers = np.flatnonzero(highs > lows)
-        for number, span in zip(numbers.tolist(), self.spans.some(numbers), strict=True):
+        for number in np.flatnonzero(highs > lows).tolist():
+            decoder, part = self.parts[number]
             low, high = int(lows[number]), int(highs[number])
-            if high - low < len(span):
-                index = span.index[places[low:high] - (self._stops[number] - len(span))]
-                span = Span.of_index(span.chunk, index)
+            if high - low < len(part):
+                index = part.index[places[low:high] - (self._stops[number] - len(part))]
+                part = MessageRange.of_index(part.chunk, index)
             rows = slice(low, high) if by_place is None else by_place[low:high]
-            yield Chosen(self._decoders[int(self._owners[number])], span, rows)
-
-
-def _groups(indexes: Iterable[memoryview]) -> Iterator[list[memoryview]]:
-    """Indexes that follow each other: one with many entries, or several."""
-    group: list[memoryview] = []
-    size = 0
-    for entries in indexes:
-        group.append(entries)
-        size += len(entries)
-        if size >= _BYTES_AT_ONCE:
-            yield group
-            group, size = [], 0
-    if group:
-        yield group
-
-
-def _for_each(
-    do: Callable[[list[Chosen]], None], parts: Iterable[list[Chosen]], threads: int
-) -> None:
-    """Call for each part, `threads` at a time; the first error ends it."""
-    if threads <= 1:
-        for part in parts:
-            do(part)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for _ in pool.map(do, parts):
-                pass
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+            yield _Selected(decoder, part, rows)

@@ -14,7 +14,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns.append import what_is_written
+from mcaprl.recorder.columns.append import written_state
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, RECORD_HEADER_BYTES
@@ -80,8 +80,8 @@ def copy_messages(
         The writer, for more messages.
     """
     with _writer_like(reader.view, reader.records(len(MCAP0_MAGIC)), target) as writer:
-        standing = what_is_written(reader.path).standing
-        for record in sorted(standing, key=lambda record: not isinstance(record, Metadata)):
+        top_level = written_state(reader.path).top_level
+        for record in sorted(top_level, key=lambda record: not isinstance(record, Metadata)):
             writer.announce(record)
         for chunk in sorted(reader.chunks, key=lambda chunk: chunk.message_start_time):
             records = reader.chunk_records(chunk)

@@ -16,7 +16,7 @@ from mcaprl.recorder.format.reading import (
     Columns,
     Decoder,
     McapReader,
-    Span,
+    MessageRange,
     Topic,
     chunk_header,
 )
@@ -62,7 +62,7 @@ class _Images:
     @property
     def are_mappable(self) -> bool:
         """Whether all pictures stand in the file as they are."""
-        chunks = [span.chunk for span in self.topic.spans]
+        chunks = [messages.chunk for _, messages in self.topic.parts]
         return all(chunk is not None and not chunk.compression for chunk in chunks)
 
     def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -106,14 +106,14 @@ class _Images:
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()
-        for number, (decoder, span) in enumerate(self.topic.parts):
-            chunk, index = span.chunk, span.index
+        for number, (decoder, messages) in enumerate(self.topic.parts):
+            chunk, index = messages.chunk, messages.index
             assert chunk is not None, "pictures outside of chunks are not mapped"
             data = chunk_header(self._reader.view, chunk.chunk_start_offset).data
             stop = start + len(index)
             places[start:stop, 0], places[start:stop, 1] = 0, number
             places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
-            checks.append(self._check_of(decoder, span, first))
+            checks.append(self._check_of(decoder, messages, first))
             start = stop
         name = str(self._reader.path)
         file = ImageFile(name, self._reader.view, self._leaf.size, checks)
@@ -121,15 +121,17 @@ class _Images:
 
     def _data_offset(self) -> int:
         """Where the first message's picture is, counted from its record."""
-        decoder, span = next(self.topic.parts)
-        found = decoder.alike(self._reader.records_of(span), span.index[:1], _FIELDS)
+        decoder, messages = self.topic.parts[0]
+        found = decoder.alike(self._reader.records_of(messages), messages.index[:1], _FIELDS)
         if found is None:
             raise CorruptLogError(f"{self._reader.path}: an image on {self.topic.name} is damaged")
         return _offset_of_data(found.dtype)
 
-    def _check_of(self, decoder: Decoder, span: Span, data_offset: int) -> Callable[[], None]:
+    def _check_of(
+        self, decoder: Decoder, messages: MessageRange, data_offset: int
+    ) -> Callable[[], None]:
         def check() -> None:
-            found = decoder.alike(self._reader.records_of(span), span.index, _FIELDS)
+            found = decoder.alike(self._reader.records_of(messages), messages.index, _FIELDS)
             if found is None or _offset_of_data(found.dtype) != data_offset:
                 raise CorruptLogError(
                     f"{self._reader.path}: images on {self.topic.name} are not all of one form;"

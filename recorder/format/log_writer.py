@@ -48,8 +48,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
+from mcaprl.recorder.columns.cdr import ENCAPSULATION
 from mcaprl.recorder.columns.message_rows import message_rows
-from mcaprl.recorder.columns.ros_types import ENCAPSULATION
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
@@ -153,7 +153,7 @@ class LogWriter:
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
 
         Returns:
-            Rows of `message_records.record_dtype`; `payload.data` is the flat picture.
+            Rows of `message_rows.record_dtype`; `payload.data` is the flat picture.
         """
         height, width, channels = (*shape, 1)[:3]
         item_bytes = 2 if encoding == "16UC1" else 1

@@ -2,18 +2,11 @@
 
 from __future__ import annotations
 
-from mcaprl.recorder.columns.chunk_check import (
-    Piece,
-    check_piece,
-    check_statistics,
-    place,
-)
+from mcaprl.recorder.columns.chunk_check import check_chunk, check_statistics, place
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
 from mcaprl.recorder.columns.file_check import check_file
-from mcaprl.recorder.columns.joined import packed
-from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER
-from mcaprl.recorder.columns.message_spans import Span, joined_index
+from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.salvage import Damage
 from mcaprl.recorder.columns.topic import LOG_TIME, Topic
@@ -25,15 +18,12 @@ __all__ = [
     "Damage",
     "Decoder",
     "McapReader",
-    "Piece",
+    "MessageRange",
     "Scratch",
-    "Span",
     "Topic",
+    "check_chunk",
     "check_file",
-    "check_piece",
     "check_statistics",
     "chunk_header",
-    "joined_index",
-    "packed",
     "place",
 ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from mcaprl.recorder.columns.cdr import ENCAPSULATION
 from mcaprl.recorder.columns.file_lock import refuse_if_taken
 from mcaprl.recorder.columns.message_rows import message_rows
-from mcaprl.recorder.columns.ros_types import ENCAPSULATION
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.valid_copy import DROP, KEEP, copy_messages, recover_file
 from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter

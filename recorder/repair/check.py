@@ -17,16 +17,16 @@ from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
+from mcap.records import ChunkIndex
+
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
 from mcaprl.problem import Problem
 from mcaprl.recorder.format.reading import (
     McapReader,
-    Piece,
     Scratch,
+    check_chunk,
     check_file,
-    check_piece,
     check_statistics,
-    packed,
     place,
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
@@ -62,53 +62,41 @@ def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Pr
     """Check each chunk, then the log if all of them are valid."""
     found: list[Problem] = []
     log = EpisodeCheck(reader) if whole else None
-    for numbers, read in _decompressed(reader, threads):
+    for chunk, read in _decompressed(reader, threads):
         try:
-            piece = read()
-            found += check_piece(reader, piece)
-        except CorruptLogError:
-            found += _check_alone(reader, numbers)
+            records = read()
+            found += check_chunk(reader, chunk, records)
+        except CorruptLogError as error:
+            found.append(Problem(_without_path(error, reader.path), place(reader, chunk)))
             continue
         if log is not None and not found:
-            log.take(piece)
+            log.take(chunk, records)
     if log is not None and not found:
         found += [*check_statistics(reader), *log.finish()]
     return found
 
 
-def _check_alone(reader: McapReader, numbers: slice) -> Iterator[Problem]:
-    """Check chunks separately, of which at least one is damaged."""
-    scratch = Scratch()
-    for number in range(numbers.start, numbers.stop):
-        try:
-            piece = Piece.read(reader, slice(number, number + 1), scratch)
-            yield from check_piece(reader, piece)
-        except CorruptLogError as error:
-            where = place(reader, reader.chunks[number])
-            yield Problem(_without_path(error, reader.path), where)
-
-
-def _decompressed(reader: McapReader, threads: int) -> Iterator[tuple[slice, Callable[[], Piece]]]:
-    """Yield numbers of chunks with what gives them, which are there until the next ones are."""
-    sizes = reader.table.rows["raw_bytes"].tolist()
-    several = packed(range(len(sizes)), sizes.__getitem__)
-    pieces = (slice(numbers[0], numbers[-1] + 1) for numbers in several)
+def _decompressed(
+    reader: McapReader, threads: int
+) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
+    """Yield chunks with functions that return their records, valid until the next chunk."""
     if threads == 1:
         scratch = Scratch()
-        for numbers in pieces:
-            yield numbers, partial(Piece.read, reader, numbers, scratch)
+        for chunk in reader.chunks:
+            yield chunk, partial(reader.chunk_records, chunk, scratch)
         return
+    chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
-        ahead = deque[tuple[slice, Future[Piece]]]()
-        # One for each thread, and one at hand: memory does not grow with the file.
+        ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
+        # One for each thread and one for the caller: memory does not grow with the file.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
-            for numbers in islice(pieces, threads + 1 - len(ahead)):
-                ahead.append((numbers, pool.submit(Piece.read, reader, numbers, next(scratches))))
+            for chunk in islice(chunks, threads + 1 - len(ahead)):
+                ahead.append((chunk, pool.submit(reader.chunk_records, chunk, next(scratches))))
             if not ahead:
                 return
-            numbers, future = ahead.popleft()
-            yield numbers, future.result
+            chunk, future = ahead.popleft()
+            yield chunk, future.result
 
 
 def _recover(path: Path) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
@@ -28,10 +29,8 @@ from mcaprl.recorder.format.reading import (
     Columns,
     Decoder,
     McapReader,
-    Piece,
-    Span,
+    MessageRange,
     Topic,
-    joined_index,
 )
 from mcaprl.recorder.format.schema import step_schema
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
@@ -39,8 +38,8 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
-# A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
-_Place = tuple[Decoder, Span, slice | Leaf]
+# Messages, what decodes them, and where they belong: rows of the steps' columns, or pictures.
+_Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 
 class EpisodeCheck:
@@ -73,27 +72,17 @@ class EpisodeCheck:
         if self._has_our_form:
             self._prepare()
 
-    def take(self, piece: Piece) -> None:
-        """Read the fields to validate from chunks of the log."""
-        records, starts = piece.records, piece.bounds[:-1]
-        for decoder, places in self._places_in(piece).items():
-            numbers, spans, wheres = zip(*places, strict=True)
-            index = joined_index(span.entries for span in spans)
-            index["offset"] += np.repeat(starts[list(numbers)], list(map(len, spans)))
-            first, last = wheres[0], wheres[-1]
-            if isinstance(first, slice):
-                rows = slice(first.start, last.stop)
-                self._take_steps(decoder.alike(records, index, _FIELDS), rows)
-            else:
-                self._take_images(decoder.alike(records, index, _IMAGE_FIELDS), first)
+    def take(self, chunk: ChunkIndex, records: memoryview) -> None:
+        """Check the messages of one chunk.
 
-    def _places_in(self, piece: Piece) -> dict[Decoder, list[tuple[int, Span, slice | Leaf]]]:
-        """Return message ranges by decoder, with their chunk number and their destination."""
-        found: dict[Decoder, list[tuple[int, Span, slice | Leaf]]] = defaultdict(list)
-        for number, chunk in enumerate(piece.chunks):
-            for decoder, span, where in self._places.get(chunk.chunk_start_offset, ()):
-                found[decoder].append((number, span, where))
-        return found
+        Raises:
+            CorruptLogError: Messages do not match the schema or the spaces of the metadata.
+        """
+        for decoder, messages, where in self._places.get(chunk.chunk_start_offset, ()):
+            if isinstance(where, slice):
+                self._take_steps(decoder.alike(records, messages.index, _FIELDS), where)
+            else:
+                self._take_images(decoder.alike(records, messages.index, _IMAGE_FIELDS), where)
 
     def finish(self) -> Iterator[Problem]:
         """Yield what is wrong with the log.
@@ -144,22 +133,22 @@ class EpisodeCheck:
     def _prepare(self) -> None:
         """Find the destination of each message range, by chunk."""
         start = 0
-        for decoder, span in self._steps.parts:
-            stop = start + len(span)
-            self._place(decoder, span, slice(start, stop))
+        for decoder, messages in self._steps.parts:
+            stop = start + len(messages)
+            self._place(decoder, messages, slice(start, stop))
             start = stop
         for leaf, topic in self._images:
-            for decoder, span in topic.parts:
-                self._place(decoder, span, leaf)
+            for decoder, messages in topic.parts:
+                self._place(decoder, messages, leaf)
         self._columns = {name: np.empty(start, self._steps.fields[name]) for name in _FIELDS} | {
             LOG_TIME: self._steps.times
         }
 
-    def _place(self, decoder: Decoder, span: Span, where: slice | Leaf) -> None:
-        if span.chunk is None:
+    def _place(self, decoder: Decoder, messages: MessageRange, where: slice | Leaf) -> None:
+        if messages.chunk is None:
             self._has_our_form = False
         else:
-            self._places[span.chunk.chunk_start_offset].append((decoder, span, where))
+            self._places[messages.chunk.chunk_start_offset].append((decoder, messages, where))
 
     def _take_steps(self, found: NDArray[Any] | None, rows: slice) -> None:
         if found is None:

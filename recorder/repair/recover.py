@@ -161,8 +161,8 @@ def _check_paths(source: Path, target: Path, overwrite: bool) -> None:
 
 
 def _count_messages(reader: McapReader) -> int:
-    spans = [span for channel in reader.channels.values() for span in reader.spans(channel)]
-    return sum(len(span) for span in spans)
+    channels = reader.channels.values()
+    return sum(len(part) for channel in channels for part in reader.message_ranges(channel))
 
 
 def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:

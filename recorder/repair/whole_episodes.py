@@ -271,10 +271,10 @@ def _listed_ends(reader: McapReader) -> set[int]:
 
 def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:
     return sum(
-        int((~_is_inside(plan, span.index["log_time"])).sum())
+        int((~_is_inside(plan, part.index["log_time"])).sum())
         for channel in reader.channels.values()
         if channel.topic.startswith(_EPISODE_TOPICS) and channel.topic != STEP_TOPIC
-        for span in reader.spans(channel)
+        for part in reader.message_ranges(channel)
     )
 
 
@@ -282,10 +282,10 @@ def _by_place(
     steps: Topic, actions: NDArray[np.uint8]
 ) -> Iterator[tuple[Place, NDArray[np.uint8]]]:
     start = 0
-    for decoder, span in steps.parts:
-        stop = start + len(span)
-        assert span.chunk is not None, "all messages are in chunks"
-        yield (span.chunk.chunk_start_offset, decoder.channel.id), actions[start:stop]
+    for decoder, part in steps.parts:
+        stop = start + len(part)
+        assert part.chunk is not None, "all messages are in chunks"
+        yield (part.chunk.chunk_start_offset, decoder.channel.id), actions[start:stop]
         start = stop
 
 

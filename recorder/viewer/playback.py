@@ -16,7 +16,7 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from mcaprl.recorder.format.reading import McapReader, Span
+from mcaprl.recorder.format.reading import McapReader, MessageRange
 
 _CHUNKS_KEPT = 24
 
@@ -69,7 +69,7 @@ class Track:
             for channel in reader.channels.values()
             if topics is None or channel.topic in topics
         ]
-        self._topics = [topic for topic in self._topics if topic.spans]
+        self._topics = [topic for topic in self._topics if topic.ranges]
         self.start_ns, self.end_ns = window_ns or (
             min((topic.starts[0] for topic in self._topics), default=0),
             max((max(topic.ends) for topic in self._topics), default=0),
@@ -114,47 +114,47 @@ class _Place(NamedTuple):
 
 
 class _TopicIndex:
-    """The messages of one channel; of each span the times rise."""
+    """The messages of one channel; the times of each range rise."""
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
         self.channel = channel
-        spans = sorted(reader.spans(channel), key=lambda span: int(span.index["log_time"].min()))
-        self.spans = [_by_time(span) for span in spans]
-        self.starts = [int(span.index["log_time"][0]) for span in self.spans]
-        self.ends = [int(span.index["log_time"][-1]) for span in self.spans]
+        ranges = [_by_time(part) for part in reader.message_ranges(channel) if len(part)]
+        self.ranges = sorted(ranges, key=lambda part: int(part.index["log_time"][0]))
+        self.starts = [int(part.index["log_time"][0]) for part in self.ranges]
+        self.ends = [int(part.index["log_time"][-1]) for part in self.ranges]
 
     def between(self, start_ns: int, stop_ns: int) -> Iterator[_Place]:
-        for span, first_ns, last_ns in zip(self.spans, self.starts, self.ends, strict=True):
+        for part, first_ns, last_ns in zip(self.ranges, self.starts, self.ends, strict=True):
             if first_ns < stop_ns and last_ns >= start_ns:
-                low, high = _rows_before(span, start_ns), _rows_before(span, stop_ns)
-                yield from (self._place(span, row) for row in range(low, high))
+                low, high = _rows_before(part, start_ns), _rows_before(part, stop_ns)
+                yield from (self._place(part, row) for row in range(low, high))
 
     def latest(self, time_ns: int) -> _Place | None:
         best: _Place | None = None
-        for span, first_ns in zip(self.spans, self.starts, strict=True):
+        for part, first_ns in zip(self.ranges, self.starts, strict=True):
             if first_ns > time_ns:
                 break
-            row = _rows_before(span, time_ns + 1) - 1
-            if best is None or span.index["log_time"][row] >= best.time_ns:
-                best = self._place(span, row)
+            row = _rows_before(part, time_ns + 1) - 1
+            if best is None or part.index["log_time"][row] >= best.time_ns:
+                best = self._place(part, row)
         return best
 
-    def _place(self, span: Span, row: int) -> _Place:
-        time_ns, offset = span.index[row].tolist()
-        chunk_start = -1 if span.chunk is None else span.chunk.chunk_start_offset
+    def _place(self, part: MessageRange, row: int) -> _Place:
+        time_ns, offset = part.index[row].tolist()
+        chunk_start = -1 if part.chunk is None else part.chunk.chunk_start_offset
         return _Place(time_ns, self.channel, chunk_start, offset)
 
 
-def _rows_before(span: Span, time_ns: int) -> int:
+def _rows_before(part: MessageRange, time_ns: int) -> int:
     # Compared with a signed integer, times would be rounded to floats.
-    return int(np.searchsorted(span.index["log_time"], np.uint64(max(time_ns, 0))))
+    return int(np.searchsorted(part.index["log_time"], np.uint64(max(time_ns, 0))))
 
 
-def _by_time(span: Span) -> Span:
-    times: NDArray[np.uint64] = span.index["log_time"]
+def _by_time(part: MessageRange) -> MessageRange:
+    times: NDArray[np.uint64] = part.index["log_time"]
     if (times[1:] >= times[:-1]).all():
-        return span
-    return Span.of_index(span.chunk, span.index[np.argsort(times, kind="stable")])
+        return part
+    return MessageRange.of_index(part.chunk, part.index[np.argsort(times, kind="stable")])
 
 
 @dataclass

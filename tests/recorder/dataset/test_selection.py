@@ -31,7 +31,7 @@ def damage(path: Path, target: Path, topic: str, number: int = 0) -> None:
     reader = McapReader(path)
     channel = reader.channel_of(topic)
     assert channel is not None
-    chunk = list(reader.spans(channel))[number].chunk
+    chunk = list(reader.message_ranges(channel))[number].chunk
     assert chunk is not None
     data = bytearray(path.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length - 5] ^= 1
@@ -183,7 +183,7 @@ def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> No
     channel = reader.channel_of("/rl/step")
     assert channel is not None
     spoilt = bytearray(large.read_bytes())
-    chunks = [span.chunk for span in reader.spans(channel)]
+    chunks = [part.chunk for part in reader.message_ranges(channel)]
     assert len(chunks) == 5
     for chunk in chunks[:-1]:
         assert chunk is not None
@@ -202,7 +202,7 @@ def test_an_index_that_leads_to_fewer_messages_is_found_out(large: Path, tmp_pat
     reader = McapReader(large)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
-    chunk = list(reader.spans(channel))[2].chunk
+    chunk = list(reader.message_ranges(channel))[2].chunk
     assert chunk is not None
     spoilt = bytearray(large.read_bytes())
     # Behind opcode, length and channel stands how many bytes of entries there are.
@@ -211,5 +211,5 @@ def test_an_index_that_leads_to_fewer_messages_is_found_out(large: Path, tmp_pat
     struct.pack_into("<I", spoilt, place, told - 16)
     path = tmp_path / "spoilt.mcap"
     path.write_bytes(spoilt)
-    with pytest.raises(CorruptLogError, match="has not the 8192 messages that the summary tells"):
+    with pytest.raises(CorruptLogError, match="has 8191 entries, not the 8192 of the summary"):
         mcaprl.open(path)

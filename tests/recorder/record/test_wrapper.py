@@ -301,7 +301,7 @@ def test_disk_full_leaves_the_finished_episodes(
 
     writer = env._recording.log.mcap
     monkeypatch.setattr(writer, "_file", Full(writer._file))
-    with pytest.raises(LogError, match="No space left on device; the episodes finished before"):
+    with pytest.raises(LogError, match="No space left on device; everything written before"):
         env.step(0)
     env.close()
     with pytest.warns(UserWarning, match="cut off"):

@@ -37,7 +37,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_no_mcap(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("hello")
-    with pytest.raises(NotMcapError, match="is no MCAP file"):
+    with pytest.raises(NotMcapError, match="is not an MCAP file"):
         mcaprl.open(path)
     path.write_text("")
     with pytest.raises(NotMcapError, match="it is empty"):

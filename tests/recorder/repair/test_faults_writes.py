@@ -143,7 +143,7 @@ def test_vector_recording_on_a_full_disk(log_path: Path) -> None:
         with failing(writes, random.Random(writes)):
             env = mcaprl.RecordVecMcap(envs, log_path, overwrite=True)
             env.reset()
-            with pytest.raises(LogError, match="the episodes finished before"):  # noqa: PT012
+            with pytest.raises(LogError, match="everything written before"):  # noqa: PT012
                 while True:
                     env.step(np.zeros(2, np.int64))
             env.close()

@@ -30,6 +30,9 @@ from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import Recovery, recover_log
 from tests.support.recordings import Truth, assert_holds, record
 
+# Damage is told by chunks, of which each episode has its own here.
+pytestmark = pytest.mark.usefixtures("small_chunks")
+
 SPACE = spaces.Dict(
     {
         "x": spaces.Box(-1, 1, (2,), np.float32),
@@ -99,7 +102,7 @@ def test_whole_file_loses_nothing(log_path: Path, truth: tuple[bytes, Truth]) ->
     assert {c.topic for c in new.channels.values()} == {c.topic for c in old.channels.values()}
     assert new.attachment("foxglove-layout.json") == old.attachment("foxglove-layout.json")
     assert recovery.messages == sum(
-        len(span) for channel in old.channels.values() for span in old.spans(channel)
+        len(part) for channel in old.channels.values() for part in old.message_ranges(channel)
     )
 
 

@@ -167,7 +167,7 @@ def test_a_log_of_an_hour_plays_from_anywhere(tmp_path: Path) -> None:
         next_observations=zeros,
     ).save(path)
     track = Track(McapReader(path))
-    rows = track._topics[0].spans[0].index
+    rows = track._topics[0].ranges[0].index
     assert not rows.flags.owndata, "the index is a view of the file"
     player = Player([track])
     middle = (player.start_ns + player.end_ns) // 2

@@ -1,4 +1,4 @@
-"""Logs of many short episodes: their small chunks are visited together, with the same result."""
+"""Logs of many short episodes: small chunks are read with the same result as merged ones."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import CorruptLogError
-from mcaprl.recorder.columns import joined
-from mcaprl.recorder.columns.decoder import Decoder
+from mcaprl.recorder.columns import compact
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY
 from mcaprl.recorder.columns.reader import McapReader
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv, record
@@ -22,45 +21,41 @@ LENGTHS = [1, 5, 2, 40, 3] * 12
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 @pytest.mark.parametrize("threads", [1, 3])
-def test_joined_or_one_by_one(
+def test_merged_or_not(
     log_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str, threads: int
 ) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), LENGTHS, compression=compression)
-    together = mcaprl.open(log_path, threads=threads, images="memory")
-    assert [episode.length for episode in together.episodes] == LENGTHS
-    monkeypatch.setattr(joined, "_MOST_BYTES", 0)
-    apart = mcaprl.open(log_path, images="memory")
-    assert together.fingerprint == apart.fingerprint
+    merged, chunks = mcaprl.open(log_path, threads=threads, images="memory"), _chunks(log_path)
+    assert [episode.length for episode in merged.episodes] == LENGTHS
+    monkeypatch.setattr(compact, "_MIN_CHUNKS_SAVED", 10**9)
+    record(
+        log_path,
+        MIXED_SPACE,
+        spaces.Discrete(2),
+        LENGTHS,
+        compression=compression,
+        overwrite=True,
+    )
+    apart = mcaprl.open(log_path, threads=threads, images="memory")
+    assert chunks * 5 < _chunks(log_path)
+    assert merged.fingerprint == apart.fingerprint
     # As text, where NaN equals NaN.
-    assert [str(e.summary) for e in together.episodes] == [str(e.summary) for e in apart.episodes]
+    assert [str(e.summary) for e in merged.episodes] == [str(e.summary) for e in apart.episodes]
     for name in ("rewards", "behavior_probs"):
-        assert getattr(together, name).tobytes() == getattr(apart, name).tobytes()
+        assert getattr(merged, name).tobytes() == getattr(apart, name).tobytes()
 
 
-def test_visits_do_not_grow_with_the_episodes(
-    log_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    record(log_path, spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), LENGTHS)
-    visits, fill = [], Decoder.fill
-
-    def count(decoder: Decoder, *arguments: object) -> None:
-        visits.append(decoder)
-        fill(decoder, *arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Decoder, "fill", count)
-    data = mcaprl.open(log_path)
-    assert len(data.episodes) == len(LENGTHS)
-    assert len(McapReader(log_path).chunks) == 2 * len(LENGTHS)
-    assert len(visits) == 2, "one for /rl/step, one for /rl/episode"
+def _chunks(path: Path) -> int:
+    return len(McapReader(path).chunks)
 
 
-def test_an_index_may_not_lead_into_the_next_chunk(log_path: Path) -> None:
-    """Side by side in memory, a message of the next chunk lies behind the last one of this."""
+@pytest.mark.usefixtures("small_chunks")
+def test_an_index_may_not_lead_out_of_its_chunk(log_path: Path) -> None:
     record(log_path, spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), [2, 2, 2])
     reader = McapReader(log_path)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
-    first, second, *_ = reader.spans(channel)
+    first, second, *_ = reader.message_ranges(channel)
     assert first.chunk is not None
     spoilt = bytearray(log_path.read_bytes())
     entries = first.chunk.message_index_offsets[channel.id] + 15
@@ -68,7 +63,7 @@ def test_an_index_may_not_lead_into_the_next_chunk(log_path: Path) -> None:
     time_ns, offset = second.index[0].tolist()
     struct.pack_into("<QQ", spoilt, last, time_ns, offset + first.chunk.uncompressed_size)
     log_path.write_bytes(spoilt)
-    with pytest.raises(CorruptLogError, match="not what the index says"):
+    with pytest.raises(CorruptLogError, match="does not match its index entry"):
         mcaprl.open(log_path)
 
 

@@ -1,0 +1,229 @@
+"""Compaction of a finished MCAP file: small chunks become few large ones.
+
+A writer that flushes often leaves many small chunks, and visiting a chunk costs as much as reading
+hundreds of its messages. The compacted file is written beside the original, and replaces it only
+when it is complete and on disk: until then, the original is a valid file with all messages.
+
+Only chunks of one kind are merged: channels that share a chunk are of one kind. All other bytes are
+copied as they are, so that the messages of each kind stay in their order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterable
+from dataclasses import replace
+from io import FileIO
+from pathlib import Path
+
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+from mcap.writer import MCAP0_MAGIC
+
+from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.columns.chunks import Compressors, Scratch, chunk_records
+from mcaprl.recorder.columns.file_lock import create, is_at
+from mcaprl.recorder.columns.output import OutputFile
+from mcaprl.recorder.columns.reader import end_of
+from mcaprl.recorder.columns.records import contents_of, map_file, records_of
+from mcaprl.recorder.columns.summary import Summary
+
+SMALL_CHUNK_BYTES = 2**16
+"""Chunks with fewer bytes of records are merged."""
+_MERGED_BYTES = 2**20
+# Rewriting a file that has hardly any more chunks than necessary is not worth its time.
+_MIN_CHUNKS_SAVED = 8
+# Copying more bytes than this for each chunk that is saved takes longer than it saves readers.
+_MAX_BYTES_PER_CHUNK = 2**20
+# In the gaps between chunks; the chunks of such files are not all listed in their summary.
+_CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
+
+
+def compact(
+    path: Path, file: FileIO, summary: Summary, data_end: int, compressors: Compressors
+) -> None:
+    """Replace a finished file by one with larger chunks, if it has many small ones.
+
+    An error while writing leaves the original as it is.
+
+    Args:
+        path: Path of the file.
+        file: The file, locked by the caller. Its lock keeps out other writers until the new file
+            is in place.
+        summary: Summary of the file.
+        data_end: First byte of the DataEnd record.
+        compressors: Compression of the merged chunks.
+    """
+    groups = groups_of(summary.chunks)
+    saved = len(summary.chunks) - len(groups)
+    if saved < _MIN_CHUNKS_SAVED or data_end > saved * _MAX_BYTES_PER_CHUNK:
+        return
+    if not path.is_file() or not is_at(file, path):
+        return
+    target = path.resolve()
+    unfinished = _unfinished_path(target)
+    # The log is complete without the compaction: a full disk must not look like lost messages.
+    with contextlib.suppress(OSError, LogError):
+        out = _CompactedFile(unfinished, create(unfinished, overwrite=True))
+        try:
+            out.copy(map_file(target), summary, data_end, groups, compressors)
+            out.replace(target, stat.S_IMODE(target.stat().st_mode))
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+        finally:
+            out.abandon()
+
+
+def remove_leftover(path: Path) -> None:
+    """Remove the unfinished compacted file of a writer that was killed.
+
+    The caller holds the lock of the file at `path`, so no other process writes the leftover.
+    """
+    with contextlib.suppress(OSError):
+        _unfinished_path(path.resolve()).unlink(missing_ok=True)
+
+
+def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
+    """Return the chunks of each chunk of the compacted file, in the order of the new file.
+
+    A merged chunk takes the place of its last part, so that no top-level record that it needs comes
+    after it.
+    """
+    chunks = list(chunks)
+    kinds = _kinds(chunks)
+    groups: list[list[ChunkIndex]] = []
+    current: dict[int, list[ChunkIndex]] = {}
+    for chunk in chunks:
+        if not chunk.message_index_offsets:
+            groups.append([chunk])
+            continue
+        kind = kinds[next(iter(chunk.message_index_offsets))]
+        size, group = chunk.uncompressed_size, current.get(kind)
+        if size >= SMALL_CHUNK_BYTES:
+            current.pop(kind, None)
+            groups.append([chunk])
+        elif group and size + sum(part.uncompressed_size for part in group) <= _MERGED_BYTES:
+            group.append(chunk)
+        else:
+            current[kind] = [chunk]
+            groups.append(current[kind])
+    return sorted(groups, key=lambda group: group[-1].chunk_start_offset)
+
+
+def _kinds(chunks: Iterable[ChunkIndex]) -> dict[int, int]:
+    """Return a number for each channel, equal for channels that share chunks."""
+    kinds: dict[int, int] = {}
+    for ids in {tuple(chunk.message_index_offsets) for chunk in chunks}:
+        connected = {kinds.get(channel_id, channel_id) for channel_id in ids}
+        for channel_id in {*ids, *(id_ for id_, kind in kinds.items() if kind in connected)}:
+            kinds[channel_id] = min(connected)
+    return kinds
+
+
+def _unfinished_path(path: Path) -> Path:
+    return path.with_name(f"{path.name}.compact.part")
+
+
+class _CompactedFile(OutputFile):
+    """Compacted copy of a file."""
+
+    def copy(
+        self,
+        view: memoryview,
+        summary: Summary,
+        data_end: int,
+        groups: list[list[ChunkIndex]],
+        compressors: Compressors,
+    ) -> None:
+        """Write the whole copy.
+
+        Raises:
+            CorruptLogError: The file is damaged, or has chunks that its summary does not list.
+            LogError: The copy cannot be written.
+        """
+        scratch = Scratch()
+        self._summary.schemas, self._summary.channels = summary.schemas, summary.channels
+        self._summary.counts = summary.counts
+        by_last = {group[-1].chunk_start_offset: group for group in groups}
+        end = 0
+        for chunk in summary.chunks:
+            self._copy_top_level(view, slice(end, chunk.chunk_start_offset), summary)
+            group, end = by_last.get(chunk.chunk_start_offset, []), end_of(chunk)
+            if len(group) == 1:
+                self._copy_chunk(view, chunk)
+            elif group:
+                self._merge(view, group, compressors, scratch)
+        self._copy_top_level(view, slice(end, data_end), summary)
+        self._finish()
+
+    def replace(self, target: Path, mode: int) -> None:
+        """Move the finished copy to the place of the original.
+
+        Raises:
+            OSError: The copy is not on disk, or cannot be moved.
+        """
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        os.chmod(self.path, mode)
+        os.replace(self.path, target)
+
+    def _copy_top_level(self, view: memoryview, part: slice, summary: Summary) -> None:
+        """Copy the bytes between two chunks, of which there are mostly none."""
+        if part.start == part.stop:
+            return
+        first_record = part.start or len(MCAP0_MAGIC)
+        if any(op in _CHUNK_RECORDS for _, op, _ in records_of(view, first_record, part.stop)):
+            raise CorruptLogError("the summary does not list all chunks and indexes")
+        shift = self.position - part.start
+        self._summary.metadata += [
+            replace(index, offset=index.offset + shift)
+            for index in summary.metadata
+            if part.start <= index.offset < part.stop
+        ]
+        self._summary.attachments += [
+            replace(index, offset=index.offset + shift)
+            for index in summary.attachments
+            if part.start <= index.offset < part.stop
+        ]
+        self._write(view[part])
+
+    def _copy_chunk(self, view: memoryview, chunk: ChunkIndex) -> None:
+        """Copy the bytes of a chunk and its indexes."""
+        shift = self.position - chunk.chunk_start_offset
+        self._write(view[chunk.chunk_start_offset : end_of(chunk)])
+        offsets = {id_: offset + shift for id_, offset in chunk.message_index_offsets.items()}
+        self._summary.chunks.append(
+            replace(
+                chunk,
+                chunk_start_offset=chunk.chunk_start_offset + shift,
+                message_index_offsets=offsets,
+            )
+        )
+
+    def _merge(
+        self,
+        view: memoryview,
+        group: list[ChunkIndex],
+        compressors: Compressors,
+        scratch: Scratch,
+    ) -> None:
+        """Write the messages of several chunks as one."""
+        joined = bytearray()
+        for chunk in group:
+            joined += chunk_records(view, chunk.chunk_start_offset, scratch)
+        records = memoryview(joined)
+        indexes = contents_of(records).indexes
+        count = sum(map(len, indexes.values()))
+        self._write_chunk(
+            records,
+            {id_: index.tobytes() for id_, index in indexes.items()},
+            (
+                min(chunk.message_start_time for chunk in group),
+                max(chunk.message_end_time for chunk in group),
+            ),
+            compressors.of(records, count)(records),
+            compressors.chunk_name,
+        )

@@ -1,0 +1,125 @@
+"""Indexes of chunks and of their messages, compared with those of the `mcap` library."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+
+import mcaprl
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.columns.chunks import chunk_index_record, parse_chunk_index
+from mcaprl.recorder.columns.message_rows import message_index
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import RECORD_HEADER
+from mcaprl.recorder.columns.summary import Summary
+from tests.support.recordings import MIXED_SPACE, record
+
+_U8 = st.integers(0, 2**64 - 1)
+CHUNK_INDEXES = st.builds(
+    ChunkIndex,
+    chunk_length=_U8,
+    chunk_start_offset=_U8,
+    compression=st.sampled_from(["", "zstd", "lz4", "größer"]),
+    compressed_size=_U8,
+    message_end_time=_U8,
+    message_index_length=_U8,
+    message_index_offsets=st.dictionaries(st.integers(0, 2**16 - 1), _U8, max_size=3),
+    message_start_time=_U8,
+    uncompressed_size=_U8,
+)
+
+
+def content_of(chunk: ChunkIndex, after: bytes = b"") -> memoryview:
+    """Return the content of the record that the library writes, and more at its end."""
+    builder = RecordBuilder()
+    chunk.write(builder)
+    return memoryview(builder.end()[RECORD_HEADER.size :] + after)
+
+
+@given(CHUNK_INDEXES, st.sampled_from([b"", b"of later versions"]))
+def test_they_are_what_the_library_wrote(chunk: ChunkIndex, after: bytes) -> None:
+    assert parse_chunk_index(content_of(chunk, after)) == chunk
+    assert chunk_index_record(chunk)[RECORD_HEADER.size :] == content_of(chunk)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_indexes_that_the_summary_does_not_tell_of_are_found(log_path: Path, every: int) -> None:
+    record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
+    reader = McapReader(log_path)
+    told = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
+    chunks = [
+        replace(chunk, message_index_offsets={}, message_index_length=0)
+        if number % every == 0
+        else chunk
+        for number, chunk in enumerate(reader.chunks)
+    ]
+    summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
+    data = log_path.read_bytes()[: reader.summary_start]
+    log_path.write_bytes(data + summary.to_bytes(len(data)))
+    assert McapReader(log_path).chunks != reader.chunks
+    found = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
+    assert [data.fingerprint for data in found] == [data.fingerprint for data in told]
+
+
+def test_they_are_sorted_by_offset(log_path: Path) -> None:
+    record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
+    reader = McapReader(log_path)
+    data = log_path.read_bytes()[: reader.summary_start]
+    for chunks in (reader.chunks[::-1], reader.chunks[1:] + reader.chunks[:1]):
+        summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
+        log_path.write_bytes(data + summary.to_bytes(len(data)))
+        assert McapReader(log_path).chunks == reader.chunks
+
+
+def test_a_channel_that_is_listed_twice_is_refused() -> None:
+    content = bytearray(content_of(ChunkIndex(1, 2, "zstd", 3, 4, 5, {7: 8, 9: 10}, 6, 7)))
+    content[36 + 10] = 7
+    with pytest.raises(CorruptLogError, match="several indexes of one channel"):
+        parse_chunk_index(memoryview(content))
+
+
+@pytest.mark.parametrize("field", ["chunk_start_offset", "chunk_length", "message_index_length"])
+def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
+    """Also where the sum of lengths would wrap around to a byte of the file."""
+    record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
+    reader = McapReader(log_path)
+    data = log_path.read_bytes()[: reader.summary_start]
+    for value in (2 * len(data), 2**63, 2**64 - 1):
+        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **{field: value})]
+        summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
+        log_path.write_bytes(data + summary.to_bytes(len(data)))
+        with pytest.raises(CorruptLogError, match=r"ends after the file|damaged at byte"):
+            McapReader(log_path)
+
+
+@pytest.mark.parametrize("field", [32, 44])
+def test_lengths_that_do_not_fit_are_refused(field: int) -> None:
+    """Bytes 32 and 44 begin the lengths of an empty map and of the name."""
+    content = bytearray(content_of(ChunkIndex(1, 2, "zstd", 3, 4, 5, {}, 6, 7)))
+    for wrong in (61, 2**31, 2**32 - 1):
+        struct.pack_into("<I", content, field, wrong)
+        with pytest.raises(CorruptLogError, match="chunk_index record"):
+            parse_chunk_index(memoryview(content))
+
+
+def test_message_indexes_that_are_wrong_are_refused() -> None:
+    entries = struct.pack("<4Q", 1, 2, 3, 4)
+    data = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(entries), 7, len(entries)) + entries
+    assert message_index(memoryview(data), 0, 7).tobytes() == entries
+    for offset, value in ((0, 9), (9, 8), (11, 31), (11, 255)):
+        spoilt = bytearray(data)
+        spoilt[offset] = value
+        with pytest.raises(CorruptLogError, match="no message index of channel 7 at byte 0"):
+            message_index(memoryview(spoilt), 0, 7)
+    for beyond in (5000, 2**63, 2**64 - 1):
+        with pytest.raises(CorruptLogError, match=f"at byte {beyond}"):
+            message_index(memoryview(data), beyond, 7)
