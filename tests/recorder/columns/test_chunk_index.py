@@ -94,7 +94,8 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
     for value in (2 * len(data), 2**63, 2**64 - 1):
-        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **{field: value})]
+        fields: dict[str, Any] = {field: value}
+        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **fields)]
         summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
         log_path.write_bytes(data + summary.to_bytes(len(data)))
         with pytest.raises(CorruptLogError, match=r"ends after the file|damaged at byte"):
