@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
-from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
@@ -44,7 +44,7 @@ class Display:
 
     def __init__(
         self,
-        log: LogWriter,
+        log: LogTopics,
         source: object,
         *,
         scene: bool,
@@ -156,7 +156,7 @@ class Display:
         if self._telemetry is not None:
             self.telemetry_names = tuple({RETURN_SO_FAR: 0.0, **self._telemetry.telemetry()})
             name, text = telemetry_schema(self.telemetry_names)
-            self._channels[TELEMETRY] = self._log.mcap.add_channel(TELEMETRY, name, text)
+            self._channels[TELEMETRY] = self._log.sink.add_channel(TELEMETRY, name, text)
         if self._depth is not None:
             shape = self._depth.depth_image_m().shape
             self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
@@ -181,5 +181,5 @@ class Display:
     def _flush_messages(self) -> None:
         # Topic by topic, each finds what it repeats close by: a tenth of the file less.
         self._messages.sort(key=itemgetter(0))
-        self._log.mcap.write_messages(self._messages)
+        self._log.sink.write_messages(self._messages)
         self._messages, self._bytes = [], 0

@@ -30,6 +30,7 @@ from mcaprl.recorder.format.reading import (
     contents_of,
     only,
 )
+from mcaprl.recorder.format.rows import make_final
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
@@ -341,8 +342,4 @@ def _end_at(record: memoryview, reader: McapReader, channel: Channel, fate: Fate
     if fate == Fate.TRUNCATE:
         message["truncated"] = True
         return
-    for name in ("action", "reward", "terminated", "truncated"):
-        message[name] = 0
-    message["final"] = True
-    if "behavior_prob" in (form.names or ()):
-        message["behavior_prob"] = np.nan
+    make_final(message)
