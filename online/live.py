@@ -154,7 +154,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._step += 1
         self._return_so_far += reward
         if is_over:
-            self._tell_end(bool(terminated[WATCHED]), bool(truncated[WATCHED]), infos)
+            self._end_episode(bool(terminated[WATCHED]), bool(truncated[WATCHED]), infos)
             self._begin_episode()
         return result
 
@@ -195,7 +195,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             "training": training,
         }
 
-    def _tell_end(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
+    def _end_episode(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
         reasons = infos.get("final_info", {}).get("reason")
         summary = EpisodeSummary(
             episode=self._episode,
@@ -209,7 +209,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             policy=self._algo,
             epsilon=math.nan if self.model is None else exploration(self.model),
         )
-        self._stream.tell_end(summary)
+        self._stream.end_episode(summary)
 
 
 class _Mirror:

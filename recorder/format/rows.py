@@ -64,6 +64,11 @@ class TopicRows:
         return int(self._rows.shape[-1])
 
     @property
+    def channel_id(self) -> int:
+        """Channel of the topic."""
+        return int(self._rows["channel_id"].flat[0])
+
+    @property
     def itemsize(self) -> int:
         """Bytes of one row."""
         return self._rows.itemsize

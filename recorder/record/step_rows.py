@@ -244,9 +244,9 @@ class ImageColumn:
         """The first step for whose picture there is no row."""
         return self._first_step + len(self._rows)
 
-    def keep(self, picture: NDArray[Any]) -> None:
+    def append(self, image: NDArray[Any]) -> None:
         """Keep the next step's picture, of any dtype with as many bytes."""
-        self._images.append(picture)
+        self._images.append(image)
 
     def flush(self, stop: int) -> None:
         """Write all pictures before step `stop`."""
