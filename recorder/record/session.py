@@ -42,7 +42,7 @@ class OpenEpisode:
     steps: int = 0
 
 
-class Recording:
+class EpisodeLog:
     """A log whose episodes are numbered, and whose times rise from one to the next.
 
     Attributes:

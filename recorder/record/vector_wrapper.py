@@ -27,7 +27,7 @@ from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.session import OpenEpisode, Recording, reason_of
+from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import as_declared, converters
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
@@ -105,7 +105,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             epsilon="" if math.isnan(epsilon) else repr(epsilon),
             seed="" if seed is None else str(seed),
         )
-        self._recording = Recording(
+        self._recording = EpisodeLog(
             path,
             description,
             compression=compression,

@@ -16,8 +16,11 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.lint import Finding
 from mcaprl.recorder.dataset.open import open_logs
-from mcaprl.recorder.viewer.tracks import Track, tracks_of
+from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.record.display import TELEMETRY
 
+Positions = NDArray[np.float64]
+_POSITION = ("x_m", "y_m")
 _BINS = 30
 _SHOWN_EPISODES: Final = 3
 """So many of the best, and of the worst."""
@@ -106,7 +109,7 @@ def _calibration_section(dataset: Dataset) -> list[Section]:
     return [Section("How likely the actions were", text, table=table)]
 
 
-def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
+def _figures(dataset: Dataset, tracks: Sequence[Positions]) -> list[Figure]:
     statistics = dataset.statistics
     small = (4.4, 2.6)
     found = []
@@ -134,7 +137,7 @@ def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
     return found
 
 
-def _coverage(tracks: Sequence[Track]) -> Any:
+def _coverage(tracks: Sequence[Positions]) -> Any:
     """A map of how many steps were where; None if the log tells no places."""
     places = np.concatenate([np.empty((0, 2)), *tracks])
     if not len(places):
@@ -150,7 +153,7 @@ def _coverage(tracks: Sequence[Track]) -> Any:
     return figure
 
 
-def _cards(dataset: Dataset, tracks: Sequence[Track]) -> list[Card]:
+def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
     order = np.argsort([-episode.total_reward for episode in dataset.episodes], kind="stable")
     best = order[:_SHOWN_EPISODES]
     worst = order[len(best) :][-_SHOWN_EPISODES:][::-1]
@@ -171,7 +174,7 @@ def _commands(dataset: Dataset) -> list[str]:
     ]
 
 
-def _card(kind: str, episode: Episode, track: Track, places: Track, command: str) -> Card:
+def _card(kind: str, episode: Episode, track: Positions, places: Positions, command: str) -> Card:
     text = f"return {episode.total_reward:.4g}, {len(episode)} steps, {episode.reason or 'unknown'}"
     if episode.policy:
         text += f", by {episode.policy}"
@@ -180,7 +183,7 @@ def _card(kind: str, episode: Episode, track: Track, places: Track, command: str
     )
 
 
-def _thumbnail(episode: Episode, track: Track, places: Track) -> str:
+def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
     """The way of an episode on the map of all; without places, its rewards step by step."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
@@ -232,3 +235,34 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
     axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel(label)
+
+
+def tracks_of(dataset: Dataset) -> list[Positions]:
+    """Return each episode's positions, (T + 1, 2) x and y in meters; (0, 2) where unknown.
+
+    Raises:
+        LogError: A file of the dataset is missing or damaged.
+    """
+    logs = [log for log in (_positions_in(path) for path in dataset.sources) if log is not None]
+    return [_positions_at(episode.log_time_ns, logs) for episode in dataset.episodes]
+
+
+def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
+    """Return the times (M,) and positions (M, 2) of a log; None if it has none."""
+    topic = Topic(McapReader(path), TELEMETRY)
+    if not len(topic) or not set(_POSITION) <= set(topic.fields):
+        return None
+    columns = topic.read(list(_POSITION))
+    return topic.times, np.column_stack([columns[name] for name in _POSITION]).astype(np.float64)
+
+
+def _positions_at(
+    times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
+) -> Positions:
+    """Return the positions at exactly these times: all topics of a step share one."""
+    for known, positions in logs:
+        start = int(np.searchsorted(known, times[0]))
+        stop = start + len(times)
+        if np.array_equal(known[start:stop], times):
+            return positions[start:stop]
+    return np.empty((0, 2))
