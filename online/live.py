@@ -210,7 +210,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             policy=self._algo,
             epsilon=math.nan if self.model is None else exploration(self.model),
         )
-        self._stream.tell_end(summary)
+        self._stream.end_episode(summary)
 
 
 class _Mirror:

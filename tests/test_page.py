@@ -19,8 +19,7 @@ from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.record.wrapper import RecordMcap
-from mcaprl.recorder.viewer.report import dataset_page
-from mcaprl.recorder.viewer.tracks import tracks_of
+from mcaprl.recorder.viewer.report import dataset_page, tracks_of
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import PolicyScore
 from mcaprl.sims.evaluation.report import evaluation_page

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, OutputExistsError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
+from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 from mcaprl.recorder.format.writing import refuse_if_taken
 
 
@@ -58,60 +58,40 @@ def save_log(
 
 
 def _write_images(log: LogWriter, columns: Transitions) -> None:
-    leaves = observation_leaves(log.metadata.observation_space)
-    for leaf, frames in zip(leaves, columns.frames, strict=True):
-        if leaf.encoding is None:
-            continue
-        rows = log.add_image_topic(leaf.topic, leaf.shape, leaf.encoding)
-        for start in range(0, len(frames), len(rows)):
-            part = slice(start, min(start + len(rows), len(frames)))
-            chunk = rows[: part.stop - start]
-            chunk["log_time"] = columns.log_time_ns[part]
-            chunk["payload"]["data"] = frames[part].reshape(len(chunk), -1)
-            log.write_images(chunk)
+    for leaf, frames in _leaves(log, columns):
+        if leaf.encoding is not None:
+            rows = log.image_rows(leaf.topic, leaf.shape, leaf.encoding)
+            rows.write_columns(columns.log_time_ns, {"data": frames})
 
 
 def _write_steps(log: LogWriter, columns: Transitions) -> None:
-    """Fill the rows of a chunk by fields: frames in order, and transitions where they belong."""
-    fields = _frame_columns(log, columns)
-    frames = len(columns.log_time_ns)
-    rows = log.step_rows()
-    for start in range(0, frames, len(rows)):
-        part = slice(start, min(start + len(rows), frames))
-        chunk = rows[: part.stop - start]
-        chunk["log_time"] = columns.log_time_ns[part]
-        for name, column in fields.items():
-            chunk["payload"][name] = column[part]
-        log.write_steps(chunk)
-
-
-def _frame_columns(log: LogWriter, columns: Transitions) -> dict[str, NDArray[Any]]:
-    """The fields of `/rl/step`, one value per frame."""
+    """Write frames in order, chunk by chunk, and the transitions that start at them."""
     count = len(columns.log_time_ns)
-    step_frames = columns.frame_of_step()
-    finals = columns.first_frames + columns.lengths
-    fields: dict[str, NDArray[Any]] = {}
-    for name, values, missing in (
-        ("reward", columns.rewards, 0),
-        ("action", _flat(columns.actions), 0),
-        ("behavior_prob", columns.behavior_probs, np.nan),
-        ("terminated", columns.terminated, False),
-        ("truncated", columns.truncated, False),
-    ):
-        fields[name] = np.full((count, *values.shape[1:]), missing, values.dtype)
-        fields[name][step_frames] = values
-    fields["final"] = np.zeros(count, np.bool_)
-    fields["final"][finals] = True
     frames_per_episode = columns.lengths + 1
-    fields["episode"] = np.repeat(np.arange(len(columns.episodes)), frames_per_episode)
-    fields["step"] = np.arange(count) - np.repeat(columns.first_frames, frames_per_episode)
-    leaves = observation_leaves(log.metadata.observation_space)
-    for leaf, frames in zip(leaves, columns.frames, strict=True):
-        if leaf.encoding is None:
-            fields[leaf.name] = _flat(np.asarray(frames))
-    return fields
+    episode = np.repeat(np.arange(len(columns.episodes)), frames_per_episode)
+    step = np.arange(count) - np.repeat(columns.first_frames, frames_per_episode)
+    frame_of_step, finals = columns.frame_of_step(), columns.first_frames + columns.lengths
+    transitions = {
+        "action": columns.actions,
+        "reward": columns.rewards,
+        "behavior_prob": columns.behavior_probs,
+        "terminated": columns.terminated,
+        "truncated": columns.truncated,
+    }
+    vectors = [(leaf.name, part) for leaf, part in _leaves(log, columns) if leaf.encoding is None]
+    rows = log.step_rows()
+    for start in range(0, count, len(rows)):
+        frames = slice(start, min(start + len(rows), count))
+        steps = slice(*np.searchsorted(frame_of_step, [frames.start, frames.stop]))
+        where, taken = slice(frames.stop - start), frame_of_step[steps] - start
+        rows.number(where, episode[frames], step[frames])
+        for name, values in vectors:
+            rows.put(name, where, values[frames])
+        for name, values in transitions.items():
+            rows.put(name, taken, values[steps])
+        rows.finish(finals[(finals >= start) & (finals < frames.stop)] - start)
+        rows.write(where, columns.log_time_ns[frames])
 
 
-def _flat(values: NDArray[Any]) -> NDArray[Any]:
-    """Each value as a vector, as a message's field has it; scalars stay scalars."""
-    return values if values.ndim == 1 else values.reshape(len(values), -1)
+def _leaves(log: LogWriter, columns: Transitions) -> Iterable[tuple[Leaf, Frames]]:
+    return zip(observation_leaves(log.metadata.observation_space), columns.frames, strict=True)

@@ -41,43 +41,142 @@ whole episodes, and episodes and times go on from one to the next.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
-from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import METADATA_NAME, SAME_WHEN_APPENDED, LogMetadata
-from mcaprl.recorder.format.schema import (
-    LEARNER_TEXT,
-    LEARNER_TYPE,
-    fill_image_constants,
-    image_dtype,
-    message_dtype,
-    step_schema,
-)
+from mcaprl.recorder.format.rows import ImageRows, StepRows, TopicRows
+from mcaprl.recorder.format.schema import LEARNER_TEXT, LEARNER_TYPE, step_schema, values_schema
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.topics import (
-    BYTES_PER_CHUNK,
     EPISODE_TOPIC,
-    IMAGE_FRAME,
     IMAGES_PER_CHUNK,
     LEARNER_TOPIC,
     LOG_TOPIC,
-    MIN_ROWS,
     STEP_TOPIC,
     STEPS_PER_CHUNK,
 )
 
 
-class LogWriter:
-    """Writes one log of format version 1."""
+class MessageSink(Protocol):
+    """Where a log's topics and messages go: a file, or the viewers of a running environment."""
+
+    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
+        """Store what the log is of."""
+
+    def add_channel(
+        self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
+    ) -> int:
+        """Announce a topic; returns its channel id."""
+
+    def write_rows(self, rows: NDArray[Any]) -> None:
+        """Write message records of one channel."""
+
+    def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
+        """Write messages, each with its channel id and log_time."""
+
+
+class LogTopics:
+    """The topics of a log, announced to a sink and written to it.
+
+    Attributes:
+        sink: Receiver of the messages.
+        metadata: Metadata of the log.
+        action: Description of an action's values.
+        image_leaves: Parts of the observation that are images.
+    """
+
+    def __init__(self, metadata: LogMetadata, sink: MessageSink) -> None:
+        """Announce the topics that every log has.
+
+        Raises:
+            SpaceError: A log cannot contain these spaces.
+        """
+        leaves = observation_leaves(metadata.observation_space)
+        self.metadata, self.sink = metadata, sink
+        self.action = action_leaf(metadata.action_space)
+        self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
+        strings = metadata.to_strings()
+        name, self._step_text = step_schema(metadata.observation_space, metadata.action_space)
+        sink.add_metadata(METADATA_NAME, strings)
+        self._step_channel = sink.add_channel(STEP_TOPIC, name, self._step_text, strings)
+        self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
+        self._log_channel: int | None = None
+
+    def add_channel(self, topic: str, type_name: str) -> int:
+        """Announce a topic of a known ROS type; returns its channel id."""
+        return self.sink.add_channel(topic, type_name, messages.definition(type_name))
+
+    def step_rows(self, most: int = STEPS_PER_CHUNK) -> StepRows:
+        """Preallocate rows of `/rl/step`: `most`, or fewer where those exceed a chunk's size."""
+        return StepRows.of_text(self._step_text, self._step_channel, most, self.sink.write_rows)
+
+    def learner_rows(self, most: int = STEPS_PER_CHUNK) -> TopicRows:
+        """Announce `/rl/learner` and preallocate its rows."""
+        channel = self.sink.add_channel(LEARNER_TOPIC, LEARNER_TYPE, LEARNER_TEXT)
+        return TopicRows.of_text(LEARNER_TEXT, channel, most, self.sink.write_rows)
+
+    def values_rows(self, topic: str, actions: int, most: int = STEPS_PER_CHUNK) -> TopicRows:
+        """Announce a topic of `schema.values_schema` and preallocate its rows."""
+        name, text = values_schema(actions)
+        channel = self.sink.add_channel(topic, name, text)
+        return TopicRows.of_text(text, channel, most, self.sink.write_rows)
+
+    def image_rows(
+        self, topic: str, shape: tuple[int, ...], encoding: str | None, most: int = IMAGES_PER_CHUNK
+    ) -> ImageRows:
+        """Announce a topic of images and preallocate its rows.
+
+        Args:
+            topic: Name of the topic.
+            shape: (height, width) or (height, width, channels).
+            encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
+            most: Number of rows; fewer are returned where those exceed a chunk's size.
+        """
+        assert encoding is not None, f"{topic} has no images"
+        channel = self.add_channel(topic, "sensor_msgs/msg/Image")
+        return ImageRows.of_shape(shape, encoding, channel, most, self.sink.write_rows)
+
+    def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
+        """Write summaries to `/rl/episode`, each at its episode's end.
+
+        Args:
+            summaries: Summaries of the episodes.
+            log_lines: Whether to write the starts and ends to `/rosout` as well.
+        """
+        written = [
+            (self._episode_channel, summary.end_time_ns, summary.to_message())
+            for summary in summaries
+        ]
+        self.sink.write_messages(written + (self._lines(summaries) if log_lines else []))
+
+    def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
+        """Write the starts and ends of episodes to `/rosout` alone."""
+        self.sink.write_messages(self._lines(summaries))
+
+    def _lines(self, summaries: list[EpisodeSummary]) -> list[tuple[int, int, bytes]]:
+        if self._log_channel is None:
+            self._log_channel = self.add_channel(LOG_TOPIC, messages.LOG_TYPE)
+        return [
+            (self._log_channel, time_ns, messages.log_message(time_ns, text))
+            for summary in summaries
+            for time_ns, text in summary.log_lines()
+        ]
+
+
+class LogWriter(LogTopics):
+    """Writes one log of format version 1 to a file.
+
+    Attributes:
+        mcap: Writer of the file, which is the sink.
+    """
 
     def __init__(
         self,
@@ -91,34 +190,17 @@ class LogWriter:
         """Create the file, or open it to append, and announce its topics.
 
         Raises:
-            SpaceError: a log cannot hold these spaces. No file is made then.
-            OutputExistsError, LogError: the file cannot be created, or appended to; then it stays
-                as it is.
+            SpaceError: A log cannot contain these spaces; no file is created then.
+            OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
+            LogError: The file cannot be created, or cannot be appended to and stays as it is.
         """
-        self._prepare(metadata)
         strings = metadata.to_strings()
+        # Refused before a file is created.
+        step_schema(metadata.observation_space, metadata.action_space)
         self.mcap = McapWriter(path, compression=compression, overwrite=overwrite, append=append)
         if self.mcap.untouched:
             self._check_same(strings)
-        self._announce(strings)
-
-    def _prepare(self, metadata: LogMetadata) -> None:
-        """Find what messages the spaces need."""
-        leaves = observation_leaves(metadata.observation_space)
-        self.metadata = metadata
-        self.action = action_leaf(metadata.action_space)
-        self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
-        self._step_type = step_schema(metadata.observation_space, metadata.action_space)
-        dtype = message_dtype(self._step_type[1])
-        assert dtype is not None, "/rl/step has a fixed length by construction"
-        self._step_dtype = dtype
-
-    def _announce(self, strings: dict[str, str]) -> None:
-        """Tell what the log is of, and the topics that every log has."""
-        self.mcap.add_metadata(METADATA_NAME, strings)
-        self._step_channel = self.mcap.add_channel(STEP_TOPIC, *self._step_type, strings)
-        self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
-        self._log_channel: int | None = None
+        super().__init__(metadata, self.mcap)
 
     def _check_same(self, strings: dict[str, str]) -> None:
         """Make sure that a file that is appended to was recorded from such an environment."""
@@ -132,86 +214,6 @@ class LogWriter:
                     f" recording's {here:.200}; record to another file"
                 )
 
-    def add_channel(self, topic: str, type_name: str) -> int:
-        """Announce a topic of a known ROS type; returns its channel id."""
-        return self.mcap.add_channel(topic, type_name, messages.definition(type_name))
-
-    def step_rows(self) -> NDArray[Any]:
-        """Preallocate a chunk's rows of `/rl/step`: `record_dtype` around its fields."""
-        count = _rows_per_chunk(STEPS_PER_CHUNK, self._step_dtype)
-        rows = message_rows(count, self._step_dtype, self._step_channel)
-        rows["payload"]["encapsulation"] = ENCAPSULATION
-        rows["payload"]["behavior_prob"] = np.nan
-        return rows
-
-    def add_image_topic(self, topic: str, shape: tuple[int, ...], encoding: str) -> NDArray[Any]:
-        """Announce a topic of images and preallocate a chunk of its rows.
-
-        Args:
-            topic: its name.
-            shape: (height, width) or (height, width, channels).
-            encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
-
-        Returns:
-            Rows of `message_rows.record_dtype`; `payload.data` is the flat picture.
-        """
-        height, width, channels = (*shape, 1)[:3]
-        item_bytes = 2 if encoding == "16UC1" else 1
-        dtype = image_dtype(height, width, channels, encoding, IMAGE_FRAME, item_bytes)
-        channel = self.add_channel(topic, "sensor_msgs/msg/Image")
-        rows = message_rows(_rows_per_chunk(IMAGES_PER_CHUNK, dtype), dtype, channel)
-        fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
-        return rows
-
-    def learner_rows(self) -> NDArray[Any]:
-        """Announce `/rl/learner` and preallocate a chunk of its rows."""
-        dtype = message_dtype(LEARNER_TEXT)
-        assert dtype is not None
-        channel = self.mcap.add_channel(LEARNER_TOPIC, LEARNER_TYPE, LEARNER_TEXT)
-        rows = message_rows(_rows_per_chunk(STEPS_PER_CHUNK, dtype), dtype, channel)
-        rows["payload"]["encapsulation"] = ENCAPSULATION
-        return rows
-
-    def write_steps(self, rows: NDArray[Any]) -> None:
-        """Write rows of `/rl/step`, all fields and log_time set."""
-        self.mcap.write_rows(rows)
-
-    def write_images(self, rows: NDArray[Any]) -> None:
-        """Write rows of an image topic; their stamps are set from log_time here."""
-        sec, nanosec = np.divmod(rows["log_time"], np.uint64(10**9))
-        rows["payload"]["sec"], rows["payload"]["nanosec"] = sec, nanosec
-        self.mcap.write_rows(rows)
-
-    def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
-        """Write episodes to `/rl/episode`, each at its end's time.
-
-        Args:
-            summaries: of the episodes.
-            log_lines: whether to tell of their starts and ends on `/rosout`, too.
-        """
-        told = [
-            (self._episode_channel, summary.end_time_ns, summary.to_message())
-            for summary in summaries
-        ]
-        self.mcap.write_messages(told + (self._lines(summaries) if log_lines else []))
-
-    def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
-        """Tell of episodes' starts and ends on `/rosout` alone."""
-        self.mcap.write_messages(self._lines(summaries))
-
-    def _lines(self, summaries: list[EpisodeSummary]) -> list[tuple[int, int, bytes]]:
-        if self._log_channel is None:
-            self._log_channel = self.add_channel(LOG_TOPIC, messages.LOG_TYPE)
-        return [
-            (self._log_channel, time_ns, messages.log_message(time_ns, text))
-            for summary in summaries
-            for time_ns, text in summary.log_lines()
-        ]
-
     def close(self) -> None:
         """Write the summary section and close the file. Closing twice is harmless."""
         self.mcap.close()
-
-
-def _rows_per_chunk(most: int, payload: np.dtype[Any]) -> int:
-    return max(MIN_ROWS, min(most, BYTES_PER_CHUNK // payload.itemsize))

@@ -1,12 +1,12 @@
-"""Writes the topics that only viewers read, beside the transitions and under the same times.
+"""Topics that only viewers read, written beside the transitions and under the same times.
 
-/scene, /scene/static   shapes: those that move, at most five times a second and at each episode's
-                        start and end; those that do not, when an episode's differ from the one's
-                        before. A viewer that jumps into the file fetches the last message of each
-                        topic, and that is all there is to see
-/tf, /tf_static         frames: at each step, and likewise
-/telemetry              named numbers to plot: the environment's own, and the return so far
-/camera/depth           metric depth, millimetres
+/scene, /scene/static   shapes: moving ones at most five times a second and at each episode's start
+                        and end; static ones when they differ from those of the episode before. A
+                        viewer that jumps into the file fetches the last message of each topic, and
+                        needs no other
+/tf, /tf_static         frames: moving ones at each step; static ones as above
+/telemetry              numbers to plot: the environment's, and the return so far
+/camera/depth           metric depth in millimeters
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
-from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
@@ -25,7 +25,7 @@ from mcaprl.recorder.record.scene import (
     SceneSource,
     Shape,
     TelemetrySource,
-    depth_millimetres,
+    depth_millimeters,
     marker_array,
     transforms,
 )
@@ -33,32 +33,57 @@ from mcaprl.recorder.record.step_rows import ImageColumn
 
 SCENE, SCENE_STATIC = "/scene", "/scene/static"
 TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
-# Display messages are written when this much has gathered, or the episode ends.
+# Display messages are written when they exceed this size, or the episode ends.
 _CHUNK_BYTES = 2**20
-# Bodies move with their frames at each step; what else moves is drawn anew no sooner than this.
+# Bodies move with their frames at each step; other moving shapes are drawn again after this time.
 _SCENE_PERIOD_NS = 200_000_000
 
 
-class Display:
-    """Collects an episode's display messages and writes them in chunks of their own."""
+class ShownTopics:
+    """The scene and telemetry topics of an environment, announced to a log.
 
-    def __init__(
-        self,
-        log: LogWriter,
-        source: object,
-        *,
-        scene: bool,
-        camera: bool,
-    ) -> None:
-        """Prepare for `source`, an unwrapped environment, with methods of the protocols or without.
+    Attributes:
+        channels: Channel id of each topic.
+        telemetry_names: Fields of `/telemetry`.
+        follow_frame: Frame that the 3D view moves with; empty for none.
+    """
+
+    def __init__(self, log: LogTopics, source: object) -> None:
+        """Announce the topics that `source` can fill; it has been reset."""
+        types: dict[str, str] = {}
+        self.telemetry_names: tuple[str, ...] = ()
+        self.follow_frame = ""
+        if isinstance(source, SceneSource):
+            self.follow_frame = next((frame.name for frame in source.frames()), "")
+            types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
+            types |= dict.fromkeys((TF, TF_STATIC), "tf2_msgs/msg/TFMessage")
+        self.channels = {topic: log.add_channel(topic, name) for topic, name in types.items()}
+        if isinstance(source, TelemetrySource):
+            self.telemetry_names = tuple({RETURN_SO_FAR: 0.0, **source.telemetry()})
+            name, text = telemetry_schema(self.telemetry_names)
+            self.channels[TELEMETRY] = log.sink.add_channel(TELEMETRY, name, text)
+
+    def telemetry(self, source: TelemetrySource, return_so_far: float) -> bytes:
+        """Return a message of `/telemetry`."""
+        values = {RETURN_SO_FAR: return_so_far, **source.telemetry()}
+        return telemetry_message([values.get(name, math.nan) for name in self.telemetry_names])
+
+
+class Display:
+    """The display messages of an episode, collected and written in separate chunks."""
+
+    def __init__(self, log: LogTopics, source: object, *, scene: bool, camera: bool) -> None:
+        """Prepare for an environment.
 
         Args:
-            log: to write to.
-            source: what is to be shown.
-            scene: whether to record shapes, frames and telemetry.
-            camera: whether to record the depth camera; it is anyway if observations are images.
+            log: Log that is written to.
+            source: Unwrapped environment. What it shows depends on which protocols of `scene` it
+                has.
+            scene: Whether to record shapes, frames and telemetry.
+            camera: Whether to record the depth camera. Environments whose observations have images
+                record it in any case.
         """
-        self._log = log
+        self._log, self._source = log, source if scene else None
         self._messages: list[tuple[int, int, bytes]] = []
         self._bytes = 0
         self._scene = source if scene and isinstance(source, SceneSource) else None
@@ -69,32 +94,37 @@ class Display:
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
-        self._channels: dict[str, int] = {}
-        self._is_announced = False
+        self._shown: ShownTopics | None = None
         self._static: dict[str, bytes] = {}
-        # Shapes that were not drawn, for the next ones may be due: those at an episode's end are.
-        self._held: tuple[int, Sequence[Shape]] | None = None
-        self.telemetry_names: tuple[str, ...] = ()
-        self.follow_frame = ""
+        # The latest shapes that were not drawn yet: an episode's last ones are drawn at its end.
+        self._pending: tuple[int, Sequence[Shape]] | None = None
+
+    @property
+    def shown(self) -> ShownTopics:
+        """The topics that are written; defined after the first `begin`."""
+        assert self._shown is not None, "no episode has begun"
+        return self._shown
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """The topics that are written; known once the first episode has begun."""
-        return (*self._channels, *((DEPTH,) if self._depth_images else ()))
+        """Names of the topics that are written; defined after the first `begin`."""
+        return (*self.shown.channels, *((DEPTH,) if self._depth_images else ()))
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Show an episode's start; the environment has just been reset.
+        """Begin an episode; the environment has just been reset.
 
         Args:
             start_ns: log_time of the first observation.
-            step_ns: from one to the next.
+            step_ns: Time between two observations.
         """
         self._start_ns, self._step_ns = start_ns, step_ns
         self._return_so_far = 0.0
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
-        if not self._is_announced:
-            self._announce()
-            self._is_announced = True
+        if self._shown is None:
+            self._shown = ShownTopics(self._log, self._source)
+            if self._depth is not None:
+                shape = self._depth.depth_image_m().shape
+                self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
         if self._scene is not None:
             self._emit_changed(SCENE_STATIC, start_ns, marker_array(self._scene.static_scene()))
             self._emit_changed(TF_STATIC, start_ns, transforms(self._scene.static_frames(), 0))
@@ -102,70 +132,51 @@ class Display:
             self._depth_images.begin(start_ns, step_ns)
 
     def observe(self, step: int, reward: float) -> None:
-        """Show the environment as it is after `step` steps, if anything of it can be shown.
+        """Add what the environment shows after `step` steps.
 
         Args:
-            step: from the episode's start.
-            reward: of the last one; 0 at the start.
+            step: Steps since the episode's start.
+            reward: Reward of the last step; 0 at the start.
         """
         self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
-            self._held = (time_ns, self._scene.scene())
+            self._pending = (time_ns, self._scene.scene())
             if step % self._steps_per_scene == 0:
-                self._draw_held()
+                self._draw_pending()
             self._emit(TF, time_ns, transforms(self._scene.frames(), time_ns))
         if self._telemetry is not None:
-            values = {RETURN_SO_FAR: self._return_so_far, **self._telemetry.telemetry()}
-            numbers = [values.get(name, math.nan) for name in self.telemetry_names]
-            self._emit(TELEMETRY, time_ns, telemetry_message(numbers))
+            message = self.shown.telemetry(self._telemetry, self._return_so_far)
+            self._emit(TELEMETRY, time_ns, message)
         if self._depth is not None and self._depth_images is not None:
             if step >= self._depth_images.full_at:
                 with HoldSignals():
                     self._depth_images.flush(step)
-            millimetres = depth_millimetres(self._depth.depth_image_m())
-            self._depth_images.keep(millimetres)
+            self._depth_images.append(depth_millimeters(self._depth.depth_image_m()))
 
     def end(self, steps: int) -> None:
-        """Write what has gathered in an episode of so many steps."""
-        self._draw_held()
+        """Write the messages of an episode of `steps` transitions."""
+        self._draw_pending()
         self._flush_messages()
         if self._depth_images is not None:
             self._depth_images.flush(steps + 1)
 
     def clear(self) -> None:
-        """Forget what has gathered."""
+        """Drop the messages that are not written yet."""
         if self._messages:
-            # What does not move may have been among them.
-            self._static = {}
-        self._messages, self._bytes, self._held = [], 0, None
+            # The static scene may have been among them.
+            self.resend_static()
+        self._messages, self._bytes, self._pending = [], 0, None
 
-    def forget_what_stands(self) -> None:
-        """Show again what does not move, since another file begins."""
+    def resend_static(self) -> None:
+        """Write the static scene again with the next episode, because another file begins."""
         self._static = {}
 
-    def _announce(self) -> None:
-        types: dict[str, str] = {}
-        if self._scene is not None:
-            self.follow_frame = next((frame.name for frame in self._scene.frames()), "")
-            types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
-            types |= dict.fromkeys((TF, TF_STATIC), "tf2_msgs/msg/TFMessage")
-        self._channels = {
-            topic: self._log.add_channel(topic, name) for topic, name in types.items()
-        }
-        if self._telemetry is not None:
-            self.telemetry_names = tuple({RETURN_SO_FAR: 0.0, **self._telemetry.telemetry()})
-            name, text = telemetry_schema(self.telemetry_names)
-            self._channels[TELEMETRY] = self._log.mcap.add_channel(TELEMETRY, name, text)
-        if self._depth is not None:
-            shape = self._depth.depth_image_m().shape
-            self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
-
-    def _draw_held(self) -> None:
-        if self._held is not None:
-            time_ns, shapes = self._held
+    def _draw_pending(self) -> None:
+        if self._pending is not None:
+            time_ns, shapes = self._pending
             self._emit(SCENE, time_ns, marker_array(shapes))
-            self._held = None
+            self._pending = None
 
     def _emit_changed(self, topic: str, time_ns: int, data: bytes) -> None:
         if self._static.get(topic) != data:
@@ -173,13 +184,13 @@ class Display:
             self._emit(topic, time_ns, data)
 
     def _emit(self, topic: str, time_ns: int, data: bytes) -> None:
-        self._messages.append((self._channels[topic], time_ns, data))
+        self._messages.append((self.shown.channels[topic], time_ns, data))
         self._bytes += len(data)
         if self._bytes > _CHUNK_BYTES:
             self._flush_messages()
 
     def _flush_messages(self) -> None:
-        # Topic by topic, each finds what it repeats close by: a tenth of the file less.
+        # Sorted by topic, similar messages are close to each other: files are a tenth smaller.
         self._messages.sort(key=itemgetter(0))
-        self._log.mcap.write_messages(self._messages)
+        self._log.sink.write_messages(self._messages)
         self._messages, self._bytes = [], 0

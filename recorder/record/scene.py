@@ -161,7 +161,7 @@ def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
     return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
 
 
-def depth_millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Metric depth as 16UC1: millimetres; 0, as in REP 118, where nothing is or beyond 65.5 m."""
     millimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
     return np.where(millimetres <= np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")

@@ -42,7 +42,7 @@ class OpenEpisode:
     steps: int = 0
 
 
-class Recording:
+class EpisodeLog:
     """A log whose episodes are numbered, and whose times rise from one to the next.
 
     Attributes:
@@ -128,14 +128,12 @@ class Recording:
         has_episodes = self.episodes > self._first_in_file
         if parts is not None and has_episodes and mcap.position >= parts.max_file_bytes:
             mcap.start_next(parts.next())
-            display.forget_what_stands()
+            display.resend_static()
             self._first_in_file = self.episodes
         display.begin(start_ns, self.step_ns)
         if not self._has_layout:
-            topics = (LOG_TOPIC, *display.topics)
-            layout = layout_of(
-                self._description, topics, display.telemetry_names, display.follow_frame
-            )
+            topics, shown = (LOG_TOPIC, *display.topics), display.shown
+            layout = layout_of(self._description, topics, shown.telemetry_names, shown.follow_frame)
             mcap.add_attachment(
                 LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns
             )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.format.episode_summary import add_up
-from mcaprl.recorder.format.log_writer import LogWriter
+from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 
 Keeper = Callable[[Any], None]
@@ -121,12 +121,10 @@ class StepColumns:
         keep_reward: keeps what it brought, a number of any type.
     """
 
-    def __init__(self, log: LogWriter) -> None:
+    def __init__(self, log: LogTopics) -> None:
         """Preallocate a chunk of rows."""
-        self._log = log
         self._rows = log.step_rows()
-        payload = self._rows["payload"]
-        self._fields = {name: payload[name] for name in payload.dtype.names or ()}
+        self._fields = self._rows.fields
         self._rewards, self._probs = array("d"), array("d")
         self._waiting: dict[str, Arrays | Integers] = {}
         self.keep_action = self.take_action = self.keeper(log.action)
@@ -168,6 +166,7 @@ class StepColumns:
         count = step - self._first_step - 1
         self._total_reward = self.total_reward(step - 1)
         self._fill(count, count)
+        self._number(count)
         self._write(count)
         self._forget(count)
 
@@ -179,15 +178,14 @@ class StepColumns:
             terminated: of the last one.
             truncated: likewise.
         """
-        final, fields = steps - self._first_step, self._fields
+        final = steps - self._first_step
         assert final >= 1, "the last transition stays in memory"
         self._fill(final, final + 1)
-        fields["terminated"][final - 1], fields["truncated"][final - 1] = terminated, truncated
-        fields["action"][final], fields["reward"][final] = 0, 0.0
-        fields["behavior_prob"][final], fields["final"][final] = math.nan, True
+        self._number(final + 1)
+        self._rows.put("terminated", final - 1, terminated)
+        self._rows.put("truncated", final - 1, truncated)
+        self._rows.finish(final)
         self._write(final + 1)
-        for name, row in (("terminated", final - 1), ("truncated", final - 1), ("final", final)):
-            fields[name][row] = False
 
     def total_reward(self, steps: int) -> float:
         """What the first `steps` transitions brought, added up in order."""
@@ -204,14 +202,16 @@ class StepColumns:
             count = actions if name == "action" else observations
             waiting.put(self._fields[name][:count])
 
+    def _number(self, count: int) -> None:
+        self._rows.number(slice(count), self._episode, self._steps(count))
+
     def _write(self, count: int) -> None:
-        rows, first = self._rows[:count], self._first_step
-        steps = np.arange(first, first + count)
-        rows["log_time"] = self._start_ns + steps * self._step_ns
-        self._fields["episode"][:count] = self._episode
-        self._fields["step"][:count] = steps
-        self._log.write_steps(rows)
+        times_ns = self._start_ns + self._steps(count) * self._step_ns
+        self._rows.write(slice(count), times_ns)
         self._first_step += count
+
+    def _steps(self, count: int) -> NDArray[np.int64]:
+        return np.arange(self._first_step, self._first_step + count)
 
     def _forget(self, count: int | None) -> None:
         del self._rewards[:count], self._probs[:count]
@@ -223,41 +223,37 @@ class ImageColumn:
     """The pictures of one topic that are not yet on disk."""
 
     def __init__(
-        self, log: LogWriter, topic: str, shape: tuple[int, ...], encoding: str | None
+        self, log: LogTopics, topic: str, shape: tuple[int, ...], encoding: str | None
     ) -> None:
-        """Announce the topic; see `LogWriter.add_image_topic`."""
-        assert encoding is not None, f"{topic} has no images"
-        self._log = log
-        self._rows = log.add_image_topic(topic, shape, encoding)
-        self._pictures = Arrays(np.dtype(np.uint8), self._rows.dtype["payload"]["data"].itemsize)
+        """Announce the topic; see `LogTopics.add_image_topic`."""
+        self._rows = log.image_rows(topic, shape, encoding)
+        self._images = Arrays(np.dtype(np.uint8), self._rows.fields["data"].shape[-1])
         self._first_step = 0
 
     def keeper(self, leaf: Leaf) -> Keeper:
         """A function that keeps the pictures of a leaf."""
-        return self._pictures.keeper(leaf)
+        return self._images.keeper(leaf)
 
     def begin(self, start_ns: int, step_ns: int) -> None:
         """Begin an episode: `start_ns` is the log_time of its first picture."""
         self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
-        self._pictures.forget()
+        self._images.forget()
 
     @property
     def full_at(self) -> int:
         """The first step for whose picture there is no row."""
         return self._first_step + len(self._rows)
 
-    def keep(self, picture: NDArray[Any]) -> None:
+    def append(self, image: NDArray[Any]) -> None:
         """Keep the next step's picture, of any dtype with as many bytes."""
-        self._pictures.append(picture)
+        self._images.append(image)
 
     def flush(self, stop: int) -> None:
         """Write all pictures before step `stop`."""
-        rows = self._rows[: stop - self._first_step]
         steps = np.arange(self._first_step, stop)
-        rows["log_time"] = self._start_ns + steps * self._step_ns
-        self._pictures.put(rows["payload"]["data"])
-        self._log.write_images(rows)
-        self._pictures.forget(len(rows))
+        self._images.put(self._rows.fields["data"][: len(steps)])
+        self._rows.write(slice(len(steps)), self._start_ns + steps * self._step_ns)
+        self._images.forget(len(steps))
         self._first_step = stop
 
 

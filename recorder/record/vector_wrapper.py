@@ -21,12 +21,13 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
-from mcaprl.recorder.format.episode_summary import INTERRUPTED, add_up
+from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.session import OpenEpisode, Recording, reason_of
+from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import as_declared, converters
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
@@ -104,7 +105,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             epsilon="" if math.isnan(epsilon) else repr(epsilon),
             seed="" if seed is None else str(seed),
         )
-        self._recording = Recording(
+        self._recording = EpisodeLog(
             path,
             description,
             compression=compression,
@@ -115,18 +116,14 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         )
         log, count = self._recording.log, self.num_envs
         self._display = Display(log, None, scene=False, camera=False)
-        self._columns = OpenSteps(log.step_rows(), count, log.write_steps)
+        self._columns = OpenSteps(log.step_rows(), count)
         self._images = {
-            leaf: OpenRows(
-                log.add_image_topic(leaf.topic, leaf.shape, leaf.encoding or ""),
-                count,
-                log.write_images,
-            )
+            leaf: OpenRows(log.image_rows(leaf.topic, leaf.shape, leaf.encoding), count)
             for leaf in log.image_leaves
         }
-        self._learner: OpenRows | None = None
+        self._learner: OpenRows[TopicRows] | None = None
         if policy_version is not None:
-            self._learner = OpenRows(log.learner_rows(), count, log.write_steps)
+            self._learner = OpenRows(log.learner_rows(), count)
         self._take_spaces()
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
@@ -242,7 +239,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._learner.put("policy_version", every, steps, version)
 
     def _make_room(self) -> None:
-        tables = [self._columns, *self._images.values()]
+        tables: list[OpenRows[Any]] = [self._columns, *self._images.values()]
         tables += [self._learner] if self._learner else []
         for table in tables:
             table.make_room(int(self._steps.max()) + 1)
@@ -310,13 +307,13 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
     def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
         """Write an episode as if it had been recorded alone, behind the last one."""
-        recording, episode, fields = self._recording, self._open[number], self._columns.fields
+        recording, episode = self._recording, self._open[number]
         steps = episode.steps = int(self._steps[number])
         # Whatever goes wrong now, this episode is not written a second time.
         self._running[number], self._steps[number] = False, 0
         summary = recording.summary(
             episode,
-            total_reward=add_up(fields["reward"][number, :steps]),
+            total_reward=self._columns.total_reward(number, steps),
             terminated=terminated,
             truncated=truncated,
             reason=reason,

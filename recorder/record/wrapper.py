@@ -19,7 +19,7 @@ from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.session import OpenEpisode, Recording, reason_of
+from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import ImageColumn, StepColumns, observation_keeper
 
 _UNKNOWN = math.nan
@@ -96,7 +96,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             epsilon="" if math.isnan(epsilon) else repr(epsilon),
             seed="" if seed is None else str(seed),
         )
-        self._recording = Recording(
+        self._recording = EpisodeLog(
             path,
             description,
             compression=compression,

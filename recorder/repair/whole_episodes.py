@@ -28,6 +28,7 @@ from mcaprl.recorder.format.reading import (
     McapReader,
     Topic,
 )
+from mcaprl.recorder.format.rows import make_final
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
@@ -306,8 +307,4 @@ def _end_episode(data: memoryview, dtype: np.dtype[Any] | None, action: RowActio
     if action == RowAction.TRUNCATE:
         message["truncated"] = True
         return
-    for name in ("action", "reward", "terminated", "truncated"):
-        message[name] = 0
-    message["final"] = True
-    if "behavior_prob" in (dtype.names or ()):
-        message["behavior_prob"] = np.nan
+    make_final(message)

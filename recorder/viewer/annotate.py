@@ -15,9 +15,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import gymnasium as gym
-import numpy as np
 from mcap.records import Attachment
-from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -25,9 +23,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.log_reader import describe
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.format.schema import message_dtype, values_schema
 from mcaprl.recorder.format.topics import LOG_TOPIC
-from mcaprl.recorder.format.writing import ENCAPSULATION, message_rows
 from mcaprl.recorder.record.display import SCENE, Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC
 from mcaprl.recorder.viewer.log_layout import layout_of_log
@@ -90,11 +86,9 @@ class AnnotatedCopy:
             UsageError: the log has the topic.
         """
         self._refuse(topic)
-        actions = episodes[0][1]["q"].shape[1]
-        name, text = values_schema(actions)
-        channel = self._log.mcap.add_channel(topic, name, text)
+        rows = self._log.values_rows(topic, actions=episodes[0][1]["q"].shape[1])
         for episode, columns in episodes:
-            self._log.mcap.write_rows(_rows(channel, text, episode.log_time_ns[:-1], columns))
+            rows.write_columns(episode.log_time_ns[:-1], columns)
 
     def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
         """Step the environment through the log, and write what there is to see.
@@ -166,16 +160,3 @@ def values_topics(names: Sequence[str]) -> dict[str, str]:
             word += "_b"
         topics[name] = f"{VALUES_TOPIC}/{word}"
     return topics
-
-
-def _rows(
-    channel: int, text: str, times: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
-) -> NDArray[Any]:
-    dtype = message_dtype(text)
-    assert dtype is not None, "the message has a fixed length by construction"
-    rows = message_rows(len(times), dtype, channel)
-    rows["log_time"] = times
-    rows["payload"]["encapsulation"] = ENCAPSULATION
-    for name, column in columns.items():
-        rows["payload"][name] = column
-    return rows

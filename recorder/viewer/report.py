@@ -16,8 +16,11 @@ from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import open_logs
-from mcaprl.recorder.viewer.tracks import Track, tracks_of
+from mcaprl.recorder.format.reading import McapReader, Topic
+from mcaprl.recorder.record.display import TELEMETRY
 
+Positions = NDArray[np.float64]
+_POSITION = ("x_m", "y_m")
 _BINS = 30
 _SHOWN_EPISODES: Final = 3
 """Number of best episodes, and of worst episodes, that the page shows."""
@@ -105,7 +108,7 @@ def _calibration_section(dataset: Dataset) -> list[Section]:
     return [Section("Behavior probabilities", f"behavior_prob implies {found}.", table=table)]
 
 
-def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
+def _figures(dataset: Dataset, tracks: Sequence[Positions]) -> list[Figure]:
     statistics = dataset.statistics
     small = (4.4, 2.6)
     found = []
@@ -133,7 +136,7 @@ def _figures(dataset: Dataset, tracks: Sequence[Track]) -> list[Figure]:
     return found
 
 
-def _coverage(tracks: Sequence[Track]) -> Any:
+def _coverage(tracks: Sequence[Positions]) -> Any:
     """Plot the number of steps at each position; None if the log has no positions."""
     places = np.concatenate([np.empty((0, 2)), *tracks])
     if not len(places):
@@ -149,7 +152,7 @@ def _coverage(tracks: Sequence[Track]) -> Any:
     return figure
 
 
-def _cards(dataset: Dataset, tracks: Sequence[Track]) -> list[Card]:
+def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
     order = np.argsort([-episode.total_reward for episode in dataset.episodes], kind="stable")
     best = order[:_SHOWN_EPISODES]
     worst = order[len(best) :][-_SHOWN_EPISODES:][::-1]
@@ -170,7 +173,7 @@ def _commands(dataset: Dataset) -> list[str]:
     ]
 
 
-def _card(kind: str, episode: Episode, track: Track, places: Track, command: str) -> Card:
+def _card(kind: str, episode: Episode, track: Positions, places: Positions, command: str) -> Card:
     text = f"return {episode.total_reward:.4g}, {len(episode)} steps, {episode.reason or 'unknown'}"
     if episode.policy:
         text += f", by {episode.policy}"
@@ -179,7 +182,7 @@ def _card(kind: str, episode: Episode, track: Track, places: Track, command: str
     )
 
 
-def _thumbnail(episode: Episode, track: Track, places: Track) -> str:
+def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
     """Plot an episode's track over all positions; without positions, its cumulative reward."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
@@ -231,3 +234,34 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
     axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel(label)
+
+
+def tracks_of(dataset: Dataset) -> list[Positions]:
+    """Return each episode's positions, (T + 1, 2) x and y in meters; (0, 2) where unknown.
+
+    Raises:
+        LogError: A file of the dataset is missing or damaged.
+    """
+    logs = [log for log in (_positions_in(path) for path in dataset.sources) if log is not None]
+    return [_positions_at(episode.log_time_ns, logs) for episode in dataset.episodes]
+
+
+def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
+    """Return the times (M,) and positions (M, 2) of a log; None if it has none."""
+    topic = Topic(McapReader(path), TELEMETRY)
+    if not len(topic) or not set(_POSITION) <= set(topic.fields):
+        return None
+    columns = topic.read(list(_POSITION))
+    return topic.times, np.column_stack([columns[name] for name in _POSITION]).astype(np.float64)
+
+
+def _positions_at(
+    times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
+) -> Positions:
+    """Return the positions at exactly these times: all topics of a step share one."""
+    for known, positions in logs:
+        start = int(np.searchsorted(known, times[0]))
+        stop = start + len(times)
+        if np.array_equal(known[start:stop], times):
+            return positions[start:stop]
+    return np.empty((0, 2))

@@ -48,7 +48,7 @@ class SeenFrame:
 
 
 @dataclass(frozen=True)
-class Moment:
+class SeenStep:
     """What is to be seen at one step.
 
     Attributes:
@@ -66,7 +66,7 @@ class Moment:
     follow: str = ""
 
 
-def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[Moment]:
+def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[SeenStep]:
     """Yield what is to be seen at each step of an episode.
 
     Raises:
@@ -84,7 +84,7 @@ def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[Moment]
                 before[channel.topic] = (data, _decoded(channel.topic, data))
         found = {topic: parts for topic, (_, parts) in before.items()}
         moving_frames = found.get(TF, [])
-        yield Moment(
+        yield SeenStep(
             step=step,
             static=found.get(SCENE_STATIC, []),
             moving=found.get(SCENE, []),

@@ -19,7 +19,7 @@ SHOWN = 5
 
 
 @dataclass(frozen=True)
-class Moment:
+class Surprise:
     """A step that surprised a policy, or that it would have done otherwise.
 
     Attributes:
@@ -50,7 +50,7 @@ class Moment:
         )
 
 
-def moments_of(path: Path) -> list[Moment]:
+def moments_of(path: Path) -> list[Surprise]:
     """The greatest TD errors and the clearest disagreements of each policy that annotated a log.
 
     Raises:
@@ -68,7 +68,7 @@ def moments_of(path: Path) -> list[Moment]:
         for kind, row, value in (*_surprises(columns), *_disagreements(columns)):
             time_ns = int(topic.times[row])
             episode, step = places.get(time_ns, (-1, -1))
-            found.append(Moment(str(path), name, kind, time_ns, episode, step, value))
+            found.append(Surprise(str(path), name, kind, time_ns, episode, step, value))
     return found
 
 

@@ -23,7 +23,7 @@ from mcaprl.recorder.record.scene import (
     DepthSource,
     SceneSource,
     TelemetrySource,
-    depth_millimetres,
+    depth_millimeters,
     marker_array,
 )
 from mcaprl.sims import SIMS, make_sim
@@ -152,7 +152,7 @@ def test_car_frame_is_where_the_telemetry_says(log: Path) -> None:
 
 def test_depth_is_millimetres() -> None:
     metres = np.array([[0.0, 1.2344, np.inf], [65.535, 65.536, 50.0]], np.float32)
-    assert depth_millimetres(metres).tolist() == [[0, 1234, 0], [65535, 0, 50000]]
+    assert depth_millimeters(metres).tolist() == [[0, 1234, 0], [65535, 0, 50000]]
 
 
 def test_depth_topic(log: Path) -> None:

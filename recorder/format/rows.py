@@ -1,0 +1,177 @@
+"""Preallocated message records of one topic, addressed by field; `/rl/step` is defined by StepRows.
+
+A block of rows has the shape (rows,), or (episodes, rows) where several episodes are open at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.columns.cdr import ENCAPSULATION
+from mcaprl.recorder.columns.message_rows import message_rows
+from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, message_dtype
+from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
+
+Write = Callable[[NDArray[Any]], None]
+"""Write message records of one channel as one chunk."""
+# What a final record contains besides the episode's last observation.
+_FINAL = {
+    "action": 0,
+    "reward": 0.0,
+    "behavior_prob": math.nan,
+    "terminated": False,
+    "truncated": False,
+    "final": True,
+}
+
+
+class TopicRows:
+    """Message records of one topic.
+
+    Attributes:
+        fields: The columns of the message by name, as views.
+    """
+
+    def __init__(self, rows: NDArray[Any], write: Write) -> None:
+        """View `rows`, whose constant fields are set."""
+        payload = rows["payload"]
+        self.fields = {name: payload[name] for name in payload.dtype.names or ()}
+        self._rows, self._write, self._log_time = rows, write, rows["log_time"]
+
+    @classmethod
+    def of_text(cls, text: str, channel_id: int, most: int, write: Write) -> Self:
+        """Preallocate records of the fixed-size message that `text` defines.
+
+        Args:
+            text: ROS 2 definition of the message.
+            channel_id: Channel of the topic.
+            most: Number of rows; fewer are allocated where these exceed a chunk's size.
+            write: Function that writes rows as one chunk.
+        """
+        dtype = message_dtype(text)
+        assert dtype is not None, "the message has a fixed length by construction"
+        rows = message_rows(_count(most, dtype), dtype, channel_id)
+        rows["payload"]["encapsulation"] = ENCAPSULATION
+        return cls(rows, write)
+
+    def __len__(self) -> int:
+        """Return the number of rows of one episode."""
+        return int(self._rows.shape[-1])
+
+    @property
+    def channel_id(self) -> int:
+        """Channel of the topic."""
+        return int(self._rows["channel_id"].flat[0])
+
+    @property
+    def itemsize(self) -> int:
+        """Bytes of one row."""
+        return self._rows.itemsize
+
+    def blank(self, *shape: int) -> Self:
+        """Return a block of another shape, filled with copies of the first row."""
+        rows = np.empty(shape, self._rows.dtype)
+        rows[...] = self._rows.flat[0]
+        return type(self)(rows, self._write)
+
+    def grown(self, length: int) -> Self:
+        """Return a longer block of several episodes that begins with the rows of this one."""
+        block = self.blank(len(self._rows), length)
+        block._rows[:, : len(self)] = self._rows
+        return block
+
+    def put(self, field: str, where: Any, values: Any) -> None:
+        """Put values of a field.
+
+        Args:
+            field: Name in the message.
+            where: Index of K rows of the block.
+            values: (K, *shape), or one scalar for all of them.
+        """
+        column = self.fields[field]
+        if column.ndim > self._rows.ndim:
+            values = np.reshape(values, (-1, column.shape[-1]))
+        column[where] = values
+
+    def write(self, where: Any, times_ns: Any) -> None:
+        """Set the log_time of a run of rows, and write them as one chunk."""
+        self._log_time[where] = times_ns
+        self._write(self._rows[where])
+
+    def write_columns(self, times_ns: NDArray[Any], columns: Mapping[str, Any]) -> None:
+        """Write a message for each log_time, in chunks of at most as many as there are rows.
+
+        Args:
+            times_ns: (K,) log_times.
+            columns: (K, ...) values of each field that is not constant.
+        """
+        for first in range(0, len(times_ns), len(self)):
+            chunk = slice(first, min(first + len(self), len(times_ns)))
+            where = slice(chunk.stop - first)
+            for name, column in columns.items():
+                self.put(name, where, column[chunk])
+            self.write(where, times_ns[chunk])
+
+
+class StepRows(TopicRows):
+    """Rows of `/rl/step`: the T transitions of an episode, then its final record.
+
+    `number` sets the counters of a run of rows and clears the flags of an earlier use; `put` then
+    sets the other fields, `finish` makes the last rows final, and `write` adds the times.
+    """
+
+    def number(self, where: Any, episode: Any, steps: Any) -> None:
+        """Set `episode` and `step` of a run of rows, and mark none of them as an end.
+
+        Args:
+            where: Index of K rows.
+            episode: Number of the episode in the log, or (K,).
+            steps: (K,) steps since the episode's start.
+        """
+        fields = self.fields
+        fields["episode"][where], fields["step"][where] = episode, steps
+        for name in ("terminated", "truncated", "final"):
+            fields[name][where] = False
+
+    def finish(self, where: Any) -> None:
+        """Make rows final: each keeps the observation, the episode and the step."""
+        for name, value in _FINAL.items():
+            self.fields[name][where] = value
+
+
+class ImageRows(TopicRows):
+    """Rows of `sensor_msgs/msg/Image`, whose field `data` is the flat image as bytes."""
+
+    @classmethod
+    def of_shape(
+        cls, shape: tuple[int, ...], encoding: str, channel_id: int, most: int, write: Write
+    ) -> Self:
+        """Preallocate rows of images of one shape; see `TopicRows.of_text` and `LogTopics`."""
+        height, width, channels = (*shape, 1)[:3]
+        item_bytes = 2 if encoding == "16UC1" else 1
+        dtype = image_dtype(height, width, channels, encoding, IMAGE_FRAME, item_bytes)
+        rows = message_rows(_count(most, dtype), dtype, channel_id)
+        fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
+        return cls(rows, write)
+
+    def write(self, where: Any, times_ns: Any) -> None:
+        """Set log_time and the header's stamp of a run of rows, and write them as one chunk."""
+        seconds, self.fields["nanosec"][where] = np.divmod(times_ns, 10**9)
+        self.fields["sec"][where] = seconds
+        super().write(where, times_ns)
+
+
+def make_final(message: NDArray[Any]) -> None:
+    """Turn transitions that are written already into final records, in place."""
+    for name, value in _FINAL.items():
+        if name in (message.dtype.names or ()):
+            message[name] = value
+
+
+def _count(most: int, payload: np.dtype[Any]) -> int:
+    return min(most, max(MIN_ROWS, BYTES_PER_CHUNK // payload.itemsize))
