@@ -16,12 +16,12 @@ from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 TRAINING_TOPIC = "/rl/training"
-# Observations of more numbers than this get a series for each of the first ones only.
+# Largest number of series in a plot; only the first ones are plotted.
 MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
-# Of the telemetry, what says how well an agent follows its course, by the ends of names.
+# Telemetry that shows how well an agent follows its course, by the ends of names.
 PLOTTED_ENDINGS = {"speed": "speed_m_s", "offsets": "offset_m"}
-# The depth image's colours span this much, millimetres.
+# The depth image's colors cover this range, millimeters.
 DEPTH_RANGE_MM = (0, 50_000)
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
 
@@ -35,14 +35,14 @@ def layout_of(
     follow_frame: str = "",
     training_names: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The layout for a log with these topics.
+    """Return the layout for a log with these topics.
 
     Args:
-        metadata: of the log: its spaces and names.
-        topics: that the log has beside `/rl/step` and `/rl/episode`.
-        telemetry_names: fields of `/telemetry`.
-        follow_frame: the frame that the 3D view moves with; empty to stand still.
-        training_names: fields of `/rl/training`, where a learner is watched.
+        metadata: Metadata of the log.
+        topics: Topics of the log besides `/rl/step` and `/rl/episode`.
+        telemetry_names: Fields of `/telemetry`.
+        follow_frame: Frame that the 3D view moves with; empty for a fixed view.
+        training_names: Fields of `/rl/training` in a live stream.
     """
     panels: dict[str, dict[str, Any]] = {}
     views = _views(metadata, topics, follow_frame, panels)
@@ -65,7 +65,7 @@ def layout_of(
 
 
 def is_values_topic(topic: str) -> bool:
-    """Whether a topic tells what a policy thinks of the steps."""
+    """Return whether a topic contains a policy's values of the steps."""
     return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 
@@ -75,7 +75,7 @@ def _views(
     follow_frame: str,
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
-    """The 3D panel and the images."""
+    """Add the 3D panel and the images."""
     names: list[Node] = []
     if "/scene" in topics:
         panels["3D!scene"] = _three_d(follow_frame)
@@ -100,7 +100,7 @@ def _plots(
     learning: Mapping[str, str],
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
-    """Plots of reward and return, and below them tabs with all other numbers of the log."""
+    """Add plots of reward and return, and below them tabs with all other numbers of the log."""
     returns = {"return of episode": "/rl/episode.total_reward"}
     if RETURN_SO_FAR in telemetry_names:
         returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
@@ -125,7 +125,7 @@ def _plots(
 
 
 def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Speeds, and offsets: what says how well an agent follows its course, by unit."""
+    """Return the speeds and the offsets from the course, which share a plot by unit."""
     return {
         title: {name: f"/telemetry.{name}" for name in names if name.endswith(ending)}
         for title, ending in PLOTTED_ENDINGS.items()
@@ -133,7 +133,7 @@ def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Of each annotating policy: its values of the actions, its surprise, its doubt."""
+    """Return for each annotating policy its action values, TD error, advantage and entropy."""
     series = {}
     for topic in topics:
         if not is_values_topic(topic):
@@ -147,7 +147,7 @@ def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dic
 
 
 def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """A series for each number of an action; for each discrete action the moments it was taken."""
+    """Return a series per number of an action, or per discrete action the steps that took it."""
     names = metadata.action_names()
     if names:
         taken = {
@@ -161,7 +161,7 @@ def _action_series(metadata: LogMetadata) -> dict[str, str]:
 
 
 def _observation_series(metadata: LogMetadata) -> dict[str, str]:
-    """A named path for each number of the vector observations, as far as they fit a plot."""
+    """Return a named path per number of the vector observations, up to `MAX_SERIES`."""
     paths = {}
     for leaf in observation_leaves(metadata.observation_space):
         if leaf.encoding is not None:
@@ -264,7 +264,7 @@ def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
 
 
 def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:
-    """Panels one after the other, of equal size unless the first one's share is given."""
+    """Stack panels of equal size, unless the first one's share is given."""
     first, *rest = nodes
     if not rest:
         return first

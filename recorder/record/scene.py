@@ -1,8 +1,8 @@
-"""Turns what a simulator says is to be seen into ROS messages.
+"""Conversion of a simulator's scene into ROS messages.
 
-A simulator takes part by having the methods of one or more of the protocols below on its unwrapped
-environment. It describes shapes and frames in terms of its own (any objects with these attributes
-will do) and imports nothing from here. Axes are those of REP 103: right-handed, z up, metres.
+A simulator provides a scene by implementing one or more of the protocols below on its unwrapped
+environment. Any objects with these attributes describe shapes and frames, so a simulator imports
+nothing from here. Axes are those of REP 103: right-handed, z up, meters.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ MARKER_TYPES = {
 }
 _ADD, _DELETE_ALL = 0, 3
 _FOREVER = (0, 0)
-# What is rounded to binary fractions that no viewer can show takes half the space in a log.
+# Values rounded to binary fractions below a viewer's resolution take half the space in a log.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**10
 _ROTATIONS_PER_ONE = 2**14
 
 
 class Shape(Protocol):
-    """One thing to draw."""
+    """One shape to draw."""
 
     @property
     def name(self) -> str:
@@ -56,15 +56,15 @@ class Shape(Protocol):
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(N, 3) metres, for all but `box`, `sphere`, `cylinder` and `text`."""
+        """(N, 3) meters, for all but `box`, `sphere`, `cylinder` and `text`."""
 
     @property
     def size(self) -> Vector:
-        """Edges in metres; of lines, the width is the first."""
+        """Edges in meters; of lines, the width is the first."""
 
     @property
     def position(self) -> Vector:
-        """In its frame, metres."""
+        """In its frame, meters."""
 
     @property
     def yaw_rad(self) -> float:
@@ -76,23 +76,23 @@ class Shape(Protocol):
 
     @property
     def text(self) -> str:
-        """What `text` says."""
+        """Text of the kind `text`."""
 
 
 class Frame(Protocol):
-    """Where one coordinate frame is in another."""
+    """A coordinate frame, placed in another."""
 
     @property
     def name(self) -> str:
-        """Of the frame."""
+        """Name of the frame."""
 
     @property
     def parent(self) -> str:
-        """Of the frame that it is placed in."""
+        """Name of the frame that it is placed in."""
 
     @property
     def position(self) -> Vector:
-        """Its origin in the parent, metres."""
+        """Its origin in the parent, meters."""
 
     @property
     def rotation(self) -> Quad:
@@ -104,16 +104,16 @@ class SceneSource(Protocol):
     """An environment that describes its world."""
 
     def static_scene(self) -> Sequence[Shape]:
-        """What does not change in an episode, bodies fixed to moving frames included."""
+        """Return shapes constant in an episode, including bodies fixed to moving frames."""
 
     def scene(self) -> Sequence[Shape]:
-        """What changes from step to step, at this moment."""
+        """Return the current shapes that change from step to step."""
 
     def static_frames(self) -> Sequence[Frame]:
-        """Frames that are fixed in their parents."""
+        """Return frames that are fixed in their parents."""
 
     def frames(self) -> Sequence[Frame]:
-        """Frames that move, at this moment."""
+        """Return the current frames that move."""
 
 
 @runtime_checkable
@@ -121,7 +121,7 @@ class TelemetrySource(Protocol):
     """An environment that has numbers to plot."""
 
     def telemetry(self) -> Mapping[str, float]:
-        """The same names each time, ROS field names with their units."""
+        """Return numbers by name, always the same names: ROS field names with units."""
 
 
 @runtime_checkable
@@ -129,11 +129,11 @@ class DepthSource(Protocol):
     """An environment with a depth camera."""
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """(height, width) distance along the ray in metres; infinite where nothing is."""
+        """Return (height, width) distances along the rays in meters; infinite where empty."""
 
 
 def marker_array(shapes: Iterable[Shape]) -> bytes:
-    """Shapes as one `visualization_msgs/msg/MarkerArray`.
+    """Encode shapes as one `visualization_msgs/msg/MarkerArray`.
 
     It begins by deleting what the topic showed before, so that a viewer which jumps to this message
     shows these shapes and no others. The message's log_time is the markers' time: their stamps are
@@ -144,7 +144,7 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
 
 
 def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
-    """Frames as one `tf2_msgs/msg/TFMessage`."""
+    """Encode frames as one `tf2_msgs/msg/TFMessage`."""
     stamped = [
         messages.new(
             "geometry_msgs/msg/TransformStamped",
@@ -162,9 +162,9 @@ def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
 
 
 def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Metric depth as 16UC1: millimetres; 0, as in REP 118, where nothing is or beyond 65.5 m."""
-    millimetres = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
-    return np.where(millimetres <= np.iinfo(np.uint16).max, millimetres, 0).astype("<u2")
+    """Convert depth to 16UC1 millimeters; 0, as in REP 118, where empty or beyond 65.5 m."""
+    millimeters = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
+    return np.where(millimeters <= np.iinfo(np.uint16).max, millimeters, 0).astype("<u2")
 
 
 def _shape_marker(shape: Shape) -> Any:
@@ -233,7 +233,7 @@ def _marker(
 
 
 def _rounded(numbers: Any, per_one: int) -> Any:
-    """Numbers or arrays of them, as lists, to the nearest 1/per_one."""
+    """Round numbers or arrays to the nearest 1/per_one, as lists."""
     return (np.rint(np.multiply(numbers, per_one)) / per_one).tolist()
 
 

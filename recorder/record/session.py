@@ -1,4 +1,4 @@
-"""What recorders of one environment and of many share: a log that grows by whole episodes."""
+"""A log that grows by whole episodes, as recorders of one environment and of many write it."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class OpenEpisode:
     """An episode that is being recorded.
 
     Attributes:
-        policy: who acts.
-        epsilon: its exploration.
-        seed: given to reset().
-        options: given to reset().
-        steps: transitions that are wholly in the columns.
+        policy: Name of the policy.
+        epsilon: Exploration of the policy.
+        seed: Seed given to reset().
+        options: Options given to reset().
+        steps: Number of complete transitions.
     """
 
     policy: str
@@ -46,10 +46,10 @@ class EpisodeLog:
     """A log whose episodes are numbered, and whose times rise from one to the next.
 
     Attributes:
-        log: what is written to.
-        step_ns: simulated time between two records.
+        log: Writer of the file.
+        step_ns: Simulated time between two records.
         next_start_ns: log_time of the next episode's first record.
-        episodes: how many there are, which is the next one's number.
+        episodes: Number of episodes, which is the number of the next one.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class EpisodeLog:
         """Create the file, or open it to append; see `RecordMcap`, whose arguments these are.
 
         Raises:
-            UsageError: the times would not rise, or a file would have no room.
-            SpaceError, OutputExistsError, LogError: as `LogWriter`.
+            UsageError: The times would not rise, or `max_file_bytes` is too small.
+            SpaceError, OutputExistsError, LogError: As for `LogWriter`.
         """
         self._description = description
         self.step_ns = description.step_duration_ns
@@ -97,21 +97,21 @@ class EpisodeLog:
             self.log.mcap.abandon()
             raise
         self._has_layout = False
-        # Number of the first episode in the file; any that it had before are its own.
+        # Number of the first episode that is recorded into this file.
         self._first_in_file = 0
         follows = start_time_ns is None and end_ns >= 0
         self.next_start_ns = max(first_ns, end_ns + self.step_ns) if follows else first_ns
 
     @property
     def closed(self) -> bool:
-        """Whether the log takes no more."""
+        """Whether the log is closed."""
         return self.log.mcap.closed
 
     def check_can_begin(self, seeds: Iterable[int | None]) -> None:
         """Make sure that episodes with these seeds can be recorded.
 
         Raises:
-            UsageError: the recording is closed, or a seed does not fit 63 bits.
+            UsageError: The recording is closed, or a seed does not fit 63 bits.
         """
         if self.closed:
             raise UsageError(f"{self.log.mcap.path} is closed; record another episode elsewhere")
@@ -120,9 +120,9 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
 
     def begin(self, display: Display) -> None:
-        """Begin the next episode for viewers, in a file that has room for it.
+        """Begin the next episode for viewers, in a new file if the current one is full.
 
-        With the first episode comes the layout.
+        The first episode adds the layout.
         """
         mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
         has_episodes = self.episodes > self._first_in_file
@@ -140,7 +140,7 @@ class EpisodeLog:
             self._has_layout = True
 
     def close(self) -> None:
-        """Finish the log. A file that was begun for an episode that did not come is removed."""
+        """Finish the log. A last file without an episode is removed."""
         self.log.close()
         if self.episodes == self._first_in_file > 0 and self._parts is not None:
             self.log.mcap.path.unlink()
@@ -154,7 +154,7 @@ class EpisodeLog:
         truncated: bool,
         reason: str,
     ) -> EpisodeSummary:
-        """What is to be told of an episode that ends now, as the next one of the log."""
+        """Return the summary of an episode that ends now, as the next one of the log."""
         return EpisodeSummary(
             episode=self.episodes,
             length=episode.steps,
@@ -171,7 +171,7 @@ class EpisodeLog:
         )
 
     def advance(self, summary: EpisodeSummary) -> None:
-        """Count an episode that is wholly written."""
+        """Count an episode that is completely written."""
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1
 
@@ -199,21 +199,21 @@ class _Parts:
 
     @property
     def current(self) -> Path:
-        """The file to be written now."""
+        """The file that is written now."""
         name = f"{self._family.stem}-{self._number:05d}{self._family.suffix}"
         return self._family.with_name(name)
 
     def next(self) -> Path:
-        """The file behind it."""
+        """Return the file after the current one."""
         self._number += 1
         return self.current
 
 
 def _episodes_in(log: LogWriter) -> int:
-    """How many episodes a log has that is appended to.
+    """Return the number of episodes in a log that is appended to.
 
     Raises:
-        LogError: the last one is not finished.
+        LogError: The last episode is not finished.
     """
     path = log.mcap.path
     steps = Topic(McapReader(path), STEP_TOPIC)
@@ -228,9 +228,11 @@ def _episodes_in(log: LogWriter) -> int:
     return int(last["episode"][0]) + 1
 
 
-def reason_of(told: Any, terminated: bool) -> str:
-    """Why an episode ended, in the environment's words if it has any."""
-    return told if isinstance(told, str) and told else "terminated" if terminated else "time_limit"
+def reason_of(given: Any, terminated: bool) -> str:
+    """Return why an episode ended: the environment's reason if it gave one."""
+    return (
+        given if isinstance(given, str) and given else "terminated" if terminated else "time_limit"
+    )
 
 
 def _json(options: dict[str, Any]) -> str:
@@ -241,5 +243,5 @@ def _json(options: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """What json cannot write by itself: NumPy's numbers and arrays; anything else by its repr."""
+    """Convert NumPy numbers and arrays for json, and any other object to its repr."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else repr(value)

@@ -1,10 +1,9 @@
-"""Values that wait to be written: what the environment gives, copied and kept in order.
+"""Buffers for the values of an open episode, copied per step and written as whole columns.
 
-Per step a value costs little more than its copy: all else (times, counters, constants, the layout
-of a message) is done by whole columns when a chunk is written. A list knows no "present row" of its
-own: its values belong to the steps from the first one that is not on disk, and a step counts only
-when all of it is in place. So there is one counter, the recorder's; what was kept beyond it is
-forgotten.
+Per step, a value costs little more than its copy: times, counters, constants and the layout of a
+message are filled in when a chunk is written. A buffer has no row counter: its values belong to the
+steps from the first one that is not on disk, and a step is valid only when all its values are
+there. The only counter is the recorder's; values beyond it are dropped.
 """
 
 from __future__ import annotations
@@ -25,52 +24,52 @@ from mcaprl.recorder.format.episode_summary import add_up
 from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 
-Keeper = Callable[[Any], None]
-"""Keeps a copy of a value.
+Store = Callable[[Any], None]
+"""A function that stores a copy of a value.
 
 Raises:
-    SpaceError: it is not one of its space's.
+    SpaceError: The value does not belong to its space.
 """
 Converter = Callable[[Any], NDArray[Any]]
-"""Takes a leaf's value out of an observation, in the dtype and shape that its space declares."""
+"""A function that returns a leaf's value, in the dtype and shape that its space declares."""
 
 
 class Arrays:
-    """Arrays of one dtype and size that wait, as bytes."""
+    """A buffer of arrays of one dtype and size, as bytes."""
 
     def __init__(self, dtype: np.dtype[Any], size: int) -> None:
-        """Begin with none; `size` is the numbers in each."""
+        """Create an empty buffer of arrays with `size` numbers each."""
         self._dtype, self._bytes_each = dtype, dtype.itemsize * size
         self._waiting = BytesIO()
 
     def append(self, value: NDArray[Any]) -> None:
-        """Keep a copy of an array of so many bytes."""
+        """Store a copy of an array of this size."""
         self._waiting.write(value.tobytes())
 
-    def keeper(self, leaf: Leaf) -> Keeper:
-        """A function that keeps values of a leaf."""
+    def store(self, leaf: Leaf) -> Store:
+        """Return a function that stores values of a leaf."""
         append, shape, dtype = self.append, leaf.shape, leaf.dtype
         take: Callable[[Any], object] = self._waiting.write
 
-        def keep(value: Any) -> None:
+        def store_value(value: Any) -> None:
             try:
                 if value.dtype is dtype and value.shape == shape:
                     take(value)
                     return
             except (AttributeError, TypeError, ValueError):
-                # No array, or one that does not lie in memory as C has it.
+                # Not an array, or not contiguous in memory.
                 pass
             append(as_declared(value, leaf))
 
-        return keep
+        return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Put the first values into a column; they stay."""
+        """Copy the first values into a column, without dropping them."""
         if len(column):
             waiting = np.frombuffer(self._waiting.getbuffer(), self._dtype, column.size)
             column[:] = waiting.reshape(column.shape)
 
-    def forget(self, count: int | None = None) -> None:
+    def drop(self, count: int | None = None) -> None:
         """Drop the first values, or all."""
         rest = b"" if count is None else self._waiting.getvalue()[count * self._bytes_each :]
         self._waiting.seek(0)
@@ -79,46 +78,46 @@ class Arrays:
 
 
 class Integers:
-    """64-bit integers that wait.
+    """A buffer of 64-bit integers.
 
     Attributes:
-        append: keeps what is one; raises TypeError or OverflowError for anything else.
+        append: Function that stores an integer; raises TypeError or OverflowError for other values.
     """
 
     def __init__(self) -> None:
-        """Begin with none."""
+        """Create an empty buffer."""
         self._waiting = array("q")
-        self.append: Keeper = self._waiting.append
+        self.append: Store = self._waiting.append
 
-    def keeper(self, leaf: Leaf) -> Keeper:
-        """A function that keeps values of a leaf."""
+    def store(self, leaf: Leaf) -> Store:
+        """Return a function that stores values of a leaf."""
         append = self.append
 
-        def keep(value: Any) -> None:
+        def store_value(value: Any) -> None:
             try:
                 append(value)
             except (TypeError, OverflowError):
                 append(as_declared(value, leaf).item())
 
-        return keep
+        return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Put the first values into a column; they stay."""
+        """Copy the first values into a column, without dropping them."""
         column[:] = self._waiting[: len(column)]
 
-    def forget(self, count: int | None = None) -> None:
+    def drop(self, count: int | None = None) -> None:
         """Drop the first values, or all."""
         del self._waiting[:count]
 
 
 class StepColumns:
-    """What of `/rl/step` is not yet on disk, all of one episode.
+    """The rows of `/rl/step` that are not on disk yet, all of one episode.
 
     Attributes:
-        take_action: keeps an action, or raises TypeError or OverflowError for one that only
-            `keep_action` keeps: a call less for the many that are integers.
-        keep_action: keeps an action.
-        keep_reward: keeps what it brought, a number of any type.
+        take_action: Function that stores an action. It raises TypeError or OverflowError where only
+            `store_action` can store it, and saves a function call for integers.
+        store_action: Function that stores an action of any type.
+        store_reward: Function that stores the reward, a number of any type.
     """
 
     def __init__(self, log: LogTopics) -> None:
@@ -127,56 +126,56 @@ class StepColumns:
         self._fields = self._rows.fields
         self._rewards, self._probs = array("d"), array("d")
         self._waiting: dict[str, Arrays | Integers] = {}
-        self.keep_action = self.take_action = self.keeper(log.action)
+        self.store_action = self.take_action = self.store(log.action)
         actions = self._waiting[log.action.name]
         if isinstance(actions, Integers):
             self.take_action = actions.append
-        self.keep_reward: Keeper = self._rewards.append
+        self.store_reward: Store = self._rewards.append
 
-    def keep_behavior_prob(self, prob: float) -> None:
-        """Keep the probability of the action that was kept last; of others it is not known."""
+    def store_behavior_prob(self, prob: float) -> None:
+        """Store the probability of the latest action; those without one are unknown."""
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
         self._probs.append(prob)
 
-    def keeper(self, leaf: Leaf) -> Keeper:
-        """A function that keeps values of a leaf."""
+    def store(self, leaf: Leaf) -> Store:
+        """Return a function that stores values of a leaf."""
         is_integer = leaf.shape == () and leaf.dtype == np.int64
         waiting = Integers() if is_integer else Arrays(leaf.dtype, leaf.size)
         self._waiting[leaf.name] = waiting
-        return waiting.keeper(leaf)
+        return waiting.store(leaf)
 
     def begin(self, episode: int, start_ns: int, step_ns: int) -> None:
         """Begin an episode: `start_ns` is the log_time of its first row."""
         self._episode, self._start_ns, self._step_ns = episode, start_ns, step_ns
         self._first_step, self._total_reward = 0, 0.0
-        self._forget(None)
+        self._drop(None)
 
     @property
     def full_at(self) -> int:
-        """The first step for whose observation there is no row."""
+        """The first step whose observation has no row."""
         return self._first_step + len(self._rows)
 
     def make_room(self, step: int) -> None:
         """Write all rows before the transition that leads to `step`.
 
-        That one stays behind, for its episode may end there and be marked so.
+        That one stays in memory, because its episode may end there.
         """
         count = step - self._first_step - 1
         self._total_reward = self.total_reward(step - 1)
         self._fill(count, count)
         self._number(count)
         self._write(count)
-        self._forget(count)
+        self._drop(count)
 
     def end(self, steps: int, terminated: bool, truncated: bool) -> None:
         """Mark the last transition and the final row, and write all.
 
         Args:
-            steps: transitions of the episode, 1 or more.
-            terminated: of the last one.
-            truncated: likewise.
+            steps: Number of transitions in the episode, 1 or more.
+            terminated: Whether the last one reached a terminal state.
+            truncated: Whether the episode was cut off there.
         """
         final = steps - self._first_step
         assert final >= 1, "the last transition stays in memory"
@@ -188,12 +187,12 @@ class StepColumns:
         self._write(final + 1)
 
     def total_reward(self, steps: int) -> float:
-        """What the first `steps` transitions brought, added up in order."""
+        """Return the sum of the first `steps` rewards, added in order."""
         rewards = np.array(self._rewards[: steps - self._first_step])
         return add_up(rewards, self._total_reward)
 
     def _fill(self, actions: int, observations: int) -> None:
-        """Put what waits into the rows."""
+        """Copy the stored values into the rows."""
         probs = self._probs[:actions]
         self._fields["reward"][:actions] = self._rewards[:actions]
         self._fields["behavior_prob"][: len(probs)] = probs
@@ -213,81 +212,81 @@ class StepColumns:
     def _steps(self, count: int) -> NDArray[np.int64]:
         return np.arange(self._first_step, self._first_step + count)
 
-    def _forget(self, count: int | None) -> None:
+    def _drop(self, count: int | None) -> None:
         del self._rewards[:count], self._probs[:count]
         for waiting in self._waiting.values():
-            waiting.forget(count)
+            waiting.drop(count)
 
 
 class ImageColumn:
-    """The pictures of one topic that are not yet on disk."""
+    """The images of one topic that are not on disk yet."""
 
     def __init__(
         self, log: LogTopics, topic: str, shape: tuple[int, ...], encoding: str | None
     ) -> None:
-        """Announce the topic; see `LogTopics.add_image_topic`."""
+        """Announce the topic; see `LogTopics.image_rows`."""
         self._rows = log.image_rows(topic, shape, encoding)
         self._images = Arrays(np.dtype(np.uint8), self._rows.fields["data"].shape[-1])
         self._first_step = 0
 
-    def keeper(self, leaf: Leaf) -> Keeper:
-        """A function that keeps the pictures of a leaf."""
-        return self._images.keeper(leaf)
+    def store(self, leaf: Leaf) -> Store:
+        """Return a function that stores the images of a leaf."""
+        return self._images.store(leaf)
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Begin an episode: `start_ns` is the log_time of its first picture."""
+        """Begin an episode: `start_ns` is the log_time of its first image."""
         self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
-        self._images.forget()
+        self._images.drop()
 
     @property
     def full_at(self) -> int:
-        """The first step for whose picture there is no row."""
+        """The first step whose image has no row."""
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:
-        """Keep the next step's picture, of any dtype with as many bytes."""
+        """Store the next step's image, of any dtype with the same number of bytes."""
         self._images.append(image)
 
     def flush(self, stop: int) -> None:
-        """Write all pictures before step `stop`."""
+        """Write all images before step `stop`."""
         steps = np.arange(self._first_step, stop)
         self._images.put(self._rows.fields["data"][: len(steps)])
         self._rows.write(slice(len(steps)), self._start_ns + steps * self._step_ns)
-        self._images.forget(len(steps))
+        self._images.drop(len(steps))
         self._first_step = stop
 
 
-def observation_keeper(
+def observation_store(
     space: spaces.Space[Any], columns: StepColumns, images: Mapping[Leaf, ImageColumn]
-) -> Keeper:
-    """A function that keeps observations of a space."""
+) -> Store:
+    """Return a function that stores observations of a space."""
     leaves = observation_leaves(space)
-    keepers = [
-        images[leaf].keeper(leaf) if leaf in images else columns.keeper(leaf) for leaf in leaves
+    stores = [
+        images[leaf].store(leaf) if leaf in images else columns.store(leaf) for leaf in leaves
     ]
     if not leaves[0].path:
-        return keepers[0]
-    parts = [(_part(leaf), keep) for leaf, keep in zip(leaves, keepers, strict=True)]
+        return stores[0]
+    parts = [(_part(leaf), store) for leaf, store in zip(leaves, stores, strict=True)]
 
-    def keep_all(observation: Any) -> None:
-        for part, keep in parts:
-            keep(part(observation))
+    def store_all(observation: Any) -> None:
+        for part, store in parts:
+            store(part(observation))
 
-    return keep_all
+    return store_all
 
 
 def converters(space: spaces.Space[Any]) -> list[Converter]:
-    """For each leaf, the function that takes its value out of an observation."""
+    """Return for each leaf the function that reads its value from an observation."""
     return [_converter(leaf) for leaf in observation_leaves(space)]
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
-    """A value in the dtype and shape that its space declares.
+    """Return a value in the dtype and shape that its space declares.
 
-    Floats may lose digits, with a warning; any other change is refused.
+    Floats may lose digits, with a warning; any other change is an error.
 
     Raises:
-        SpaceError: it has another shape, or does not fit.
+        SpaceError: The value has another shape, or does not fit.
     """
     where = _where(leaf)
     try:
@@ -303,7 +302,7 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     if array.dtype == leaf.dtype:
         return cast
     if array.dtype.kind == leaf.dtype.kind == "f":
-        # A list of floats claims no dtype of its own.
+        # A list of floats has no declared dtype.
         if array.ndim and isinstance(value, np.ndarray):
             warnings.warn(
                 f"{where} is {array.dtype}, its space declares {leaf.dtype}: logged as such",
@@ -327,7 +326,7 @@ def _converter(leaf: Leaf) -> Converter:
 
 
 def _part(leaf: Leaf) -> Callable[[Any], Any]:
-    """A function that takes a leaf's value out of an observation, as it is."""
+    """Return a function that reads a leaf's value from an observation, unconverted."""
 
     def part(observation: Any) -> Any:
         try:

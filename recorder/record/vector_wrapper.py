@@ -1,12 +1,12 @@
-"""Records a vector of environments while it runs, each episode whole and in order.
+"""A Gymnasium wrapper that records a vector of environments, one whole episode after the other.
 
-Episodes of many environments grow side by side. Each one's rows wait in memory until it ends; then
-they are written as if it had been recorded alone, behind the one that ended before it. So the file
-is the same as a single environment's: a reader cannot tell, and simulated time runs on from episode
-to episode. What waits is lost if the process is killed, one open episode of each environment.
+The rows of each environment's open episode stay in memory until it ends; then they are written
+after the episode that ended before it, as if it had been recorded alone. The file has the same form
+as a single environment's, and simulated time continues from episode to episode. If the process is
+killed, the open episode of each environment is lost.
 
-Viewers are shown no scene, since there is no single one to show; a single environment that replays
-the seeds and actions has it.
+No scene is recorded, because there is no single environment to show; one that repeats the seeds and
+actions has it.
 """
 
 from __future__ import annotations
@@ -33,20 +33,21 @@ from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 
 
 class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
-    """Records every transition of a vector environment to an MCAP file.
+    """A wrapper that records every transition of a vector environment to an MCAP file.
 
-    Each finished episode is on disk when `step` returns its end, whatever the autoreset mode. An
-    episode that is broken off by `reset`, `close` or an error is kept and marked truncated, with
-    the reason `interrupted`. Wrap last: what other wrappers outside of this one do is not seen.
+    Each finished episode is on disk when `step` returns its end, in every autoreset mode. An
+    episode that is interrupted by `reset`, `close` or an error is recorded as truncated, with the
+    reason `interrupted`. Apply this wrapper last: it does not record what wrappers outside of it
+    do.
 
     Attributes:
-        behavior_probs: set it before `step` to the (N,) probabilities of the actions under the
-            policy that chose them; NaN, meaning unknown, after each step.
-        policy: name of who acts, for `/rl/episode`; may be changed at any time, and each episode
-            tells the one of its start.
-        epsilon: its exploration, likewise; NaN if unknown.
-        policy_version: how many updates the policy has seen. If it is given at the beginning,
-            `/rl/learner` tells it and `epsilon` for each step, as they are when `step` is called.
+        behavior_probs: (N,) probabilities of the next actions under the policy that chose them. Set
+            it before `step`, which resets it to NaN (unknown).
+        policy: Name of the policy, for `/rl/episode`; may be changed at any time, and each episode
+            records the name at its start.
+        epsilon: Exploration of the policy; NaN if unknown. May be changed at any time.
+        policy_version: Number of updates of the policy so far. If it is given at the beginning,
+            `/rl/learner` records it and `epsilon` for each step, as they are when `step` is called.
     """
 
     def __init__(
@@ -68,27 +69,27 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Wrap `env` and create the file.
 
         Args:
-            env: whose single environments could be recorded by `RecordMcap`; its metadata name
-                the autoreset mode.
-            path: of the file to write.
-            policy: name of who acts.
-            epsilon: probability of a random action; NaN if unknown.
-            policy_version: how many updates the policy has seen; None leaves out `/rl/learner`.
-            seed: of the recording, for the metadata.
-            compression: `zstd`, `lz4` or `none`.
-            overwrite: replace a file that is there.
-            append: go on behind the last episode of a file that is there, which must have been
-                recorded from an environment of the same id, arguments and spaces.
-            max_file_bytes: begin another file behind the episode that made one as large as this.
-                `lane.mcap` then is `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of
-                whole episodes; `mcaprl.open` reads their folder as one.
-            step_duration_s: simulated seconds between two observations; default: as `RecordMcap`.
-            start_time_ns: log_time of the first record, since the Unix epoch; default: now.
+            env: Vector environment. `RecordMcap` could record its single environments, and its
+                metadata name the autoreset mode.
+            path: File to write.
+            policy: Name of the policy.
+            epsilon: Probability of a random action; NaN if unknown.
+            policy_version: Number of updates of the policy so far; None leaves out `/rl/learner`.
+            seed: Seed of the recording, for the metadata.
+            compression: Compression of chunks: `zstd`, `lz4` or `none`.
+            overwrite: Whether to replace an existing file.
+            append: Whether to continue after the last episode of an existing file, which must have
+                been recorded from an environment of the same id, arguments and spaces.
+            max_file_bytes: File size after which the next episode begins another file. `lane.mcap`
+                becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
+                episodes; `mcaprl.open` reads their folder as one dataset.
+            step_duration_s: Simulated seconds between two observations; default: as `RecordMcap`.
+            start_time_ns: log_time of the first record since the Unix epoch; default: now.
 
         Raises:
-            SpaceError: a log cannot hold the environments' spaces.
-            UsageError: the times would not rise, or the autoreset mode is not known.
-            OutputExistsError, LogError: the file cannot be created, or appended to.
+            SpaceError: A log cannot contain the environments' spaces.
+            UsageError: The times would not rise, or the autoreset mode is unknown.
+            OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if not isinstance(env, gym.vector.VectorEnv):
             raise UsageError(
@@ -127,7 +128,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._take_spaces()
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Transitions of each environment's open episode, and whether it has one.
+        # Number of transitions in each environment's open episode, and whether it has one.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # Which environments reset themselves in the next step.
@@ -136,33 +137,33 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
     @property
     def episodes(self) -> int:
-        """Finished episodes of the log, with those that it had before it was appended to."""
+        """Number of finished episodes in the log, including those it had before appending."""
         return self._recording.episodes
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset all environments, or those of `options["reset_mask"]`, and begin their episodes.
 
         Args:
-            seed: of the first one, the others count up from it; or a list with one for each.
-            options: as the environments take them.
+            seed: Seed of the first environment, from which the others count up; or a list of seeds.
+            options: Options of the environments.
 
         Raises:
-            SpaceError: an observation does not fit its space.
-            UsageError: the recording is closed, or a seed does not fit 63 bits.
+            SpaceError: An observation does not fit its space.
+            UsageError: The recording is closed, or a seed does not fit 63 bits.
         """
         count = self.num_envs
         seeds = [seed + k for k in range(count)] if isinstance(seed, int) else seed
         seeds = [None] * count if seeds is None else list(seeds)
         self._recording.check_can_begin(seeds)
-        # Kept now: environments take the mask out of the options.
-        told = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        # Read before the reset: environments remove the mask from the options.
+        given = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
         numbers = np.flatnonzero((options or {}).get("reset_mask", np.ones(count, np.bool_)))
         self._interrupt(numbers)
         observations, infos = self.env.reset(seed=seed, options=options)
         values = [convert(observations) for convert in self._converters]
         with HoldSignals():
             for number in numbers.tolist():
-                episode = OpenEpisode(self.policy, self.epsilon, seeds[number], told or None)
+                episode = OpenEpisode(self.policy, self.epsilon, seeds[number], given or None)
                 self._begin(number, values, episode)
         return observations, infos
 
@@ -172,10 +173,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         The action of an environment that resets itself in this step is not taken, nor logged.
 
         Raises:
-            ResetNeeded: an environment has no open episode.
-            SpaceError: the actions do not fit their space, and are not taken; or an observation
-                does not fit. As after any error behind the actions, all episodes are over then, and
-                kept up to the transition before.
+            ResetNeeded: An environment has no open episode.
+            SpaceError: The actions do not fit their space, and the environments are not stepped; or
+                an observation does not fit. After an error in an environment or in its results, all
+                episodes are over and recorded up to the previous transition.
         """
         if not (self._running | self._due).all():
             idle = np.flatnonzero(~(self._running | self._due)).tolist()
@@ -189,7 +190,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             values = [convert(observations) for convert in self._converters]
             ended = self._running & np.logical_or(terminated, truncated)
             if ended.any() or self._due.any() or self._steps.max() + 1 >= self._full_at:
-                # Nothing may come between the writes, nor between them and what counts the steps.
+                # No signal may interrupt the writes or separate them from the step counters.
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
@@ -198,7 +199,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             else:
                 self._observe(values)
         except BaseException:
-            # The environments may be a step ahead of the log: nothing may be joined to it.
+            # The environments may be a step ahead of the log, so no episode can continue.
             self._interrupt(self._every)
             raise
         return observations, rewards, terminated, truncated, infos
@@ -214,7 +215,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             super().close(**kwargs)
 
     def _take_spaces(self) -> None:
-        """Prepare how values are taken out of observations and actions, and where they go."""
+        """Prepare how values are read from observations and actions, and where they are put."""
         leaves = observation_leaves(self.single_observation_space)
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
@@ -246,7 +247,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._full_at = min(table.capacity for table in tables)
 
     def _observe(self, values: list[NDArray[Any]]) -> None:
-        """Put each environment's observation; from here on the transition to it counts."""
+        """Put each environment's observation; the transition to it is complete then."""
         self._put(self._every, self._steps + self._running, values)
         self._steps += self._running
 
@@ -259,7 +260,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
 
     def _begin(self, number: int, values: list[NDArray[Any]], episode: OpenEpisode) -> None:
-        """Begin an episode of one environment with its row of the observations."""
+        """Begin an episode of one environment with its part of the observations."""
         self._put(number, 0, [value[number] for value in values])
         self._open[number], self._steps[number] = episode, 0
         self._running[number], self._due[number] = True, False
@@ -272,31 +273,31 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         truncated: NDArray[np.bool_],
         infos: dict[str, Any],
     ) -> None:
-        """End episodes, in the order of their environments, and begin those that follow at once."""
+        """End episodes in the order of their environments; begin the next ones if required."""
         same_step = self._autoreset is AutoresetMode.SAME_STEP
-        told = infos.get("final_info", {}) if same_step else infos
+        ended = infos.get("final_info", {}) if same_step else infos
         for number in numbers.tolist():
             if same_step:
                 self._put(number, int(self._steps[number]), self._final_observation(infos, number))
             is_terminal = bool(terminated[number])
-            reason = reason_of(_of_env(told, "reason", number), is_terminal)
+            reason = reason_of(_of_env(ended, "reason", number), is_terminal)
             self._end(number, is_terminal, bool(truncated[number]), reason)
             self._due[number] = self._autoreset is AutoresetMode.NEXT_STEP
             if same_step:
                 self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
-        """Where an episode ended; the observation that was returned is the next one's first."""
+        """Return an episode's last observation; `step` returned the next episode's first one."""
         final = _of_env(infos, "final_obs", number)
         if final is None:
             raise SpaceError(
                 f"environment {number} was reset in its episode's last step, but infos['final_obs']"
-                " does not tell where the episode ended"
+                " does not contain the episode's last observation"
             )
         return [convert(final) for convert in self._converters_of_one]
 
     def _interrupt(self, numbers: NDArray[np.int64]) -> None:
-        """Keep episodes that are broken off; one without a transition leaves no trace."""
+        """End unfinished episodes as truncated; one without a transition is dropped."""
         with HoldSignals():
             for number in numbers.tolist():
                 if self._running[number] and self._steps[number] and not self._recording.closed:
@@ -306,10 +307,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._display.clear()
 
     def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
-        """Write an episode as if it had been recorded alone, behind the last one."""
+        """Write an episode after the previous one, as if it had been recorded alone."""
         recording, episode = self._recording, self._open[number]
         steps = episode.steps = int(self._steps[number])
-        # Whatever goes wrong now, this episode is not written a second time.
+        # Set first, so that after an error this episode is not written a second time.
         self._running[number], self._steps[number] = False, 0
         summary = recording.summary(
             episode,
@@ -331,18 +332,18 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
-    told = env.metadata.get("autoreset_mode")
+    declared = env.metadata.get("autoreset_mode")
     try:
-        return AutoresetMode(told)
+        return AutoresetMode(declared)
     except ValueError:
         known = ", ".join(mode.value for mode in AutoresetMode)
         raise UsageError(
-            f"{env} does not say how it resets: its metadata['autoreset_mode'] is {told!r};"
+            f"{env} does not declare how it resets: its metadata['autoreset_mode'] is {declared!r};"
             f" known are {known}"
         ) from None
 
 
 def _of_env(infos: dict[str, Any], key: str, number: int) -> Any:
-    """What one environment has told; None if it has not."""
+    """Return one environment's entry of the infos; None if it has none."""
     found = infos.get(key)
     return found[number] if isinstance(found, np.ndarray | list | tuple) else None

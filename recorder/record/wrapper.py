@@ -1,8 +1,8 @@
-"""Records an environment while it runs: a Gymnasium wrapper over preallocated columns.
+"""A Gymnasium wrapper that records an environment while it runs.
 
-Row k of `/rl/step` holds observation k and the action taken there with what it brought; the row
-behind an episode's last transition holds its last observation and is `final`. Only what differs
-from row to row is written per step; times, counters and constants are filled in by whole columns
+Row k of `/rl/step` contains observation k, the action taken there and its reward; the row after an
+episode's last transition contains its last observation and is `final`. Only the values that differ
+from row to row are stored per step; times, counters and constants are filled in as whole columns
 when a chunk is written. Rows are copies, so the environment may reuse its buffers.
 """
 
@@ -20,23 +20,23 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
-from mcaprl.recorder.record.step_rows import ImageColumn, StepColumns, observation_keeper
+from mcaprl.recorder.record.step_rows import ImageColumn, StepColumns, observation_store
 
 _UNKNOWN = math.nan
 
 
 class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
-    """Records every transition of an environment to an MCAP file.
+    """A wrapper that records every transition of an environment to an MCAP file.
 
-    Each finished episode is on disk when `step` returns its end. An episode that is broken off by
-    `reset`, `close` or an error is kept and marked truncated, with the reason `interrupted`. Wrap
-    last: what other wrappers outside of this one do (a TimeLimit, say) is not seen here.
+    Each finished episode is on disk when `step` returns its end. An episode that is interrupted by
+    `reset`, `close` or an error is recorded as truncated, with the reason `interrupted`. Apply this
+    wrapper last: it does not record what wrappers outside of it do, such as a TimeLimit.
 
     Attributes:
-        behavior_prob: set it before `step` to the probability of the action under the policy that
-            chose it; NaN, meaning unknown, after each step.
-        policy: name of who acts, for `/rl/episode`; may be changed between episodes.
-        epsilon: its exploration, likewise; NaN if unknown.
+        behavior_prob: Probability of the next action under the policy that chose it. Set it before
+            `step`, which resets it to NaN (unknown).
+        policy: Name of the policy, for `/rl/episode`; may be changed between episodes.
+        epsilon: Exploration of the policy; NaN if unknown. May be changed between episodes.
     """
 
     def __init__(
@@ -59,29 +59,29 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Wrap `env` and create the file.
 
         Args:
-            env: with a Box, Discrete, MultiDiscrete or MultiBinary action space, and observations
-                of these or of a Dict of them.
-            path: of the file to write.
-            policy: name of who acts.
-            epsilon: probability of a random action; NaN if unknown.
-            seed: of the recording, for the metadata.
-            compression: `zstd`, `lz4` or `none`.
-            overwrite: replace a file that is there.
-            append: go on behind the last episode of a file that is there, which must have been
-                recorded from an environment of the same id, arguments and spaces.
-            max_file_bytes: begin another file behind the episode that made one as large as this.
-                `lane.mcap` then is `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of
-                whole episodes; `mcaprl.open` reads their folder as one.
-            scene: record what viewers show, where the environment describes it.
-            camera: record the environment's metric depth image, too.
-            step_duration_s: simulated seconds between two observations; default: the environment's
+            env: Environment with a Box, Discrete, MultiDiscrete or MultiBinary action space, and
+                observations of these spaces or of a Dict of them.
+            path: File to write.
+            policy: Name of the policy.
+            epsilon: Probability of a random action; NaN if unknown.
+            seed: Seed of the recording, for the metadata.
+            compression: Compression of chunks: `zstd`, `lz4` or `none`.
+            overwrite: Whether to replace an existing file.
+            append: Whether to continue after the last episode of an existing file, which must have
+                been recorded from an environment of the same id, arguments and spaces.
+            max_file_bytes: File size after which the next episode begins another file. `lane.mcap`
+                becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
+                episodes; `mcaprl.open` reads their folder as one dataset.
+            scene: Whether to record what viewers show, where the environment describes it.
+            camera: Whether to record the environment's metric depth image as well.
+            step_duration_s: Simulated seconds between two observations; default: the environment's
                 `step_duration_s`, or one over its `render_fps`, or 0.1.
-            start_time_ns: log_time of the first record, since the Unix epoch; default: now.
+            start_time_ns: log_time of the first record since the Unix epoch; default: now.
 
         Raises:
-            SpaceError: a log cannot hold the environment's spaces.
-            UsageError: the times would not rise.
-            OutputExistsError, LogError: the file cannot be created, or appended to.
+            SpaceError: A log cannot contain the environment's spaces.
+            UsageError: The times would not rise.
+            OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if isinstance(env, gym.vector.VectorEnv):
             raise UsageError(
@@ -110,19 +110,19 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._columns = columns = StepColumns(log)
         # Looked up at each step.
         self._shows_steps = self._display.shows_steps
-        self._take_action, self._keep_reward = columns.take_action, columns.keep_reward
+        self._take_action, self._store_reward = columns.take_action, columns.store_reward
         images = {
             leaf: ImageColumn(log, leaf.topic, leaf.shape, leaf.encoding)
             for leaf in log.image_leaves
         }
         self._images = list(images.values())
-        self._keep_observation = observation_keeper(env.observation_space, self._columns, images)
+        self._store_observation = observation_store(env.observation_space, self._columns, images)
         self._full_at = 0
         self._open: OpenEpisode | None = None
 
     @property
     def episodes(self) -> int:
-        """Finished episodes of the log, with those that it had before it was appended to."""
+        """Number of finished episodes in the log, including those it had before appending."""
         return self._recording.episodes
 
     def reset(
@@ -131,8 +131,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Reset the environment and begin an episode in the log.
 
         Raises:
-            SpaceError: the observation does not fit its space.
-            UsageError: the recording is closed, or the seed does not fit 63 bits.
+            SpaceError: The observation does not fit its space.
+            UsageError: The recording is closed, or the seed does not fit 63 bits.
         """
         self._recording.check_can_begin([seed])
         self._interrupt()
@@ -145,23 +145,23 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Step the environment and log the transition.
 
         Raises:
-            ResetNeeded: no episode is open.
-            SpaceError: the action does not fit its space, and is not taken; or the observation
-                does not fit. As after any error behind the action, the episode is over then, and
-                kept up to the transition before.
+            ResetNeeded: No episode is open.
+            SpaceError: The action does not fit its space, and the environment is not stepped; or
+                the observation does not fit. After an error in the environment or in its results,
+                the episode is over and recorded up to the previous transition.
         """
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
         try:
-            # Before the environment can change it.
+            # Copied before the environment can change it.
             try:
                 self._take_action(action)
             except (TypeError, OverflowError):
-                self._columns.keep_action(action)
+                self._columns.store_action(action)
             if self.behavior_prob is not _UNKNOWN:
-                self._columns.keep_behavior_prob(self.behavior_prob)
+                self._columns.store_behavior_prob(self.behavior_prob)
                 self.behavior_prob = _UNKNOWN
         except SpaceError:
             raise
@@ -170,10 +170,10 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             raise
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
-            self._keep_observation(observation)
-            self._keep_reward(reward)
+            self._store_observation(observation)
+            self._store_reward(reward)
             if terminated or truncated or step >= self._full_at:
-                # Nothing may come between the writes, nor between them and what counts the steps.
+                # No signal may interrupt the writes or separate them from the step counter.
                 with HoldSignals():
                     self._make_room(step)
                     self._count(episode, step, float(reward))
@@ -185,7 +185,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             else:
                 episode.steps = step
         except BaseException:
-            # The environment may be a step ahead of the log: nothing may be joined to it.
+            # The environment may be a step ahead of the log, so the episode cannot continue.
             self._interrupt()
             raise
         return observation, reward, terminated, truncated, info
@@ -207,7 +207,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         for image in self._images:
             image.begin(start_ns, step_ns)
         self._full_at = self._next_full()
-        self._keep_observation(observation)
+        self._store_observation(observation)
         recording.begin(self._display)
         self._count(episode, 0, 0.0)
         self._open = episode
@@ -221,7 +221,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._full_at = self._next_full()
 
     def _next_full(self) -> int:
-        """The first step for whose observation there is no room."""
+        """Return the first step whose observation has no room."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
     def _count(self, episode: OpenEpisode, step: int, reward: float) -> None:
@@ -231,7 +231,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         episode.steps = step
 
     def _interrupt(self) -> None:
-        """Keep an episode that is broken off; one without a transition leaves no trace."""
+        """End an unfinished episode as truncated; one without a transition is dropped."""
         if self._open is not None and self._open.steps > 0:
             with HoldSignals():
                 self._end(False, True, INTERRUPTED)
@@ -241,7 +241,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     def _end(self, terminated: bool, truncated: bool, reason: str) -> None:
         episode = self._open
         assert episode is not None
-        # Whatever goes wrong now, this episode is not written a second time.
+        # Set first, so that after an error this episode is not written a second time.
         self._open = None
         summary = self._recording.summary(
             episode,

@@ -271,7 +271,7 @@ def test_what_is_refused(log_path: Path) -> None:
         mcaprl.RecordVecMcap(gym.make("CartPole-v1"), log_path)  # type: ignore[arg-type]
     silent = cartpoles(2)
     silent.metadata = {}
-    with pytest.raises(UsageError, match="does not say how it resets"):
+    with pytest.raises(UsageError, match="does not declare how it resets"):
         mcaprl.RecordVecMcap(silent, log_path)
     assert not log_path.exists()
     env = mcaprl.RecordVecMcap(cartpoles(2), log_path)
