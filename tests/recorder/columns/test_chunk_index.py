@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from gymnasium import spaces
@@ -93,8 +94,10 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
+    changes: dict[str, Any]
     for value in (2 * len(data), 2**63, 2**64 - 1):
-        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **{field: value})]
+        changes = {field: value}
+        chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **changes)]
         summary = Summary(dict(reader.schemas), dict(reader.channels), reader._counts, chunks)
         log_path.write_bytes(data + summary.to_bytes(len(data)))
         with pytest.raises(CorruptLogError, match=r"ends after the file|damaged at byte"):
