@@ -1,9 +1,9 @@
-"""Finds what is sound in a damaged MCAP file: records that are what their lengths say.
+"""Search for valid records in a damaged MCAP file.
 
-MCAP has no marks to begin again at. Where a record is damaged, the one behind it is looked for: by
-the damaged one's length if that leads to a sound record, else byte by byte for a while, else by the
-form of a chunk, in which two lengths must agree. A record that passes is exactly as its writer
-would have written it; whether a chunk's contents are whole, its CRC tells whoever opens it.
+MCAP has no synchronization marks. After a damaged record, the next one is searched for: where the
+damaged length ends, if there is a valid record; else byte by byte for a while; else by the form of a
+chunk, in which two lengths must agree. A valid record has exactly the bytes that a writer
+would have written; the contents of a chunk are checked by their CRC when it is opened.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from mcaprl.recorder.columns.records import RECORD_HEADER, parse_record, records
 SoundRecord = tuple[int, int, memoryview]
 """Offset, opcode and content."""
 
-# Records that carry something; what the rest say can be found out again.
+# Records with data of their own; all others can be derived from these.
 _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _SEARCHED = (*_REWRITTEN, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _CHUNK_NAME = struct.Struct("<QQQII")
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-# So far every byte is tried; a search for chunks goes on from there.
+# Distance within which every byte is tried; after it, only chunks are searched for.
 _NEAR_BYTES = 2**16
 _BLOCK_BYTES = 2**22
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A place in a file that cannot be read.
+    """Part of a file that cannot be read.
 
     Attributes:
-        offset: of its first byte.
-        bytes: how many.
-        what: is wrong there.
+        offset: First byte.
+        bytes: Number of bytes.
+        what: Description.
     """
 
     offset: int
@@ -52,16 +52,16 @@ class Damage:
     what: str
 
     def __str__(self) -> str:
-        """One phrase."""
+        """Return one phrase."""
         return f"{self.what} at byte {self.offset} ({self.bytes} bytes)"
 
 
 def sound_records(view: memoryview, damages: list[Damage]) -> Iterator[SoundRecord]:
-    """Yield offset, opcode and content of each sound record of the data section.
+    """Yield offset, opcode and content of each valid record of the data section.
 
     Args:
-        view: the file.
-        damages: what is between them is added here.
+        view: Bytes of the file.
+        damages: List to which the parts between valid records are added.
     """
     offset = len(MCAP0_MAGIC)
     if bytes(view[:offset]) != MCAP0_MAGIC:
@@ -83,15 +83,15 @@ def sound_records(view: memoryview, damages: list[Damage]) -> Iterator[SoundReco
             damages.append(Damage(offset, 0, "the data does not match the CRC of all"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # Not before the end: a copy of the rest at each record would make this quadratic.
+        # Only at the end: a copy of the rest at each record would take quadratic time.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 
 
 def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
-    """Whether a DataEnd record is the data's end: all in front of it is, then, as it was written.
+    """Return whether a DataEnd record ends the data section, so that all before it is undamaged.
 
-    Without a CRC it is believed if only a summary can follow.
+    One without a CRC does so if no chunk follows.
     """
     (crc,) = struct.unpack("<I", content)
     if crc:
@@ -100,7 +100,7 @@ def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
 
 
 def _sound_record(view: memoryview, offset: int) -> memoryview | None:
-    """The content of the record at `offset`, if it is as a writer would have written it."""
+    """Return the content of the record at `offset`; None if it is not valid."""
     if offset + RECORD_HEADER_BYTES > len(view):
         return None
     opcode, length = RECORD_HEADER.unpack_from(view, offset)
@@ -133,16 +133,16 @@ def _is_sound(opcode: int, content: memoryview) -> bool:
 
 
 def _repeats(opcode: int, content: memoryview) -> bool:
-    """Whether a record that is read and written again is the same."""
+    """Return whether a record is unchanged when it is parsed and serialized."""
     try:
         builder = RecordBuilder()
         parse_record(opcode, content).write(builder)
     except (CorruptLogError, struct.error):
         return False
-    again, told = bytes(builder.end()[RECORD_HEADER_BYTES:]), bytes(content)
-    # The CRC of an attachment may have been left out.
-    without_crc = opcode == Opcode.ATTACHMENT and told[-4:] == bytes(4)
-    return again == told or (without_crc and again[:-4] == told[:-4])
+    again, found = bytes(builder.end()[RECORD_HEADER_BYTES:]), bytes(content)
+    # An attachment may have no CRC.
+    without_crc = opcode == Opcode.ATTACHMENT and found[-4:] == bytes(4)
+    return again == found or (without_crc and again[:-4] == found[:-4])
 
 
 def _is_chunk(content: memoryview) -> bool:
@@ -155,14 +155,14 @@ def _is_chunk(content: memoryview) -> bool:
 
 
 def _next_record(view: memoryview, damaged: int) -> int:
-    """Where the next sound record is behind a damaged one; the file's end if there is none."""
+    """Return the next valid record after a damaged one; the end of the file if there is none."""
     if damaged + RECORD_HEADER_BYTES <= len(view):
         _, length = RECORD_HEADER.unpack_from(view, damaged)
-        behind = int(damaged + RECORD_HEADER_BYTES + length)
-        leads_on = behind < len(view) and view[behind] in _KNOWN and _sound_record(view, behind)
-        # A wrong length may lead to a message within another chunk, past whole ones.
-        if leads_on and _next_chunk(view, damaged + 1, behind) == behind:
-            return behind
+        after = int(damaged + RECORD_HEADER_BYTES + length)
+        leads_on = after < len(view) and view[after] in _KNOWN and _sound_record(view, after)
+        # A wrong length may lead into a later chunk, past undamaged ones.
+        if leads_on and _next_chunk(view, damaged + 1, after) == after:
+            return after
     near = min(damaged + _NEAR_BYTES, len(view))
     for offset in range(damaged + 1, near):
         if view[offset] in _SEARCHED and _sound_record(view, offset) is not None:
@@ -171,7 +171,7 @@ def _next_record(view: memoryview, damaged: int) -> int:
 
 
 def _next_chunk(view: memoryview, start: int, stop: int) -> int:
-    """Where the first sound chunk begins from `start` on; `stop` if there is none before it."""
+    """Return the first valid chunk between `start` and `stop`; `stop` if there is none."""
     bytes_ = np.frombuffer(view, np.uint8)
     for block in range(start, stop, _BLOCK_BYTES):
         for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, stop)):
@@ -181,7 +181,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
 
 
 def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
-    """Places with a chunk's opcode and a length below 2**40."""
+    """Return the offsets of a chunk's opcode with a length below 2**40."""
     found = start + np.flatnonzero(bytes_[start:stop] == int(Opcode.CHUNK))
     found = found[found + RECORD_HEADER_BYTES <= len(bytes_)]
     for high in (6, 7, 8):
@@ -191,7 +191,7 @@ def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
 
 
 def intact_summary(view: memoryview) -> list[Any]:
-    """Schemas and channels from the summary, if that is there and matches its CRC."""
+    """Return the schemas and channels of a summary that matches its CRC; else nothing."""
     end = len(view) - len(MCAP0_MAGIC)
     start = end - RECORD_HEADER_BYTES - 20
     if start < len(MCAP0_MAGIC) or bytes(view[end:]) != MCAP0_MAGIC:
