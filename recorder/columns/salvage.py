@@ -1,9 +1,9 @@
 """Search for valid records in a damaged MCAP file.
 
 MCAP has no synchronization marks. After a damaged record, the next one is searched for: where the
-damaged length ends, if there is a valid record; else byte by byte for a while; else by the form of a
-chunk, in which two lengths must agree. A valid record has exactly the bytes that a writer
-would have written; the contents of a chunk are checked by their CRC when it is opened.
+damaged length ends, if there is a valid record; else byte by byte for a while; else by the form of
+a chunk, in which two lengths must agree. A valid record has exactly the bytes that a writer would
+have written; the contents of a chunk are checked by their CRC when it is opened.
 """
 
 from __future__ import annotations
