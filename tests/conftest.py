@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -50,7 +51,9 @@ def need(available: bool, reason: str) -> None:
         pytest.skip(reason)
 
 
-@pytest.fixture
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let writers leave their small chunks, as one that is killed does."""
-    monkeypatch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)
+@pytest.fixture(scope="module")
+def small_chunks() -> Iterator[None]:
+    """Let the writers of a module leave their small chunks, as one that is killed does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mcaprl.recorder.columns.compact._MIN_CHUNKS_SAVED", 10**9)
+        yield

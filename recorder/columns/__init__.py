@@ -1,4 +1,7 @@
-"""MCAP topics as NumPy columns: records, chunks, indexes, CRCs and CDR.
+"""MCAP topics as NumPy columns. This package knows nothing about reinforcement learning.
 
-Nothing in here knows reinforcement learning.
+Reading: `reader` (summary, positions of messages), `topic` (columns), `decoder` and `cdr` (fields).
+Writing: `writer` (chunks, top-level records), `output` (file), `compact` (merges small chunks at
+close), `append` (state of a finished file), `summary`, `file_lock`, `signals`.
+Both: `records`, `chunks`, `message_rows`, `checksum`. Damaged files: `chunk_check`, `salvage`.
 """

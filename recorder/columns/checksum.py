@@ -1,6 +1,6 @@
-"""CRC-32, which covers all that is read and written.
+"""CRC-32 of all data that are read and written.
 
-ISA-L's takes an eighth of the time of zlib's; it is there with `pip install 'mcaprl[fast]'`.
+ISA-L takes an eighth of the time of zlib; `pip install 'mcaprl[fast]'` installs it.
 """
 
 from __future__ import annotations

@@ -95,21 +95,21 @@ def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
     chunks = list(chunks)
     kinds = _kinds(chunks)
     groups: list[list[ChunkIndex]] = []
-    current: dict[int, list[ChunkIndex]] = {}
+    # The last group of each kind, and the bytes of its records.
+    current: dict[int, tuple[list[ChunkIndex], int]] = {}
     for chunk in chunks:
-        if not chunk.message_index_offsets:
-            groups.append([chunk])
-            continue
-        kind = kinds[next(iter(chunk.message_index_offsets))]
-        size, group = chunk.uncompressed_size, current.get(kind)
-        if size >= SMALL_CHUNK_BYTES:
+        size = chunk.uncompressed_size
+        kind = kinds[next(iter(chunk.message_index_offsets))] if chunk.message_index_offsets else -1
+        group, group_bytes = current.get(kind, ([], 0))
+        if kind < 0 or size >= SMALL_CHUNK_BYTES:
             current.pop(kind, None)
             groups.append([chunk])
-        elif group and size + sum(part.uncompressed_size for part in group) <= _MERGED_BYTES:
-            group.append(chunk)
-        else:
-            current[kind] = [chunk]
-            groups.append(current[kind])
+            continue
+        if not group or group_bytes + size > _MERGED_BYTES:
+            group, group_bytes = [], 0
+            groups.append(group)
+        group.append(chunk)
+        current[kind] = group, group_bytes + size
     return sorted(groups, key=lambda group: group[-1].chunk_start_offset)
 
 

@@ -1,4 +1,4 @@
-"""Keeps Ctrl-C, SIGTERM and a closed terminal from falling between writes that belong together."""
+"""Delay of Ctrl-C, SIGTERM and SIGHUP during writes that belong together."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
 try:
-    # What `signal` wraps, to make enums of numbers and handlers: that takes ten times as long, and
-    # an episode's end holds signals twice.
+    # `signal` wraps these functions to return enums, which takes ten times as long.
     from _signal import getsignal  # type: ignore[import-not-found]
     from _signal import signal as set_handler
 except ImportError:
@@ -23,16 +22,16 @@ _HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 
 
 class HoldSignals:
-    """A `with` block that lets signals wait; they are handled as usual when it ends.
+    """Context manager that delays signals; they are handled as usual at its end.
 
-    Only the main thread can hold them; in any other thread no handler runs anyway. A block within
-    another adds nothing to it.
+    Only the main thread delays them, since handlers run in no other thread. A nested context has no
+    effect.
     """
 
     _is_held: ClassVar[bool] = False
 
     def __enter__(self) -> None:
-        """Begin to hold."""
+        """Start to delay signals."""
         self._handlers: dict[int, Any] = {}
         self._waiting: list[int] = []
         self._holds = threading.current_thread() is threading.main_thread() and not self._is_held
@@ -42,7 +41,7 @@ class HoldSignals:
             HoldSignals._is_held = True
             for number in _HELD:
                 handler = getsignal(number)
-                # None: not installed from Python, so it cannot be put back.
+                # None: not installed from Python, so it cannot be restored.
                 if handler is not None:
                     self._handlers[number] = handler
                     set_handler(number, self._note)
@@ -56,7 +55,7 @@ class HoldSignals:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Handle what came in the meantime."""
+        """Handle the delayed signals."""
         self._restore()
         for number in self._waiting:
             handler = self._handlers[number]
@@ -66,7 +65,7 @@ class HoldSignals:
                 signal.raise_signal(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        # Not the frame: as long as it were kept, so would be all that was being worked on in it.
+        # The frame is not stored: it would keep its local variables alive.
         self._waiting.append(number)
 
     def _restore(self) -> None:

@@ -24,9 +24,10 @@ topics. `/rl/episode` has that of the final record.
 
 Chunks. Each holds one kind of topic, as the lines above divide them (but `/rosout` stands with
 `/rl/episode`), and is compressed by zstd, lz4 or not at all, with its CRC, and a MessageIndex for
-each channel in it. Schemas, channels, metadata and attachments stand outside of chunks, before what
-needs them. The summary repeats schemas and channels, and indexes all else. Every CRC that MCAP has
-is there.
+each channel in it. Schemas, channels, metadata and attachments are top-level records before the
+chunks that need them. The summary repeats schemas and channels, and indexes all else. Every CRC
+that MCAP has is there. When a log is closed, many chunks below 64 KiB are merged to chunks of about
+1 MiB of the same kind; the messages of each channel stay in their order.
 
 Order. First comes the metadata record `mcaprl.dataset`. Of an episode, `/rl/step` is written last:
 a finished episode is one whose record `final` is in the file, and then all else of it is there too.

@@ -1,7 +1,7 @@
 """Adds topics to a copy of a log: what policies think of its steps, or what there was to see.
 
-The copy begins with the log, byte for byte up to its end; what is added stands behind it, under the
-log_times of the steps it belongs to, and a new layout shows it.
+The copy has all messages of the log; new ones are written after them, with the log_times of their
+steps, and a new layout shows them.
 """
 
 from __future__ import annotations

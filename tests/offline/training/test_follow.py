@@ -65,6 +65,29 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     np.testing.assert_array_equal(logs.dataset.next_observations, whole.next_observations)
 
 
+def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
+    """At its end, a recorder replaces its log by a file of another size, with all its episodes."""
+    path = tmp_path / "log.mcap"
+    recorder = Recorder(path)
+    recorder.record(6)
+    logs = GrowingLogs([path])
+    before = path.stat().st_ino
+    recorder.record(3)
+    recorder.env.close()
+    assert path.stat().st_ino != before
+    assert logs.grow()
+    assert not logs.grow()
+    whole = mcaprl.open(path)
+    assert len(whole.episodes) == 9
+    np.testing.assert_array_equal(logs.dataset.observations, whole.observations)
+    # A file that is replaced is noticed even if its size is the same.
+    copy = path.with_name("copy")
+    copy.write_bytes(path.read_bytes())
+    logs._counts[path] = 8
+    copy.replace(path)
+    assert logs.grow()
+
+
 def test_files_may_join_later(tmp_path: Path) -> None:
     first = Recorder(tmp_path / "b.mcap")
     first.record(1)

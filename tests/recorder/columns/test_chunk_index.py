@@ -94,6 +94,7 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
+    changes: dict[str, Any]
     for value in (2 * len(data), 2**63, 2**64 - 1):
         fields: dict[str, Any] = {field: value}
         chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **fields)]

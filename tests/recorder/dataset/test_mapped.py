@@ -16,6 +16,9 @@ from mcaprl.recorder.dataset.mapped import MappedImages
 from tests.recorder.dataset.test_selection import damage
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of, record
 
+# Each episode has its own chunks, of which single ones are damaged here.
+pytestmark = pytest.mark.usefixtures("small_chunks")
+
 LENGTHS = [120, 1, 33, 210]
 
 

@@ -16,6 +16,9 @@ from mcaprl.recorder.columns.reader import McapReader
 from tests.support.foreign_logs import plain_messages, steps_of, write_with_mcap
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, record
 
+# Each episode has its own chunks, of which single ones are damaged here.
+pytestmark = pytest.mark.usefixtures("small_chunks")
+
 LENGTHS = [5, 1, 120, 30, 7]
 
 
