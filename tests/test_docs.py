@@ -1,4 +1,4 @@
-"""The docs do what they say: code runs, commands exist, the reference is fresh."""
+"""The docs are correct: code runs, commands exist, generated pages are up to date."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_readme_code_runs(
     assert "Dataset(CartPole-v1: 10 episodes" in capsys.readouterr().out
 
 
-def test_code_about_the_sims_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sims_page_code_runs(capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("numba")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sims.md").read_text(), re.DOTALL)
     for block in blocks:

@@ -17,7 +17,7 @@ def subclasses(of: type[errors.McaprlError]) -> list[type[errors.McaprlError]]:
 
 
 @pytest.mark.parametrize("kind", subclasses(errors.McaprlError))
-def test_every_error_crosses_processes(kind: type[errors.McaprlError]) -> None:
+def test_every_error_can_be_pickled(kind: type[errors.McaprlError]) -> None:
     if kind is errors.UnknownNameError:
         error: errors.McaprlError = errors.UnknownNameError("sim", "lan", ["lane"], ["land"])
     else:
@@ -27,7 +27,7 @@ def test_every_error_crosses_processes(kind: type[errors.McaprlError]) -> None:
     assert kind.exit_code in (1, 2)
 
 
-def test_every_error_is_in_the_picture() -> None:
+def test_every_error_is_in_the_diagram() -> None:
     assert errors.__doc__ is not None
     for kind in subclasses(errors.McaprlError):
         assert kind.__name__ in errors.__doc__
@@ -40,7 +40,7 @@ def test_nearest_names_come_first() -> None:
     assert str(none) == "unknown policy 'zzz': known: pilot, random"
 
 
-def test_missing_extra_has_the_line_that_mends_it() -> None:
+def test_a_missing_extra_names_the_install_command() -> None:
     with pytest.raises(errors.MissingExtraError) as told:
         errors.import_extra("no_such_module.inner", "sims")
     assert str(told.value) == "no_such_module is not installed: pip install 'mcaprl[sims]'"

@@ -1,4 +1,4 @@
-"""The folders, the links and the table of packages say the same; importing stays light."""
+"""Folders, links and the table of packages agree; importing mcaprl stays light."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_importing_loads_no_engine() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_all_is_what_can_be_used() -> None:
+def test_public_names_can_be_imported() -> None:
     for name in mcaprl.__all__:
         assert getattr(mcaprl, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
@@ -92,7 +92,7 @@ def test_public_names_are_documented(name: str) -> None:
 
 
 def test_layers_are_kept_by_the_imports_themselves() -> None:
-    """What import-linter checks over the whole graph, on the two rules that matter most."""
+    """Check two of import-linter's rules without import-linter."""
     for path in (ROOT / "recorder").rglob("*.py"):
         assert not _imports(path) & {"torch", "mcaprl.sims", "mcaprl.offline", "numba"}, path
     for path in (ROOT / "sims").rglob("*.py"):
@@ -126,7 +126,7 @@ def test_the_project_pins_what_it_was_tested_with() -> None:
         wanted += SETTINGS["project"]["optional-dependencies"][extra]
     for requirement in wanted:
         name = re.split(r"[<>=\[]", requirement)[0].lower()
-        # An extra may take another of ours along.
+        # An extra may include another of our extras.
         assert name in {*pinned, "mcaprl"}, f"{name} is not in constraints.txt"
 
 

@@ -27,7 +27,7 @@ from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-# What the page measures of itself, put where the browser's dump of the document shows it.
+# The page's measurements, written where the browser's document dump shows them.
 PROBE = """<script>
 window.addEventListener("load", () => {
   const style = getComputedStyle(document.body);
@@ -39,7 +39,7 @@ window.addEventListener("load", () => {
 
 
 def browse(page: Path, *flags: str) -> tuple[str, str]:
-    """The document as a browser has it after loading, and what the browser's console said."""
+    """Return the document after loading in a browser, and the browser's console output."""
     need(BROWSER is not None, "Chromium is not installed (Debian: apt-get install chromium)")
     done = subprocess.run(
         [
@@ -64,7 +64,7 @@ def browse(page: Path, *flags: str) -> tuple[str, str]:
 
 @pytest.fixture(scope="module")
 def lane_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a short lane log."""
+    """Write the report of a short lane log."""
     folder = tmp_path_factory.mktemp("page")
     recorder = RecordMcap(make_sim("lane"), folder / "lane.mcap")
     for seed in range(4):
@@ -79,7 +79,7 @@ def lane_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return page
 
 
-def test_a_browser_has_nothing_to_complain_of(lane_page: Path) -> None:
+def test_a_browser_reports_no_error(lane_page: Path) -> None:
     document, console = browse(lane_page)
     assert console == ""
     assert "Where the steps were" in document
@@ -88,10 +88,10 @@ def test_a_browser_has_nothing_to_complain_of(lane_page: Path) -> None:
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (390, True)])
-def test_it_fits_a_phone_and_the_reader_s_colors(lane_page: Path, width: int, dark: bool) -> None:
+def test_the_page_fits_phones_and_color_schemes(lane_page: Path, width: int, dark: bool) -> None:
     probed = lane_page.with_name(f"probed-{width}-{dark}.html")
     probed.write_text(lane_page.read_text() + PROBE)
-    # Chromium's windows are 500 wide or more; a narrower one is a frame in it.
+    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
     outer = lane_page.with_name(f"outer-{width}-{dark}.html")
     outer.write_text(
         f'<iframe id="f" src="{probed.name}" width="{width}" height="900"></iframe><script>'
@@ -110,7 +110,7 @@ def test_it_fits_a_phone_and_the_reader_s_colors(lane_page: Path, width: int, da
     assert svg_ink == ink, "what is drawn has the color of what is written"
 
 
-def test_the_command_names_the_file_that_an_episode_is_in(tmp_path: Path) -> None:
+def test_the_replay_command_names_the_episodes_file(tmp_path: Path) -> None:
     for name, count in (("a", 2), ("b", 1)):
         recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / f"{name}.mcap")
         for seed in range(count):
@@ -123,13 +123,13 @@ def test_the_command_names_the_file_that_an_episode_is_in(tmp_path: Path) -> Non
     page = (tmp_path / "all.html").read_text()
     found = re.findall(r"mcaprl replay \S+/(\w)\.mcap --episode (\d)", page)
     assert sorted(found) == [("a", "0"), ("a", "1"), ("b", "0")]
-    # Of a part of the log the files no longer tell the numbers.
+    # The episode numbers of a filtered dataset are unknown.
     some = data.filter(lambda episode: episode.index > 0)
     dataset_page(tmp_path / "some.html", some, "", [], [])
     assert "mcaprl replay" not in (tmp_path / "some.html").read_text()
 
 
-def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> None:
+def test_an_evaluation_shows_the_learning_curves(tmp_path: Path) -> None:
     for seed in range(2):
         (tmp_path / f"online/seed-{seed}").mkdir(parents=True)
         points = [
@@ -160,7 +160,7 @@ def test_an_evaluation_shows_how_its_policies_were_learnt(tmp_path: Path) -> Non
     assert document.count("<svg") == 1 + 1 + 2 + 3, "comparison, ways, thumbnails, curves"
 
 
-def test_text_is_text_and_no_markup(tmp_path: Path) -> None:
+def test_text_is_escaped(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>"
     figure, axes = new_figure((2, 1))
     axes.set_title(evil)
@@ -175,12 +175,12 @@ def test_text_is_text_and_no_markup(tmp_path: Path) -> None:
     assert "<script" not in (tmp_path / "evil.html").read_text()
 
 
-def test_columns_of_numbers_go_to_the_right() -> None:
+def test_numbers_are_right_aligned() -> None:
     rows = [["lane", "1.5", "3", ""], ["12", "-2 to 3.25", "x", "4.5 s"]]
     assert Table(["a", "b", "c", "d"], rows).kinds == ["text", "number", "text", "number"]
 
 
-def test_the_same_figure_gives_the_same_bytes() -> None:
+def test_equal_figures_are_equal_bytes() -> None:
     drawn = []
     for _ in range(2):
         figure, axes = new_figure((2, 1))
@@ -189,7 +189,7 @@ def test_the_same_figure_gives_the_same_bytes() -> None:
     assert drawn[0] == drawn[1]
 
 
-def test_tracks_are_the_places_that_telemetry_told(tmp_path: Path) -> None:
+def test_tracks_are_the_positions_in_telemetry(tmp_path: Path) -> None:
     recorder = RecordMcap(make_sim("lane"), tmp_path / "lane.mcap")
     told = []
     for seed in range(2):

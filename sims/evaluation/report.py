@@ -193,29 +193,15 @@ def _score_table(scores: Sequence[PolicyScore]) -> Table:
         )
         for score in scores
     ]
-    names = (
-        "policy",
-        "mean return",
-        "95 % interval",
-        "interquartile mean",
-        "median",
-        "score",
-        "success",
-        "ends",
-    )
+    names = ("policy", "mean return", "95 % interval", "IQM", "median", "score", "success", "ends")
     return Table(names, rows)
 
 
 def _improvement_table(compared: Sequence[Improvement]) -> Table:
-    rows = [
-        (
-            one.better,
-            one.than,
-            f"{one.probability:.2f}",
-            f"{one.interval[0]:.2f} to {one.interval[1]:.2f}",
-        )
-        for one in compared
-    ]
+    rows = []
+    for one in compared:
+        interval = f"{one.interval[0]:.2f} to {one.interval[1]:.2f}"
+        rows.append((one.better, one.than, f"{one.probability:.2f}", interval))
     return Table(("policy", "than", "probability", "95 % interval"), rows)
 
 

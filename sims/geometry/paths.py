@@ -224,3 +224,8 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
 def in_body_frame(dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
     """Transform a map vector into a body's frame: (forward, left), meters."""
     return dx_m * cos_yaw + dy_m * sin_yaw, dy_m * cos_yaw - dx_m * sin_yaw
+
+
+def scattered(index: int, low: float, high: float) -> float:
+    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
+    return low + (high - low) * (index * 0.6180339887498949 % 1.0)

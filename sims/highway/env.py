@@ -5,31 +5,30 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+from typing import Any, ClassVar, Final
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from highway_env.envs.lane_keeping_env import LaneKeepingEnv
 from highway_env.envs.racetrack_env import RacetrackEnv, RacetrackEnvOval
 from numpy.typing import NDArray
 
+from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.highway import scene as highway_scene
 from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
 from mcaprl.sims.highway.scene import Car
 from mcaprl.sims.highway.start import drawn_pose, pose_from_options
 from mcaprl.sims.vehicle.arguments import Pose, check_action, check_name
-
-if TYPE_CHECKING:
-    from mcaprl.sims.highway.view import HighwayView
+from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode
 
 Floats = NDArray[np.float64]
 
 RULES = ("default",)
 OBSERVATIONS = ("state",)
 STARTS = ("anywhere", "line")
-RENDER_MODES = ("human", "rgb_array")
+VIEW_M = 80.0
+"""Width of the ground in the rendered image."""
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}
 ROADS: Final[dict[str, type]] = {
     "lane-keeping-v0": LaneKeepingEnv,
@@ -59,7 +58,7 @@ TRAIL_LENGTH = 40
 _NO_OBSERVATION = {"type": "AttributesObservation", "attributes": []}
 
 
-class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
+class HighwayLaneEnv(RenderedEnv[FollowView]):
     """Lane keeping on a road of highway-env.
 
     ## Description
@@ -153,7 +152,7 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         rules: str = "default",
         observation: str = "state",
         start: str = "anywhere",
-        render_mode: Literal["human", "rgb_array"] | None = None,
+        render_mode: RenderMode | None = None,
     ) -> None:
         """Make the environment; see "Arguments" of the class.
 
@@ -164,8 +163,7 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         check_name("rules", rules, RULES)
         check_name("observation", observation, OBSERVATIONS)
         check_name("start", start, STARTS)
-        check_name("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
-        self.render_mode = self._render_mode = render_mode
+        super().__init__(render_mode)
         self._inner: Any = ROADS[road](config={"observation": _NO_OBSERVATION})
         frequency_hz = self._inner.config["policy_frequency"]
         self.step_duration_s = 1.0 / frequency_hz
@@ -181,7 +179,6 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         self._last_action = 0
         self._reward = 0.0
         self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
-        self._view: HighwayView | None = None
         self._locate()
 
     @property
@@ -344,23 +341,15 @@ class HighwayLaneEnv(gym.Env[NDArray[np.float32], Any]):
         """Return the car's frame in the map."""
         return (highway_scene.car_frame(self._car),)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
-        if self._render_mode is None:
-            return None
-        if self._view is None:
-            from mcaprl.sims.highway.view import HighwayView
+    def _open_view(self, render_mode: RenderMode) -> FollowView:
+        frames_per_s = self.metadata["render_fps"]
+        return FollowView(render_mode, "highway-lane", self.static_scene(), VIEW_M, frames_per_s)
 
-            static = self.static_scene()
-            self._view = HighwayView(self._render_mode, static, self.metadata["render_fps"])
-        image = self._view.draw(self._car, self.scene(), self._place.offset_m, self._reward)
-        return image if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+    def _draw(self, view: FollowView) -> NDArray[np.uint8]:
+        car, offset_m = self._car, self._place.offset_m
+        text = f"{car.speed_m_s:4.1f} m/s   offset {offset_m:+.2f} m   reward {self._reward:+.2f}"
+        view.draw(self.scene(), Body("car", car.x_m, car.y_m, car.yaw_rad), text)
+        return view.show()
 
 
 def _car_of(vehicle: Any) -> Car:

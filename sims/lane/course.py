@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.geometry.paths import closed_path
+from mcaprl.sims.geometry.paths import closed_path, scattered
 
 CORNERS_M = (
     (0.0, 1.0),
@@ -114,11 +114,6 @@ def rails() -> list[Box]:
     return boxes
 
 
-def _spread(index: int, low: float, high: float) -> float:
-    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
-    return low + (high - low) * (index * 0.6180339887498949 % 1.0)
-
-
 def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
     apart_x = np.minimum(bounds[:, 2] - box.x_m, box.x_m - bounds[:, 0]) <= -box.length_m / 2
     apart_y = np.minimum(bounds[:, 3] - box.y_m, box.y_m - bounds[:, 1]) <= -box.width_m / 2
@@ -136,11 +131,11 @@ def _house(
         forward: (2,) unit vector along the street.
         left: (2,) unit vector from the street to the house.
     """
-    front_m, deep_m = _spread(index, 8.0, 18.0), _spread(3 * index, 8.0, 15.0)
-    garden_m = _spread(5 * index, 7.5, 11.5)
+    front_m, deep_m = scattered(index, 8.0, 18.0), scattered(3 * index, 8.0, 15.0)
+    garden_m = scattered(5 * index, 7.5, 11.5)
     middle = at + forward * (front_m / 2) + left * (garden_m + deep_m / 2)
     size = np.abs(forward) * front_m + np.abs(left) * deep_m
-    height_m = _spread(7 * index, 4.0, 12.0) + _spread(11 * index, 0.0, 3.0) ** 3
+    height_m = scattered(7 * index, 4.0, 12.0) + scattered(11 * index, 0.0, 3.0) ** 3
     return Box(float(middle[0]), float(middle[1]), float(size[0]), float(size[1]), height_m)
 
 
@@ -170,5 +165,5 @@ def buildings() -> tuple[Box, ...]:
                 middle = np.array([box.x_m, box.y_m])
                 taken = np.vstack([taken, [*(middle - half), *(middle + half)]])
             front_m = abs(float(forward @ [box.length_m, box.width_m]))
-            along_m += front_m + _spread(13 * index, 2.0, 6.0)
+            along_m += front_m + scattered(13 * index, 2.0, 6.0)
     return tuple(boxes)

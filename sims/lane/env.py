@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.lane import scene as lane_scene
 from mcaprl.sims.lane.fleet import LaneFleet
@@ -15,13 +16,12 @@ from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import RENDER_MODES, RenderMode, VehicleEnv
 
-if TYPE_CHECKING:
-    from mcaprl.sims.lane.view import LaneView
-
+VIEW_M = 55.0
+"""Width of the ground in the rendered image."""
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / DECISION_S)}
 
 
-class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
+class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     """Lane keeping on the streets of a town.
 
     ## Description
@@ -205,13 +205,18 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, "LaneView"]):
         """Return the car's frame in the map."""
         return (lane_scene.car_frame(self.car),)
 
-    def _open_view(self, render_mode: RenderMode) -> LaneView:
-        from mcaprl.sims.lane.view import LaneView
+    def _open_view(self, render_mode: RenderMode) -> FollowView:
+        frames_per_s = self.metadata["render_fps"]
+        return FollowView(render_mode, "lane", self.static_scene(), VIEW_M, frames_per_s)
 
-        return LaneView(render_mode)
-
-    def _draw(self, view: LaneView) -> NDArray[np.uint8]:
-        return view.draw(self.car, self.scene(), self.fleet.rewards.item())
+    def _draw(self, view: FollowView) -> NDArray[np.uint8]:
+        car, reward = self.car, self.fleet.rewards.item()
+        text = (
+            f"{car.speed_m_s:4.1f} m/s   offset {car.offset_m:+.2f} m   "
+            f"at {car.along_m:.0f} m   reward {reward:+.2f}"
+        )
+        view.draw(self.scene(), Body("car", car.x_m, car.y_m, car.yaw_rad), text)
+        return view.show()
 
 
 class BatchedLaneKeepingEnv(BatchedEnv):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import in_body_frame, point_at
-from mcaprl.sims.geometry.ray_code import log_code
+from mcaprl.sims.geometry.ray_code import log_code, ray_name
 from mcaprl.sims.lane.course import COURSE
 from mcaprl.sims.lane.obstacles import ray_length
 from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
@@ -21,16 +21,8 @@ RAYS = len(RAYS_DEG)
 WAY_M = 20.0
 """Distance of the observed path point, which shows the street to take at a crossing."""
 WAY_LIMIT = 4.0
-
-
-def _ray_name(angle_deg: int) -> str:
-    if angle_deg in (0, 180):
-        return "behind" if angle_deg else "ahead"
-    return f"{'left' if angle_deg > 0 else 'right'}_{abs(angle_deg)}"
-
-
 RAY_OBSERVATION_NAMES = (
-    *(_ray_name(angle) for angle in RAYS_DEG),
+    *(ray_name(angle) for angle in RAYS_DEG),
     "speed",
     "steering",
     "way_20m_forward",

@@ -67,14 +67,7 @@ OBSERVATION_NAMES = (
     "heading_error",
     "speed",
     "steering",
-    "ahead_5m_forward",
-    "ahead_5m_left",
-    "ahead_10m_forward",
-    "ahead_10m_left",
-    "ahead_20m_forward",
-    "ahead_20m_left",
-    "ahead_40m_forward",
-    "ahead_40m_left",
+    *(f"ahead_{ahead:.0f}m_{axis}" for ahead in LOOKAHEADS_M for axis in ("forward", "left")),
 )
 OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
 # A tuple is a compile-time constant.

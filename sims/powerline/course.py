@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
+from mcaprl.sims.geometry.paths import scattered
 from mcaprl.sims.geometry.vectors import Vector, cross, minus, norm
 
 Floats = NDArray[np.float64]
@@ -281,11 +282,6 @@ WIRES_M: Floats = _wires()
 BEAMS_M: Floats = _beams()
 
 
-def _spread(index: int, low: float, high: float) -> float:
-    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
-    return low + (high - low) * (index * 0.6180339887498949 % 1.0)
-
-
 def trees() -> tuple[Tree, ...]:
     """Return the firs: small ones in the strip under the line, tall ones on both sides of it."""
     found = []
@@ -293,8 +289,8 @@ def trees() -> tuple[Tree, ...]:
         along_m = (index + 0.5) / TREE_COUNT * LENGTH_M
         side = 1.0 if index % 2 else -1.0
         small = index % 3 == 0
-        beside_m = side * (_spread(index, 2.0, 12.0) if small else _spread(7 * index, 14.0, 80.0))
-        height_m = _spread(5 * index, 1.0, 2.5) if small else _spread(5 * index, 6.0, 13.0)
+        away_m = scattered(index, 2.0, 12.0) if small else scattered(7 * index, 14.0, 80.0)
+        height_m = scattered(5 * index, 1.0, 2.5) if small else scattered(5 * index, 6.0, 13.0)
         x_m, y_m, _ = point_on_line(along_m)
-        found.append(Tree(x_m, y_m + beside_m, height_m))
+        found.append(Tree(x_m, y_m + side * away_m, height_m))
     return tuple(found)

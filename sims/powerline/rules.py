@@ -66,22 +66,9 @@ REASONS = ("", "off_line", "collision", "finished")
 
 GUST_TIME_S = 2.0
 
+_OBSERVED_VECTORS = ("offset", "velocity", "command_error", "tangent", "next_tangent")
 OBSERVATION_NAMES = (
-    "offset_x",
-    "offset_y",
-    "offset_z",
-    "velocity_x",
-    "velocity_y",
-    "velocity_z",
-    "command_error_x",
-    "command_error_y",
-    "command_error_z",
-    "tangent_x",
-    "tangent_y",
-    "tangent_z",
-    "next_tangent_x",
-    "next_tangent_y",
-    "next_tangent_z",
+    *(f"{name}_{axis}" for name in _OBSERVED_VECTORS for axis in "xyz"),
     "to_corner",
     "corner_nearness",
     "lost_progress",

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, path
+from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, no_points, path
 from mcaprl.sims.drawing.shapes import label
 from mcaprl.sims.geometry.vectors import Vector, norm
 from mcaprl.sims.powerline import camera, course
@@ -130,40 +130,31 @@ def _drone() -> list[Shape]:
     arm_m = DRONE_SCALE * ROTOR_OFFSET_M
     turns = ((1, 1), (-1, -1), (1, -1), (-1, 1))
     names = ("front_left", "rear_right", "front_right", "rear_left")
-    long = (2 * math.sqrt(2) * arm_m, 0.12, 0.08)
-    shapes = [
-        Shape("drone_body", "box", BODY, size=(0.9, 0.55, 0.3), frame="drone"),
-        Shape(
-            "drone_nose",
-            "box",
-            PAINT,
-            size=(0.3, 0.4, 0.2),
-            position=(0.5, 0.0, 0.05),
-            frame="drone",
-        ),
-        Shape("drone_arms_a", "box", BODY, size=long, yaw_rad=math.pi / 4, frame="drone"),
-        Shape("drone_arms_b", "box", BODY, size=long, yaw_rad=-math.pi / 4, frame="drone"),
-        Shape(
-            "drone_camera",
-            "sphere",
-            BODY,
-            size=(0.3, 0.3, 0.3),
-            position=(0.3, 0.0, -0.25),
-            frame="drone",
+    arm = functools.partial(
+        _part, kind="box", color=BODY, size=(2 * math.sqrt(2) * arm_m, 0.12, 0.08)
+    )
+    return [
+        _part("body", "box", BODY, (0.9, 0.55, 0.3)),
+        _part("nose", "box", PAINT, (0.3, 0.4, 0.2), (0.5, 0.0, 0.05)),
+        arm("arms_a", yaw_rad=math.pi / 4),
+        arm("arms_b", yaw_rad=-math.pi / 4),
+        _part("camera", "sphere", BODY, (0.3, 0.3, 0.3), (0.3, 0.0, -0.25)),
+        *(
+            _part(f"rotor_{name}", "cylinder", DISC, (1.2, 1.2, 0.04), (x * arm_m, y * arm_m, 0.16))
+            for name, (x, y) in zip(names, turns, strict=True)
         ),
     ]
-    for name, (forward, left) in zip(names, turns, strict=True):
-        shapes.append(
-            Shape(
-                name=f"drone_rotor_{name}",
-                kind="cylinder",
-                color=DISC,
-                size=(1.2, 1.2, 0.04),
-                position=(forward * arm_m, left * arm_m, 0.16),
-                frame="drone",
-            )
-        )
-    return shapes
+
+
+def _part(
+    name: str,
+    kind: Kind,
+    color: Color,
+    size: tuple[float, float, float],
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    yaw_rad: float = 0.0,
+) -> Shape:
+    return Shape(f"drone_{name}", kind, color, no_points(), size, position, yaw_rad, "drone")
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import heading_of
-from mcaprl.sims.geometry.ray_code import FAR_M
+from mcaprl.sims.geometry.ray_code import FAR_M, ray_name
 from mcaprl.sims.racer.car import Car, corner_at
 from mcaprl.sims.racer.course import METERS_PER_PX
 
@@ -24,20 +24,7 @@ _SIN: NDArray[np.float64] = np.sin(CENTER_RAYS_RAD)
 CENTER_RAYS = len(CENTER_RAYS_DEG)
 RAYS = CENTER_RAYS + 4
 RAY_NAMES = (
-    "ahead",
-    "left_30",
-    "right_30",
-    "right_45",
-    "left_45",
-    "right_90",
-    "left_90",
-    "behind",
-    "right_10",
-    "left_10",
-    "right_135",
-    "left_135",
-    "right_20",
-    "left_20",
+    *(ray_name(angle if angle == 180 else -angle) for angle in CENTER_RAYS_DEG),
     "left_corner_sideways",
     "right_corner_sideways",
     "left_corner_ahead",

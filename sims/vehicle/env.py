@@ -30,7 +30,44 @@ AnyFleet = TypeVar("AnyFleet", bound=Fleet)
 AnyView = TypeVar("AnyView", bound=View)
 
 
-class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
+class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
+    """Environment that opens its renderer when it is first needed."""
+
+    def __init__(self, render_mode: RenderMode | None) -> None:
+        """Choose a render mode.
+
+        Raises:
+            UnknownNameError: There is no such render mode.
+        """
+        check_name("render_mode", render_mode, (None, *RENDER_MODES))
+        self.render_mode = self._render_mode = render_mode
+        self._view: AnyView | None = None
+
+    @abstractmethod
+    def _open_view(self, render_mode: RenderMode) -> AnyView:
+        """Make the renderer of the sim; pygame is first imported here."""
+
+    @abstractmethod
+    def _draw(self, view: AnyView) -> NDArray[np.uint8]:
+        """Render the vehicle in its current state as an (H, W, 3) image."""
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
+        if self._render_mode is None:
+            return None
+        if self._view is None:
+            self._view = self._open_view(self._render_mode)
+        image = self._draw(self._view)
+        return image if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+
+class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
     """Environment of one vehicle: seeding, steps, ends and rendering, the same in all sims."""
 
     trail_length: int = 40
@@ -43,9 +80,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         Raises:
             UnknownNameError: There is no such render mode.
         """
-        check_name("render_mode", render_mode, (None, *RENDER_MODES))
+        super().__init__(render_mode)
         self.fleet = fleet
-        self.render_mode = self._render_mode = render_mode
         self.step_duration_s = fleet.step_duration_s
         self.action_meanings = fleet.action_meanings
         self.observation_names = fleet.observation_names
@@ -57,7 +93,6 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        self._view: AnyView | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -112,31 +147,8 @@ class VehicleEnv(gym.Env[Any, Any], Generic[AnyFleet, AnyView]):
             self._trail.append(self.place)
         return list(self._trail)
 
-    @abstractmethod
-    def _open_view(self, render_mode: RenderMode) -> AnyView:
-        """Make the renderer of the sim; only this method imports pygame."""
-
-    @abstractmethod
-    def _draw(self, view: AnyView) -> NDArray[np.uint8]:
-        """Render the vehicle in its current state as an (H, W, 3) image."""
-
     def _watch(self) -> None:
         """Append the vehicle's position to the trail, and show it in mode `human`."""
         self._trail.append(self.place)
         if self.render_mode == "human":
             self.render()
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
-        if self._render_mode is None:
-            return None
-        if self._view is None:
-            self._view = self._open_view(self._render_mode)
-        image = self._draw(self._view)
-        return image if self.render_mode == "rgb_array" else None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._view is not None:
-            self._view.close()
-            self._view = None

@@ -1,4 +1,4 @@
-"""The commands as a user types them: what they print, what they write, how they exit."""
+"""The commands: what they print, what they write, and their exit codes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def fails(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) -> str:
-    """Run a command that must fail with one line on stderr; returns that line."""
+    """Run a command that fails with one line on stderr, and return the line."""
     assert run(arguments) == code
     out, err = capsys.readouterr()
     assert err.count("\n") == 1, f"not one line: {err!r}"
@@ -102,7 +102,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
             "effective_sample_size",
             "verdict",
         }
-        # Four episodes are too few to say anything.
+        # Four episodes are too few for a verdict.
         assert estimate["verdict"].startswith("refused: ")
     random = {e["estimator"]: e for e in result["estimates"] if e["policy"] == "random"}
     assert random["PDIS"]["value"] == pytest.approx(result["behavior_return"]), "random acted"
@@ -115,7 +115,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert "pilot has no network to ask about a log" in line
 
 
-def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
+def test_counts_of_one_are_singular(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["record", "CartPole-v1", "--policy=random", "--steps=1", "--out=one.mcap"]) == 0
     assert "one.mcap: 1 episode, 1 step, mean return 1.00" in capsys.readouterr().out
     assert run(["recover", "one.mcap", "two.mcap"]) == 0
@@ -152,7 +152,7 @@ def test_appended_and_rotated_recordings_are_the_same(capsys: pytest.CaptureFixt
     assert "leave out one" in capsys.readouterr().err
 
 
-def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_shards_contain_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
     common = ["record", "CartPole-v1", "--policy", "random", "--episodes", "5", "--seed", "2"]
     assert run([*common, "--out", "one.mcap"]) == 0
     assert run([*common, "--out", "shards", "--envs", "2"]) == 0
@@ -166,7 +166,7 @@ def test_shards_hold_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> No
     assert len(mcaprl.open("shards").episodes) == 5
 
 
-def test_shards_touch_nothing_when_the_request_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_arguments_leave_existing_shards(capsys: pytest.CaptureFixture[str]) -> None:
     common = ["--policy", "random", "--episodes", "2", "--envs", "2", "--overwrite", "--out", "d"]
     Path("d").mkdir()
     Path("d/shard-00.mcap").write_text("old")
@@ -179,7 +179,9 @@ def test_shards_touch_nothing_when_the_request_is_wrong(capsys: pytest.CaptureFi
     assert "precious.mcap" in fails_after(capsys, 2, "record", "CartPole-v1", *common)
 
 
-def test_names_are_no_markup(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_are_not_interpreted_as_markup(
+    cartpole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     cartpole.rename("run[red].mcap")
     capsys.readouterr()
     assert run(["info", "run[red].mcap"]) == 0
@@ -192,12 +194,12 @@ def fails_after(capsys: pytest.CaptureFixture[str], code: int, *arguments: str) 
 
 
 def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
-    """The main job at a small size: record, train, evaluate, record the trained one."""
+    """The main workflow at a small size: record, train, evaluate, record the trained policy."""
     common = ["record", "lane", "--no-scene", "--out"]
     assert run([*common, "data/a.mcap", "--epsilon", "0.1", "--steps", "400"]) == 0
     assert run([*common, "data/b.mcap", "--policy", "random", "--steps", "100"]) == 0
     small = ["--updates", "60", "--batch-size", "32", "--hidden", "16,16", "--alpha", "0.5"]
-    # Enough copies of the target for the horizon of gamma, or it warns.
+    # Enough target syncs for the horizon of gamma, otherwise there is a warning.
     small += ["--gamma", "0.5", "--target-interval", "6", "--dueling"]
     assert run(["train-offline", "data", "--out", "run", "--seeds", "2", *small]) == 0
     assert json.loads(Path("run/config.json").read_text())["env_id"] == "mcaprl/LaneKeeping-v0"
@@ -239,7 +241,7 @@ def test_learn_evaluate_replay(capsys: pytest.CaptureFixture[str]) -> None:
     assert policy.act(recorded.observations[:7]).shape == (7,)
 
 
-def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
+def test_resume_continues_training(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["record", "lane", "--steps", "200", "--no-scene", "--out", "d.mcap"]) == 0
     train = [
         "train-offline",
@@ -266,7 +268,7 @@ def test_resume_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert "not a JSON object" in fails_after(capsys, 1, *train, "--resume")
 
 
-def test_check_goes_on_behind_a_missing_file(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_continues_after_a_missing_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", "missing.mcap", str(LANE_LOG)]) == 1
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
@@ -274,7 +276,7 @@ def test_check_goes_on_behind_a_missing_file(capsys: pytest.CaptureFixture[str])
     assert [problem["file"] for problem in result["problems"]] == ["missing.mcap"]
 
 
-def test_logs_are_not_overwritten_by_what_is_no_log(
+def test_logs_are_not_overwritten_by_other_outputs(
     cartpole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = cartpole.read_bytes()
@@ -289,7 +291,7 @@ def test_logs_are_not_overwritten_by_what_is_no_log(
     assert "is of CartPole-v1, not of mcaprl/LaneKeeping-v0" in line
 
 
-def test_policies_of_one_name_keep_their_paths(capsys: pytest.CaptureFixture[str]) -> None:
+def test_policies_with_equal_names_are_shown_with_paths(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
         run(["record", "CartPole-v1", "--policy", "random", "--steps", "60", "--out", "d.mcap"])
         == 0
@@ -398,7 +400,7 @@ def test_missing_extra(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
     assert "numba is not installed: pip install 'mcaprl[sims]'" in line
 
 
-def test_check_tells_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> None:
     broken = bytearray(LANE_LOG.read_bytes())
     broken[len(broken) // 2] ^= 1
     Path("broken.mcap").write_bytes(broken)
@@ -410,7 +412,7 @@ def test_check_tells_what_where_and_next(capsys: pytest.CaptureFixture[str]) -> 
     assert "broken.mcap" in capsys.readouterr().out
 
 
-def test_golden_log_reads_as_ever(capsys: pytest.CaptureFixture[str]) -> None:
+def test_golden_log_is_read_by_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
     data = mcaprl.open(LANE_LOG)
     assert (len(data), len(data.episodes)) == (60, 2)
     assert data.fingerprint == (LANE_LOG.with_suffix(".sha256").read_text().strip())
@@ -423,7 +425,7 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
         [*command, "--out", "stopped.mcap"],
         stderr=subprocess.PIPE,
         text=True,
-        # A test run in the background may ignore SIGINT, and its children would, too.
+        # If the test runs in the background, its children would ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120

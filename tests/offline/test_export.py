@@ -75,7 +75,7 @@ def policy_of(config: TrainingConfig, space: spaces.Space[Any], folder: Path) ->
 
 
 @pytest.mark.parametrize(("config", "space"), CASES)
-def test_the_exported_policy_gives_the_same_scores_and_actions(
+def test_the_exported_policy_returns_the_same_scores_and_actions(
     tmp_path: Path, config: TrainingConfig, space: spaces.Space[Any]
 ) -> None:
     need(onnxruntime is not None, "onnxruntime is not installed")

@@ -62,7 +62,7 @@ def saved_and_loaded(folder: Path, learner: Learner) -> Policy:
     return read_policy(folder)
 
 
-def test_a_loaded_policy_gives_the_values_of_the_network_that_was_saved(tmp_path: Path) -> None:
+def test_a_loaded_policy_has_the_saved_networks_values(tmp_path: Path) -> None:
     learner = learner_of(CQLConfig(**TINY), corridor())
     policy = saved_and_loaded(tmp_path, learner)
     with torch.no_grad():
@@ -71,7 +71,7 @@ def test_a_loaded_policy_gives_the_values_of_the_network_that_was_saved(tmp_path
     np.testing.assert_array_equal(policy.q_values(inner_observations()), expected)
 
 
-def test_a_policy_knows_its_task(tmp_path: Path) -> None:
+def test_a_policy_stores_its_task(tmp_path: Path) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
     assert (policy.algo, policy.env_id) == ("cql", "Corridor-v0")
     assert policy.env_kwargs == {"length": 5}
@@ -79,7 +79,7 @@ def test_a_policy_knows_its_task(tmp_path: Path) -> None:
     assert policy.observation_space == spaces.Box(0, 1, (N_CELLS,), np.float32)
 
 
-def test_actions_are_those_of_the_space_and_greedy(tmp_path: Path) -> None:
+def test_actions_are_greedy_and_in_the_space(tmp_path: Path) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
     actions = policy.act(inner_observations())
     assert actions.dtype == np.int64
@@ -87,13 +87,13 @@ def test_actions_are_those_of_the_space_and_greedy(tmp_path: Path) -> None:
     assert policy.action_probabilities(inner_observations()).tolist() == [[0, 1]] * 3
 
 
-def test_of_equal_values_the_first_is_chosen(tmp_path: Path) -> None:
+def test_ties_are_broken_by_the_first_action(tmp_path: Path) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [2.0, 2.0]))
     assert policy.act(inner_observations()).tolist() == [5, 5, 5]
     assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
 
 
-def test_a_clone_gives_the_probabilities_it_learned_and_no_values(tmp_path: Path) -> None:
+def test_a_cloned_policy_has_probabilities_and_no_values(tmp_path: Path) -> None:
     logits = np.log([0.25, 0.75]).tolist()
     policy = saved_and_loaded(tmp_path, learner_with_outputs(BC, logits))
     assert policy.act(inner_observations()[:1]).tolist() == [6]
@@ -109,7 +109,7 @@ def test_probabilities_of_huge_logits_are_finite(tmp_path: Path) -> None:
     assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
 
 
-def test_filtered_values_leave_out_what_the_log_hardly_shows(tmp_path: Path) -> None:
+def test_bcq_filters_actions_that_are_rare_in_the_log(tmp_path: Path) -> None:
     # The second action is worth more, and a tenth as likely as the first.
     learner = learner_with_outputs(BCQ, [1.0, 2.0], np.log([10.0, 1.0]).tolist())
     policy = saved_and_loaded(tmp_path, learner)
@@ -118,7 +118,7 @@ def test_filtered_values_leave_out_what_the_log_hardly_shows(tmp_path: Path) -> 
     assert policy.action_probabilities(inner_observations()).tolist() == [[1, 0]] * 3
 
 
-def test_iql_acts_by_its_policy_and_knows_values(tmp_path: Path) -> None:
+def test_iql_acts_by_its_policy_and_has_values(tmp_path: Path) -> None:
     learner = learner_with_outputs(IQL, np.log([0.75, 0.25]).tolist(), [1.0, 2.0])
     policy = saved_and_loaded(tmp_path, learner)
     assert policy.act(inner_observations()).tolist() == [5, 5, 5]
@@ -136,7 +136,7 @@ def test_iql_acts_by_its_policy_and_knows_values(tmp_path: Path) -> None:
         DQNConfig(**TINY, layer_norm=True, normalize=True),
     ],
 )
-def test_every_kind_of_network_comes_back(tmp_path: Path, config: TrainingConfig) -> None:
+def test_every_kind_of_network_can_be_loaded(tmp_path: Path, config: TrainingConfig) -> None:
     learner = learner_of(config, corridor())
     policy = saved_and_loaded(tmp_path, learner)
     with torch.no_grad():
@@ -145,7 +145,7 @@ def test_every_kind_of_network_comes_back(tmp_path: Path, config: TrainingConfig
     np.testing.assert_allclose(policy.q_values(inner_observations()), expected, rtol=1e-6)
 
 
-def test_normalised_pictures_come_back(tmp_path: Path) -> None:
+def test_normalized_images_can_be_loaded(tmp_path: Path) -> None:
     pictures = np.random.default_rng(0).integers(90, 110, (9, 36, 36, 1), dtype=np.uint8)
     dataset = Dataset.from_arrays(
         observations=pictures[:-1],
@@ -171,7 +171,7 @@ def test_normalised_pictures_come_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(policy.q_values(stacks), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_an_action_that_is_not_allowed_is_not_taken(tmp_path: Path) -> None:
+def test_masked_actions_are_not_taken(tmp_path: Path) -> None:
     mask = np.array([[1, 1], [1, 0]], np.int8)
     parts = {"action_mask": mask, "x": np.zeros((2, 1), np.float32)}
     dataset = Dataset.from_arrays(
@@ -204,7 +204,7 @@ def walk_policy(folder: Path, count: int) -> Policy:
     return saved_and_loaded(folder, learner_of(DQNConfig(**TINY, frame_stack=count), dataset))
 
 
-def test_a_policy_remembers_the_frames_it_looks_at(tmp_path: Path) -> None:
+def test_a_policy_keeps_the_frames_of_its_stack(tmp_path: Path) -> None:
     policy = walk_policy(tmp_path, 3)
     random = np.random.default_rng(0)
     for _ in range(3):
@@ -217,12 +217,12 @@ def test_a_policy_remembers_the_frames_it_looks_at(tmp_path: Path) -> None:
             assert policy.act(stack).tolist() == expected.tolist()
 
 
-def test_values_of_lone_frames_are_not_made_up(tmp_path: Path) -> None:
+def test_values_of_single_frames_are_refused_by_a_stacking_policy(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match="looks at 3 observations in a row"):
         walk_policy(tmp_path, 3).q_values(np.zeros((4, 1), np.float32))
 
 
-def test_images_are_taken_as_bytes(tmp_path: Path) -> None:
+def test_images_are_accepted_as_bytes(tmp_path: Path) -> None:
     images: NDArray[np.uint8] = np.random.default_rng(0).integers(
         0, 256, (6, 36, 40, 1), dtype=np.uint8
     )
@@ -243,7 +243,7 @@ def test_images_are_taken_as_bytes(tmp_path: Path) -> None:
     )
 
 
-def test_observations_are_only_read(tmp_path: Path) -> None:
+def test_observations_are_not_modified(tmp_path: Path) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
     observations = inner_observations()
     observations.flags.writeable = False
@@ -258,7 +258,7 @@ def test_observations_of_another_shape_are_refused(tmp_path: Path, shape: tuple[
         policy.act(np.zeros(shape, np.float32))
 
 
-def test_a_run_stands_for_its_first_seed(cql_run: Path) -> None:
+def test_a_run_means_its_first_seed(cql_run: Path) -> None:
     both, first = load_policies(cql_run), load_policy(cql_run)
     values = [policy.q_values(inner_observations()) for policy in (*both, first)]
     assert len(both) == 2

@@ -67,14 +67,14 @@ def test_a_rollout_is_shared_by_the_environments() -> None:
         (A2CConfig, "rollout_steps", 4),
     ],
 )
-def test_settings_that_cannot_be_meant_are_refused(
+def test_invalid_settings_are_refused(
     config_type: type[OnlineConfig], name: str, value: Any
 ) -> None:
     with pytest.raises(UsageError, match=f"^{name} must be"):
         config_type(**{name: value})
 
 
-def test_an_unknown_algorithm_is_told_with_those_that_exist() -> None:
+def test_an_unknown_algorithm_lists_the_known_ones() -> None:
     with pytest.raises(UnknownNameError, match="did you mean dqn"):
         find_algorithm("dqm")
 
@@ -102,7 +102,7 @@ def test_other_tasks_have_sb3s_settings(
     assert settings_for(config_type, sim, sim_options) == {}
 
 
-def test_what_the_user_gives_goes_first() -> None:
+def test_the_users_settings_take_precedence() -> None:
     config = Task.for_sim("racer", n_steps=5).config
     assert isinstance(config, DoubleDQNConfig)
     assert (config.n_steps, config.gamma) == (5, 0.98)

@@ -99,7 +99,7 @@ def test_with_gamma_0_only_the_reward_counts() -> None:
     assert step_of(model_of(DoubleDQN, gamma=0.0), rewards=[0.25]) == pytest.approx(0.025)
 
 
-def test_dqn_trusts_the_target_networks_own_choice() -> None:
+def test_dqn_uses_the_target_networks_maximum() -> None:
     # 1 + .5 x max(5, 3) = 3.5 for DQN; with the reward lowered by 3, its error is .5.
     assert step_of(model_of(DQN), rewards=[-2.0]) == pytest.approx(0.05)
     assert step_of(model_of(DoubleDQN), rewards=[-2.0]) == pytest.approx(-0.05)
@@ -109,7 +109,7 @@ def test_gradients_are_clipped() -> None:
     assert step_of(model_of(DoubleDQN, max_grad_norm=0.2)) == pytest.approx(0.02)
 
 
-def test_the_batch_changes_nothing_else() -> None:
+def test_double_dqn_changes_only_the_target() -> None:
     model = model_of(DoubleDQN)
     step_of(model)
     assert model.q_net.rows[1].tolist() == [1.0, 2.0]
@@ -130,7 +130,7 @@ def cartpole(kind: type[DQN], **kwargs: Any) -> Any:
     )
 
 
-def test_where_both_networks_choose_alike_it_is_dqn_bit_for_bit() -> None:
+def test_double_dqn_equals_dqn_if_both_networks_agree() -> None:
     # A target network that is copied after every step is the online one.
     states = []
     for kind in (DQN, DoubleDQN):

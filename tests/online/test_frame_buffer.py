@@ -68,7 +68,7 @@ def check_same(ours: Any, theirs: Any) -> None:
 
 
 @given(steps=st.integers(1, 60), envs=st.integers(1, 3), seed=st.integers(0, 99))
-def test_samples_are_those_of_sb3s_buffer(steps: int, envs: int, seed: int) -> None:
+def test_samples_equal_those_of_sb3s_buffer(steps: int, envs: int, seed: int) -> None:
     ours = FrameReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
     theirs = ReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
     feed([ours, theirs], PICTURE, steps, envs, seed)
@@ -81,7 +81,7 @@ def test_samples_are_those_of_sb3s_buffer(steps: int, envs: int, seed: int) -> N
     n_steps=st.integers(2, 5),
     seed=st.integers(0, 99),
 )
-def test_n_step_samples_are_those_of_sb3s_buffer(
+def test_n_step_samples_equal_those_of_sb3s_buffer(
     steps: int, envs: int, n_steps: int, seed: int
 ) -> None:
     extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
@@ -92,7 +92,7 @@ def test_n_step_samples_are_those_of_sb3s_buffer(
 
 
 @given(steps=st.integers(1, 60), seed=st.integers(0, 99))
-def test_dict_samples_are_those_of_sb3s_buffer(steps: int, seed: int) -> None:
+def test_dict_samples_equal_those_of_sb3s_buffer(steps: int, seed: int) -> None:
     ours = FrameReplayBuffer(40, DICT, ACTIONS, "cpu", 2)
     theirs = DictReplayBuffer(40, DICT, ACTIONS, "cpu", 2)
     feed([ours, theirs], DICT, steps, 2, seed)
@@ -125,7 +125,7 @@ class Stacking:
     count=st.integers(2, 4),
     seed=st.integers(0, 99),
 )
-def test_stacks_are_those_that_sb3s_buffer_would_hold(
+def test_stacks_equal_those_of_sb3s_buffer(
     steps: int, envs: int, n_steps: int, count: int, seed: int
 ) -> None:
     shown = stacked_space(PICTURE, count)
@@ -139,7 +139,7 @@ def test_stacks_are_those_that_sb3s_buffer_would_hold(
 
 @pytest.mark.parametrize("space", [PICTURE, DICT], ids=["picture", "dict"])
 @pytest.mark.parametrize("steps", [7, 50])
-def test_what_is_kept_can_be_restored(space: spaces.Space[Any], steps: int) -> None:
+def test_a_saved_buffer_can_be_restored(space: spaces.Space[Any], steps: int) -> None:
     first = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=3, gamma=0.9)
     feed([first], space, steps, 2, 1)
     second = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=3, gamma=0.9)
@@ -150,7 +150,7 @@ def test_what_is_kept_can_be_restored(space: spaces.Space[Any], steps: int) -> N
     check_same(second, first)
 
 
-def test_frames_that_are_overwritten_are_stood_for_by_the_oldest() -> None:
+def test_overwritten_frames_are_replaced_by_the_oldest() -> None:
     """Four rows; frames count up, and one episode goes on."""
     shown = stacked_space(PICTURE, 3)
     buffer = FrameReplayBuffer(4, shown, ACTIONS, "cpu", 1, frame_stack=3)

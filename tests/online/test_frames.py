@@ -44,7 +44,7 @@ def silent(_: TrainingProgress) -> None:
     """A progress callback that does nothing."""
 
 
-def test_the_newest_frame_is_last_and_the_first_one_stands_for_what_was() -> None:
+def test_stacks_end_with_the_newest_frame_and_repeat_the_first() -> None:
     memory = FrameMemory(spaces.Box(0, 9, (2,)), 3)
     assert memory.begin(np.array([[1, 2], [5, 6]])).tolist() == [
         [1, 2, 1, 2, 1, 2],
@@ -62,7 +62,7 @@ def test_the_newest_frame_is_last_and_the_first_one_stands_for_what_was() -> Non
 @pytest.mark.parametrize(
     ("shape", "stacked"), [((84, 84, 1), (84, 84, 3)), ((1, 84, 84), (3, 84, 84))]
 )
-def test_pictures_are_joined_along_their_channels(
+def test_images_are_stacked_along_their_channels(
     shape: tuple[int, ...], stacked: tuple[int, ...]
 ) -> None:
     space = spaces.Box(0, 255, shape, np.uint8)
@@ -75,7 +75,7 @@ def test_pictures_are_joined_along_their_channels(
         assert (np.take(found[0], k, axis) == k).all()
 
 
-def test_environments_stack_as_their_episodes_go() -> None:
+def test_stacks_are_reset_at_each_environments_episode() -> None:
     """What is seen at each step is the newest frame; what is before it was seen before."""
     batch = Task.for_sim("lane").batch(3)
     with closing(StackedVecEnv(BatchedVecEnv(batch), 2)) as env:
@@ -115,7 +115,7 @@ def test_a_stacking_policy_acts_outside_as_it_does_in_training(tmp_path: Path) -
     assert mcaprl.open(tmp_path / "log.mcap").observation_space.shape == (12,)
 
 
-def test_the_commands_take_a_stacking_policy(tmp_path: Path) -> None:
+def test_the_commands_accept_a_stacking_policy(tmp_path: Path) -> None:
     (summary,) = train(Task.for_sim("lane", **SHORT), tmp_path / "run", progress=silent)
     path, log = str(summary.folder / "best_model.zip"), str(tmp_path / "log.mcap")
     assert run(["record", "lane", "--policy", path, "--episodes", "2", "--out", log]) == 0
@@ -128,7 +128,7 @@ def test_the_commands_take_a_stacking_policy(tmp_path: Path) -> None:
     assert values.argmax(1).tolist() == episode.actions.tolist()
 
 
-def test_an_offline_policy_that_stacks_is_taken_over(tmp_path: Path) -> None:
+def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
     env = mcaprl.RecordMcap(mcaprl.sims.make_sim("lane"), tmp_path / "log.mcap", scene=False)
     rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=300)
     env.close()

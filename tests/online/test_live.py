@@ -53,7 +53,7 @@ class Clock:
         return self.now_s
 
 
-def test_frames_take_no_more_than_their_share() -> None:
+def test_frames_stay_within_their_time_budget() -> None:
     clock = Clock()
     pace = Pace(share=0.02, period_s=0.1, clock=clock)
     shown = 0
@@ -74,7 +74,7 @@ def test_frames_take_no_more_than_their_share() -> None:
     assert shown == pytest.approx(clock.now_s / 0.25, rel=0.02)
 
 
-def test_cheap_frames_come_no_faster_than_can_be_seen() -> None:
+def test_the_frame_rate_is_limited() -> None:
     clock = Clock()
     pace = Pace(share=0.02, period_s=0.1, clock=clock)
     shown = 0
@@ -122,7 +122,7 @@ def decoded(seen: Any, topic: str) -> np.ndarray[Any, Any]:
     return np.frombuffer(b"".join(found), dtype)
 
 
-def test_a_viewer_sees_what_is_recorded(tmp_path: Path) -> None:
+def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
     """With time for every frame, the first environment's transitions are those in the log."""
     task = Task.for_sim("lane", **SHORT)
     seen = watched(task, tmp_path / "run", record=tmp_path / "log.mcap")
@@ -150,7 +150,7 @@ def test_a_viewer_sees_what_is_recorded(tmp_path: Path) -> None:
     assert first.total_reward == pytest.approx(steps["reward"][:length].sum())
 
 
-def test_values_and_numbers_are_the_learners(tmp_path: Path) -> None:
+def test_values_and_metrics_are_those_of_the_learner(tmp_path: Path) -> None:
     task = Task.for_sim("lane", **SHORT)
     seen = watched(task, tmp_path / "run")
     values, steps = decoded(seen, "/rl/values"), decoded(seen, "/rl/step")
@@ -170,7 +170,7 @@ def test_values_and_numbers_are_the_learners(tmp_path: Path) -> None:
     assert np.isfinite(training["score"][-1])
 
 
-def test_watching_changes_nothing(tmp_path: Path) -> None:
+def test_viewing_changes_nothing(tmp_path: Path) -> None:
     task = Task.for_sim("lane", **SHORT)
     watched(task, tmp_path / "seen", record=tmp_path / "seen.mcap")
     train(task, tmp_path / "alone", record=tmp_path / "alone.mcap", progress=silent)
@@ -207,7 +207,7 @@ def test_other_algorithms_and_environments(
     assert ("/scene" in seen["topics"]) == (sim != "CartPole-v1")
 
 
-def test_the_command_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = ["--steps", "16", "--envs", "4", "--eval-episodes", "1", "--final-episodes", "1"]
     out = tmp_path / "run"
     arguments = ["train-online", "lane", *short, "--out", str(out), "--live", "--port", "0"]
@@ -218,7 +218,7 @@ def test_the_command_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (out / "foxglove-layout.json").exists()
 
 
-def test_a_port_that_is_taken() -> None:
+def test_a_port_in_use_is_refused() -> None:
     task = Task.for_sim("lane", **SHORT)
     with closing(LiveTraining(task, port=0)) as live:
         port = int(live.stream.url.rpartition(":")[2])

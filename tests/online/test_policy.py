@@ -93,7 +93,7 @@ def test_it_acts_as_sb3_does(tmp_path: Path, kind: Any, written_by: str) -> None
 
 
 @pytest.mark.parametrize("channel_first", [True, False])
-def test_pictures_are_turned_as_the_network_has_them(tmp_path: Path, channel_first: bool) -> None:
+def test_images_are_transposed_for_the_network(tmp_path: Path, channel_first: bool) -> None:
     env = FakeImageEnv(screen_height=36, screen_width=40, n_channels=1, channel_first=channel_first)
     model = DQN("CnnPolicy", env, buffer_size=10, **small())
     observations = observations_of(env.observation_space)
@@ -105,7 +105,7 @@ def test_pictures_are_turned_as_the_network_has_them(tmp_path: Path, channel_fir
     np.testing.assert_array_equal(read_policy(tmp_path / "sb3.zip").act(observations), expected)
 
 
-def test_dicts_are_understood(tmp_path: Path) -> None:
+def test_dict_observations_are_supported(tmp_path: Path) -> None:
     env = SimpleMultiObsEnv(random_start=False)
     model = DQN("MultiInputPolicy", env, buffer_size=10, **small())
     policy = read_policy(ours(tmp_path / "model.zip", model, env))
@@ -118,7 +118,7 @@ def test_dicts_are_understood(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("multi", [False, True])
-def test_centered_pictures_are_saved_as_plain_weights(tmp_path: Path, multi: bool) -> None:
+def test_centering_is_folded_into_the_saved_weights(tmp_path: Path, multi: bool) -> None:
     image = FakeImageEnv(screen_height=36, screen_width=40, n_channels=1, channel_first=False)
     env = SimpleMultiObsEnv(random_start=False) if multi else image
     model = DQN("MultiInputPolicy" if multi else "CnnPolicy", env, buffer_size=10, **small())
@@ -138,7 +138,7 @@ def test_centered_pictures_are_saved_as_plain_weights(tmp_path: Path, multi: boo
     )
 
 
-def test_networks_of_other_shapes_are_built_as_their_file_says(tmp_path: Path) -> None:
+def test_networks_are_built_from_the_files_shapes(tmp_path: Path) -> None:
     kwargs = {"net_arch": {"pi": [8, 4], "vf": [6]}, "activation_fn": torch.nn.ReLU}
     model = PPO("MlpPolicy", gym.make("CartPole-v1"), device="cpu", policy_kwargs=kwargs)
     model.save(tmp_path / "model.zip")
@@ -188,7 +188,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
         ({"mcaprl_json": None, "data": b"{}"}, "observation space is not a Box"),
     ],
 )
-def test_broken_files_are_told_in_one_line(
+def test_broken_files_are_one_line_errors(
     tmp_path: Path, members: dict[str, bytes | None], message: str
 ) -> None:
     path = ours(tmp_path / "good.zip", dqn(), gym.make("CartPole-v1"))
@@ -207,7 +207,7 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
         read_policy(rewrite(path, tmp_path / "other.zip", mcaprl_json=text))
 
 
-def test_files_that_are_no_zip_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_not_zip_are_refused(tmp_path: Path) -> None:
     (tmp_path / "model.zip").write_bytes(b"no zip")
     with pytest.raises(PolicyError, match="cannot read the model"):
         read_policy(tmp_path / "model.zip")
@@ -234,7 +234,7 @@ def test_observations_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         policy.act(np.zeros((1, 5), dtype=np.float32))
 
 
-def test_a_runs_seeds_come_in_their_order(tmp_path: Path) -> None:
+def test_a_runs_seeds_are_in_order(tmp_path: Path) -> None:
     for seed in (10, 2):
         (tmp_path / f"seed-{seed}").mkdir()
         ours(tmp_path / f"seed-{seed}" / BEST_NAME, dqn(), gym.make("CartPole-v1"))
@@ -243,7 +243,7 @@ def test_a_runs_seeds_come_in_their_order(tmp_path: Path) -> None:
     assert policy_files(tmp_path / "seed-2") == [tmp_path / "seed-2" / BEST_NAME]
 
 
-def test_plain_sb3_needs_nothing_of_this_package(tmp_path: Path) -> None:
+def test_sb3_loads_the_model_without_this_package(tmp_path: Path) -> None:
     env = gym.make("CartPole-v1")
     model = dqn(seed=4)
     path = ours(tmp_path / "model.zip", model, env)

@@ -102,14 +102,14 @@ def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) ->
     assert timeouts == told
 
 
-def test_it_trains_offline_as_it_is(tmp_path: Path) -> None:
+def test_the_log_can_be_trained_on_offline(tmp_path: Path) -> None:
     _, log = trained(tmp_path / "run")
     config = CQLConfig(updates=20, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     (summary,) = train_offline(log, config, tmp_path / "offline", progress=silent)
     assert summary.steps == 20
 
 
-def test_probabilities_are_those_of_the_behavior(tmp_path: Path) -> None:
+def test_probabilities_are_those_of_the_behavior_policy(tmp_path: Path) -> None:
     _, log = trained(tmp_path / "run")
     learner = read_learner(tmp_path / "run" / "log.mcap")
     epsilon, probs = learner.epsilon, log.behavior_probs
@@ -125,7 +125,7 @@ def test_probabilities_are_those_of_the_behavior(tmp_path: Path) -> None:
     assert learner.policy_version.max() > 100
 
 
-def test_probabilities_are_right_whatever_was_asked_in_between(tmp_path: Path) -> None:
+def test_probabilities_do_not_depend_on_other_predictions(tmp_path: Path) -> None:
     # With a learning rate of next to nothing, the network at the end is that of all steps; an
     # evaluation after each one asks the network for other actions.
     _, log = trained(
@@ -144,7 +144,7 @@ def test_probabilities_are_right_whatever_was_asked_in_between(tmp_path: Path) -
     assert 0.3 < (log.actions == greedy)[epsilon < 1].mean() < 0.9
 
 
-def test_greedy_steps_are_the_networks_choice() -> None:
+def test_greedy_steps_follow_the_network() -> None:
     env = BatchedVecEnv(Task.for_sim("lane").batch(5))
     model = DQN("MlpPolicy", env, buffer_size=10, learning_starts=0, device="cpu", seed=0)
     observations: Any = env.reset()
@@ -180,7 +180,7 @@ def test_recording_changes_nothing(tmp_path: Path) -> None:
         assert plain[name].tolist() == [getattr(point, name) for point in agent.points]
 
 
-def test_each_evaluation_has_a_log_of_its_own(tmp_path: Path) -> None:
+def test_each_evaluation_has_a_separate_log(tmp_path: Path) -> None:
     agent, _ = trained(tmp_path / "run")
     paths = sorted((tmp_path / "run" / "evaluations").iterdir())
     assert [path.name for path in paths] == ["step-000000400.mcap", "step-000000800.mcap"]
@@ -244,7 +244,7 @@ def test_several_seeds_write_a_file_each(tmp_path: Path) -> None:
         log_paths(tmp_path / "a.mcap", range(2), False)
 
 
-def test_a_log_that_is_there_is_not_touched(tmp_path: Path) -> None:
+def test_an_existing_log_is_not_touched(tmp_path: Path) -> None:
     path = tmp_path / "mine.mcap"
     path.write_bytes(b"mine")
     with pytest.raises(OutputExistsError, match=r"mine\.mcap exists"):

@@ -87,7 +87,7 @@ def state_of(agent: Agent) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("settings", [{}, {"n_steps": 3}, {"buffer_size": 1_000}])
-def test_everything_comes_back(tmp_path: Path, settings: dict[str, Any]) -> None:
+def test_a_checkpoint_restores_everything(tmp_path: Path, settings: dict[str, Any]) -> None:
     first = agent_in(tmp_path / "run", False, **settings)
     with closing(first):
         first.learn(silent)
@@ -101,7 +101,7 @@ def test_everything_comes_back(tmp_path: Path, settings: dict[str, Any]) -> None
     assert state_of(second) == before
 
 
-def test_a_stopped_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+def test_a_stopped_run_continues_from_its_last_checkpoint(tmp_path: Path) -> None:
     task = Task.for_sim("lane", "dqn", **SHORT)
     with pytest.raises(Stopped):
         train(task, tmp_path / "run", progress=stop_at(1_000))
@@ -113,7 +113,7 @@ def test_a_stopped_run_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
     assert names == ["progress-from-800.csv", "progress.csv"]
 
 
-def test_epsilon_and_learning_rate_go_on_falling(tmp_path: Path) -> None:
+def test_epsilon_and_learning_rate_continue_to_decay(tmp_path: Path) -> None:
     settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
     task = Task.for_sim("lane", "dqn", **settings)
     with pytest.raises(Stopped):
@@ -130,7 +130,7 @@ def test_epsilon_and_learning_rate_go_on_falling(tmp_path: Path) -> None:
         assert epsilon == pytest.approx(1 - 0.95 * step / 2_000, abs=0.01)
 
 
-def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
+def test_a_finished_run_is_not_repeated(tmp_path: Path) -> None:
     task = Task.for_sim("lane", "dqn", **SHORT)
     (first,) = train(task, tmp_path / "run", progress=silent)
     curve = (first.folder / "curve.csv").read_bytes()
@@ -140,7 +140,7 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     assert (more.resumed_at, more.steps) == (0, 2_000)
 
 
-def test_a_killed_run_goes_on(tmp_path: Path) -> None:
+def test_a_killed_run_continues(tmp_path: Path) -> None:
     code = f"""
         import sys, time
         from mcaprl.online.task import Task
@@ -183,7 +183,7 @@ def test_a_log_is_appended_to(tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.rewards[: len(before)], before.rewards)
 
 
-def test_ppo_goes_on_too(tmp_path: Path) -> None:
+def test_ppo_continues(tmp_path: Path) -> None:
     settings = {**SHORT, "rollout_steps": 512}
     for name in ("learning_starts", "target_update_interval"):
         settings.pop(name)
@@ -206,7 +206,7 @@ def test_another_task_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "has sim 'lane', not 'racer'" in capsys.readouterr().err
 
 
-def test_the_command_resumes_with_the_runs_own_settings(
+def test_the_command_resumes_with_the_runs_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = {**SHORT, "steps": 200, "eval_interval": 200}
@@ -215,7 +215,7 @@ def test_the_command_resumes_with_the_runs_own_settings(
     assert "dqn in lane" in capsys.readouterr().out
 
 
-def test_a_broken_checkpoint_is_told(tmp_path: Path) -> None:
+def test_a_broken_checkpoint_is_reported(tmp_path: Path) -> None:
     short = {**SHORT, "steps": 200, "eval_interval": 200}
     task = Task.for_sim("lane", "dqn", **short)
     train(task, tmp_path / "run", progress=silent)
@@ -225,7 +225,7 @@ def test_a_broken_checkpoint_is_told(tmp_path: Path) -> None:
         train(task, tmp_path / "run", resume=True, progress=silent)
 
 
-def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"algo": "cql", "config": {}}))
     with pytest.raises(TrainingError, match="is not of an online run"):
         Task.of_run(tmp_path)
@@ -234,7 +234,7 @@ def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
         Task.of_run(tmp_path)
 
 
-def test_a_resumed_models_file_is_whole(tmp_path: Path) -> None:
+def test_a_resumed_models_file_is_complete(tmp_path: Path) -> None:
     task = Task.for_sim("lane", "dqn", **SHORT)
     with pytest.raises(Stopped):
         train(task, tmp_path / "run", progress=stop_at(1_000))

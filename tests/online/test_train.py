@@ -40,7 +40,7 @@ def silent(_: TrainingProgress) -> None:
     """A progress callback that does nothing."""
 
 
-def test_a_run_leaves_these_files(tmp_path: Path) -> None:
+def test_a_run_writes_these_files(tmp_path: Path) -> None:
     out = tmp_path / "run"
     (summary,) = train(lane(), out, seed=2, progress=silent)
     assert {path.name for path in out.iterdir()} == {
@@ -100,7 +100,7 @@ def test_the_same_seed_gives_the_same_curve(tmp_path: Path, envs: int) -> None:
     assert curves[0] == curves[1] != curves[2]
 
 
-def test_several_seeds_are_each_as_if_alone(tmp_path: Path) -> None:
+def test_each_seed_is_independent_of_the_others(tmp_path: Path) -> None:
     train(lane(), tmp_path / "all", seeds=2, progress=silent)
     train(lane(), tmp_path / "one", seed=1, progress=silent)
     curves = [tmp_path / name / "seed-1" / "curve.csv" for name in ("all", "one")]
@@ -109,7 +109,7 @@ def test_several_seeds_are_each_as_if_alone(tmp_path: Path) -> None:
     assert set(scores["seeds"]) == {"seed-0", "seed-1"}
 
 
-def test_the_last_score_is_what_evaluate_says(
+def test_the_last_score_equals_evaluates(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -120,7 +120,7 @@ def test_the_last_score_is_what_evaluate_says(
     assert mine["normalized_score"] == pytest.approx(summary.score, abs=1e-12)
 
 
-def test_the_kept_model_is_the_best_and_plain_sb3s(tmp_path: Path) -> None:
+def test_the_saved_model_is_the_best_and_loads_in_sb3(tmp_path: Path) -> None:
     (summary,) = train(lane(), tmp_path / "run", progress=silent)
     model = DQN.load(summary.folder / "best_model.zip")
     assert model.num_timesteps == summary.best_step
@@ -145,7 +145,7 @@ def test_other_algorithms_and_environments(
     assert scores["seeds"]["seed-0"]["score"] is None
 
 
-def test_pictures_are_learnt_from(tmp_path: Path) -> None:
+def test_image_observations_are_learned_from(tmp_path: Path) -> None:
     sizes: dict[str, Any] = {
         "steps": 80,
         "eval_interval": 40,
@@ -178,7 +178,7 @@ def test_an_agent_learns_to_stay_upright(tmp_path: Path) -> None:
     assert summary.mean_return > 100
 
 
-def test_a_taken_folder_is_not_touched(tmp_path: Path) -> None:
+def test_an_existing_folder_is_not_touched(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "note").write_text("mine")
     with pytest.raises(OutputExistsError, match="choose another folder"):
@@ -215,7 +215,7 @@ def test_the_command_trains_and_prints_a_row_for_each_seed(
         assert [row["step"] for row in csv.DictReader(file)] == ["96", "192"]
 
 
-def test_the_command_knows_which_settings_an_algorithm_has(
+def test_the_command_accepts_only_an_algorithms_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = str(tmp_path / "run")

@@ -48,7 +48,7 @@ def short_cartpole() -> gym.Env[Any, Any]:
     ],
     ids=["cartpole", *SIMS],
 )
-def test_it_says_what_sb3s_own_says(ours: BatchedVecEnv, one: Any) -> None:
+def test_it_equals_sb3s_own_environment(ours: BatchedVecEnv, one: Any) -> None:
     theirs = dummy(one, 5)
     ours.seed(5)
     np.testing.assert_array_equal(np.asarray(ours.reset()), np.asarray(theirs.reset()))
@@ -76,7 +76,7 @@ def test_it_says_what_sb3s_own_says(ours: BatchedVecEnv, one: Any) -> None:
     theirs.close()
 
 
-def test_both_ways_to_end_are_told_apart() -> None:
+def test_termination_and_truncation_are_distinguished() -> None:
     env = batched_cartpole()
     env.reset()
     random = np.random.default_rng(0)
@@ -96,13 +96,13 @@ def test_the_same_seed_gives_the_same_starts_and_another_does_not() -> None:
     assert starts[0] == starts[1] != starts[2]
 
 
-def test_without_a_new_seed_episodes_go_on_differing() -> None:
+def test_without_a_new_seed_episodes_differ() -> None:
     env = batched("lane")
     env.seed(1)
     assert np.asarray(env.reset()).tobytes() != np.asarray(env.reset()).tobytes()
 
 
-def test_attributes_are_the_batchs() -> None:
+def test_attributes_are_those_of_the_batch() -> None:
     env = batched("lane")
     assert env.get_attr("num_envs") == [COUNT] * COUNT
     assert env.get_attr("num_envs", [0]) == [COUNT]

@@ -145,7 +145,7 @@ def agent(folder: Path, algo: str = "double-dqn", **settings: Any) -> Agent:
     return Agent(task, "mcaprl/LaneKeeping-v0", folder, 0, Scale(0.0, 1.0))
 
 
-def test_an_agent_begins_with_a_log(logs: Path, tmp_path: Path) -> None:
+def test_an_agent_starts_from_a_log(logs: Path, tmp_path: Path) -> None:
     data = mcaprl.open(logs)
     with closing(agent(tmp_path)) as begun:
         begun.start_from(data, None)
@@ -155,7 +155,7 @@ def test_an_agent_begins_with_a_log(logs: Path, tmp_path: Path) -> None:
         assert model._n_updates == 50
 
 
-def test_pictures_are_turned_for_the_buffer(tmp_path: Path) -> None:
+def test_images_are_transposed_for_the_buffer(tmp_path: Path) -> None:
     path = tmp_path / "depth.mcap"
     env = mcaprl.RecordMcap(mcaprl.sims.make_sim("lane", observation="depth"), path, scene=False)
     rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=12)
@@ -171,7 +171,7 @@ def test_pictures_are_turned_for_the_buffer(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frames[:12, 0, 0], data.observations[..., 0])
 
 
-def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path: Path) -> None:
+def test_an_agent_starts_from_an_offline_policy(logs: Path, tmp_path: Path) -> None:
     config = CQLConfig(updates=30, hidden=(8,), log_interval=10, gamma=0.5, target_interval=2)
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
     policy = load_policy(tmp_path / "cql")
@@ -194,7 +194,7 @@ def test_an_agent_begins_as_the_offline_policy_it_was_given(logs: Path, tmp_path
         assert (acted == own).mean() > 0.9, "the first steps are its own"
 
 
-def test_an_agent_goes_on_from_an_online_policy(tmp_path: Path) -> None:
+def test_an_agent_continues_from_an_online_policy(tmp_path: Path) -> None:
     task = Task.for_sim("lane", **{**SHORT, "learning_starts": 40})
     (summary,) = train(task, tmp_path / "first", progress=silent)
     policy = load_policy(summary.folder / "best_model.zip")
@@ -203,7 +203,7 @@ def test_an_agent_goes_on_from_an_online_policy(tmp_path: Path) -> None:
     assert second.steps == 8
 
 
-def test_weights_of_plain_pictures_are_turned_for_centered_ones(tmp_path: Path) -> None:
+def test_weights_for_uncentered_images_are_converted(tmp_path: Path) -> None:
     short = {**SHORT, "envs": 1, "learning_starts": 40}
     options = {"observation": "depth"}
     (summary,) = train(Task.for_sim("lane", None, options, **short), tmp_path / "plain")
@@ -231,7 +231,7 @@ def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> Non
         begun.start_from(None, load_policy(tmp_path / "cql"))
 
 
-def test_weights_that_mean_other_values_are_refused(tmp_path: Path) -> None:
+def test_weights_of_other_outputs_are_refused(tmp_path: Path) -> None:
     with closing(agent(tmp_path)) as begun:
         model: Any = begun.model
 
@@ -248,7 +248,7 @@ def test_weights_that_mean_other_values_are_refused(tmp_path: Path) -> None:
             begun.start_from(None, Doubled())
 
 
-def test_ppo_begins_with_neither(logs: Path, tmp_path: Path) -> None:
+def test_ppo_accepts_neither_logs_nor_policies(logs: Path, tmp_path: Path) -> None:
     task = Task.for_sim("lane", "ppo", steps=64, envs=4, rollout_steps=64)
     begun = Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))
     with closing(begun):
@@ -258,7 +258,7 @@ def test_ppo_begins_with_neither(logs: Path, tmp_path: Path) -> None:
             begun.start_from(None, object())
 
 
-def test_the_command_takes_logs_and_a_policy(
+def test_the_command_accepts_logs_and_a_policy(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     offline = ["--updates", "20", "--hidden", "8", "--algo", "cql"]

@@ -1,4 +1,4 @@
-"""What every sim keeps to, whatever it simulates."""
+"""The contract that every sim fulfills."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ choices = st.lists(st.integers(0, 2**16), min_size=1, max_size=30)
 
 
 def bare(name: str, kwargs: dict[str, Any]) -> Any:
-    """The sim itself, without wrappers."""
+    """Return the sim without wrappers."""
     return make_sim(name, **kwargs).unwrapped
 
 
@@ -69,7 +69,7 @@ def actions_of(env: gym.Env[Any, Any], chosen: list[int]) -> list[int]:
 
 
 def trace(env: gym.Env[Any, Any], seed: int, actions: list[int]) -> Trace:
-    """All that an episode gives, observations as bytes."""
+    """All results of an episode, with observations as bytes."""
     observation, info = env.reset(seed=seed)
     steps: Trace = [(as_bytes(observation), 0.0, False, False, info)]
     for action in actions:
@@ -81,7 +81,7 @@ def trace(env: gym.Env[Any, Any], seed: int, actions: list[int]) -> Trace:
 
 
 @every_sim
-def test_gymnasium_and_sb3_find_no_fault(name: str, kwargs: dict[str, Any]) -> None:
+def test_the_checkers_of_gymnasium_and_sb3_pass(name: str, kwargs: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(bare(name, kwargs))
@@ -91,7 +91,7 @@ def test_gymnasium_and_sb3_find_no_fault(name: str, kwargs: dict[str, Any]) -> N
 @every_sim
 @settings(max_examples=15)
 @given(seeds, choices)
-def test_seed_and_actions_decide_every_bit(
+def test_seed_and_actions_determine_every_bit(
     name: str, kwargs: dict[str, Any], seed: int, chosen: list[int]
 ) -> None:
     first, second = bare(name, kwargs), bare(name, kwargs)
@@ -102,7 +102,7 @@ def test_seed_and_actions_decide_every_bit(
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("name", BATCHED)
-def test_a_copy_goes_on_by_itself(name: str, copied: Callable[[Any], Any]) -> None:
+def test_a_copy_continues_independently(name: str, copied: Callable[[Any], Any]) -> None:
     first = bare(name, {})
     first.reset(seed=1)
     for action in (1, 2, 1):
@@ -139,7 +139,7 @@ def test_observations_are_in_the_space_to_the_very_end(
 
 
 @every_sim
-def test_an_observation_is_the_callers_own(name: str, kwargs: dict[str, Any]) -> None:
+def test_an_observation_is_a_copy(name: str, kwargs: dict[str, Any]) -> None:
     sim = bare(name, kwargs)
     first, _ = sim.reset(seed=0)
     kept = as_bytes(first)
@@ -177,14 +177,14 @@ def test_every_shape_can_be_drawn(name: str, kwargs: dict[str, Any]) -> None:
 
 
 @every_sim
-def test_names_fit_what_they_name(name: str, kwargs: dict[str, Any]) -> None:
+def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> None:
     sim = bare(name, kwargs)
     sim.reset(seed=0)
     assert len(sim.action_meanings) == sim.action_space.n
     if sim.observation_names:
         assert (len(sim.observation_names),) == sim.observation_space.shape
     if name == "racer" or kwargs.get("rules", "default") == "default":
-        # The metadata are the class's; the classic car and drone decide less often.
+        # Metadata belong to the class; decisions of the classic car and drone are longer.
         assert sim.step_duration_s * sim.metadata["render_fps"] == pytest.approx(1.0)
     assert {"x_m", "y_m", "speed_m_s"} <= set(sim.telemetry())
     before = sim.telemetry()
@@ -194,9 +194,7 @@ def test_names_fit_what_they_name(name: str, kwargs: dict[str, Any]) -> None:
 
 
 @every_sim
-def test_the_time_limit_truncates_without_a_reason_of_its_own(
-    name: str, kwargs: dict[str, Any]
-) -> None:
+def test_the_time_limit_truncates_without_a_reason(name: str, kwargs: dict[str, Any]) -> None:
     env = make_sim(name, max_episode_steps=2, **kwargs)
     env.reset(seed=1)
     env.step(0)
@@ -216,7 +214,7 @@ def test_each_sim_has_a_time_limit_and_a_pilot(name: str) -> None:
 
 
 @every_sim
-def test_an_action_that_does_not_exist_is_refused(name: str, kwargs: dict[str, Any]) -> None:
+def test_an_invalid_action_is_refused(name: str, kwargs: dict[str, Any]) -> None:
     sim = bare(name, kwargs)
     sim.reset(seed=0)
     last = int(sim.action_space.n) - 1

@@ -1,4 +1,4 @@
-"""A log holds all that is needed to live its episodes again, to the last bit."""
+"""A log contains all that is needed to repeat its episodes bit for bit."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ EPISODES = 4
 
 
 @every_sim
-def test_a_recorded_episode_can_be_lived_again(
+def test_a_recorded_episode_can_be_repeated(
     name: str, kwargs: dict[str, Any], log_path: Path
 ) -> None:
-    """Recorded in one sim with scene; lived again in another, from seeds, poses and actions."""
+    """Recorded in one sim with its scene, and repeated in another from seeds and actions."""
     sim = make_sim(name, max_episode_steps=25, **kwargs)
     sim.action_space.seed(1)
     env = mcaprl.RecordMcap(sim, log_path)

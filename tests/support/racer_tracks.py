@@ -1,4 +1,4 @@
-"""A track on which rewards, ends and rays can be computed by hand."""
+"""Track for which rewards, ends and rays can be computed by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.sims.racer.course import Track
 
 
 def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
-    """Create a box 1000 pixels long, driven to the right, with gates at 300 and 600 pixels."""
+    """Return a box 1000 pixels long, driven to the right, with gates at 300 and 600 pixels."""
     right_px = 1000.0
     corners = [(0.0, top_px), (right_px, top_px), (right_px, bottom_px), (0.0, bottom_px)]
     walls = np.array([(*corners[i], *corners[(i + 1) % 4]) for i in range(4)])
@@ -24,6 +24,6 @@ def corridor(top_px: float = 100.0, bottom_px: float = 200.0) -> Track:
 def car_in(
     track: Track, x_px: float, y_px: float, heading_deg: float = 0.0, speed_px: float = 0.0
 ) -> Car:
-    """Place a car on that track whose next gate is the first one."""
+    """Return a car at a place, whose next gate is the first one."""
     car = placed(track, x_px, y_px, math.radians(heading_deg), speed_px, x_px / 10)
     return car._replace(next_gate=0.0)

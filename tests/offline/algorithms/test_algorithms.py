@@ -99,7 +99,7 @@ def lone_state(*, terminated: bool, gamma: float, reward: float = 1.0, **setting
         BCQConfig(**SMALL_Q),
     ],
 )
-def test_values_are_those_of_value_iteration(config: Any) -> None:
+def test_values_equal_those_of_value_iteration(config: Any) -> None:
     learner = trained(learner_of(config, corridor(), 0, 1))
     encoder = learner.buffer.encoder
     for seed in learner.seeds:
@@ -109,7 +109,7 @@ def test_values_are_those_of_value_iteration(config: Any) -> None:
         np.testing.assert_allclose(values, optimal_values(), atol=0.03)
 
 
-def test_the_truth_of_the_corridor() -> None:
+def test_the_corridors_values_by_hand() -> None:
     # Written out: right is worth 1, .9, .81 counted from the far exit; the near exit pays .3.
     np.testing.assert_allclose(optimal_values(), [[0.3, 0.81], [0.729, 0.9], [0.81, 1.0]])
 
@@ -123,13 +123,13 @@ def test_with_gamma_zero_only_the_reward_counts() -> None:
     assert lone_state(terminated=False, gamma=0.0, reward=-3.0) == pytest.approx(-3.0, abs=0.01)
 
 
-def test_quantiles_know_termination_too() -> None:
+def test_quantiles_stop_at_termination() -> None:
     settings = {"gamma": 0.5, "n_quantiles": 4}
     assert lone_state(terminated=True, **settings) == pytest.approx(1.0, abs=0.01)
     assert lone_state(terminated=False, **settings) == pytest.approx(2.0, abs=0.02)
 
 
-def test_n_steps_carry_a_reward_over_the_corridor_at_once() -> None:
+def test_n_step_returns_propagate_a_reward_over_the_corridor() -> None:
     # One episode from cell 1 to the far exit; with one copy of the target, only returns tell.
     walk = corridor_walk()
     config = DQNConfig(**{**SMALL_Q, "n_steps": 3, "target_interval": 600})
@@ -152,7 +152,7 @@ def corridor_walk() -> Dataset:
 
 @pytest.mark.parametrize("learner_type", [DQN, DoubleDQN, BCQ, IQL])
 @pytest.mark.parametrize("seeds", [(0,), (0, 1, 2)])
-def test_looking_up_the_target_is_the_same_as_computing_it(
+def test_the_cached_target_equals_the_computed_one(
     learner_type: type[Learner], seeds: tuple[int, ...]
 ) -> None:
     # With as many updates between copies as there are rows or more, a table of targets is kept.
@@ -195,7 +195,7 @@ ONLY_LEFT = {(cell, 0): 1 for cell in (1, 2, 3)}
         IQLConfig(**SMALL_Q),
     ],
 )
-def test_what_the_data_never_show_is_not_done(config: Any) -> None:
+def test_actions_absent_from_the_data_are_not_taken(config: Any) -> None:
     # Nobody ever went right: whatever lies there, the log cannot tell.
     for seed in range(3):
         learner = trained(learner_of(config, corridor(ONLY_LEFT), seed))
@@ -221,7 +221,7 @@ def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
         IQLConfig(**SMALL_Q, expectile=0.9, beta=20.0),
     ],
 )
-def test_what_pays_is_found_where_the_data_show_both(config: Any) -> None:
+def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
     # One in three visits goes right; imitation pulls towards left and the reward wins.
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     assert best(trained(learner_of(config, mostly_left)), inner_observations()) == [1, 1, 1]
@@ -229,7 +229,7 @@ def test_what_pays_is_found_where_the_data_show_both(config: Any) -> None:
     assert best(clone, inner_observations()) == [0, 0, 0]
 
 
-def test_iql_values_lie_between_the_mean_and_the_best() -> None:
+def test_iql_values_are_between_mean_and_maximum() -> None:
     values = []
     for expectile in (0.5, 0.7, 0.99):
         config = IQLConfig(**{**SMALL_Q, "updates": 1500}, expectile=expectile)
@@ -242,7 +242,7 @@ def test_iql_values_lie_between_the_mean_and_the_best() -> None:
     assert values[2] == pytest.approx(0.9, abs=0.05)
 
 
-def test_a_bcq_threshold_of_one_is_imitation_and_of_zero_double_dqn() -> None:
+def test_bcq_with_threshold_one_imitates_and_with_zero_is_double_dqn() -> None:
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     found = [
         best(
@@ -283,7 +283,7 @@ def masked_corridor() -> Dataset:
 
 
 @pytest.mark.parametrize("config", [DQNConfig(**SMALL_Q), DoubleDQNConfig(**SMALL_Q)])
-def test_what_is_not_allowed_is_worth_nothing_to_anybody(config: Any) -> None:
+def test_masked_actions_do_not_contribute(config: Any) -> None:
     values = outputs(trained(learner_of(config, masked_corridor())), inner_observations())
     # From cell 1 the near exit pays .3 at once; going right leads to a cell that only leads back.
     assert values[0].tolist() == pytest.approx([0.3, 0.9 * 0.9 * 0.3], abs=0.02)
@@ -292,7 +292,7 @@ def test_what_is_not_allowed_is_worth_nothing_to_anybody(config: Any) -> None:
 
 
 @pytest.mark.parametrize("learner_type", ALL)
-def test_the_same_seed_gives_the_same_weights_whoever_learns_beside_it(
+def test_a_seeds_weights_do_not_depend_on_other_seeds(
     learner_type: type[Learner],
 ) -> None:
     config = learner_type.config_type(**{**SMALL, "updates": 30})
@@ -308,7 +308,7 @@ def test_the_same_seed_gives_the_same_weights_whoever_learns_beside_it(
 
 
 @pytest.mark.parametrize("learner_type", ALL)
-def test_a_restored_learner_goes_on_bit_for_bit(learner_type: type[Learner]) -> None:
+def test_a_restored_learner_continues_bit_for_bit(learner_type: type[Learner]) -> None:
     values: dict[str, Any] = (
         {"target_interval": 20} if issubclass(learner_type.config_type, BootstrapConfig) else {}
     )
@@ -335,7 +335,7 @@ def test_weight_decay_shrinks_the_weights() -> None:
     assert sizes[1] < 0.9 * sizes[0]
 
 
-def test_a_loss_that_is_not_finite_is_named_and_leaves_the_weights_alone() -> None:
+def test_a_loss_that_is_not_finite_is_reported_and_changes_no_weights() -> None:
     learner = learner_of(CQLConfig(**SMALL_Q), corridor(), 2, 5)
     learner.buffer.returns[0] = torch.inf
     before = learner.models["q"].weights.clone()
@@ -345,7 +345,7 @@ def test_a_loss_that_is_not_finite_is_named_and_leaves_the_weights_alone() -> No
     assert learner.step == 0
 
 
-def test_pictures_are_learned_from() -> None:
+def test_image_observations_are_learned_from() -> None:
     # The brighter of two pictures asks for action 1.
     images: NDArray[np.uint8] = np.zeros((40, 36, 36), np.uint8)
     images[::2] = 200
@@ -364,7 +364,7 @@ def test_pictures_are_learned_from() -> None:
         assert learner.network("logits", seed)(seen).argmax(1).tolist() == [0, 1]
 
 
-def test_a_device_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_missing_device_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="device"):
         train(corridor(), "bc", tmp_path / "run", device="tpu")
     if not torch.cuda.is_available():

@@ -32,7 +32,7 @@ def test_a_setting_of_one_algorithm_is_not_offered_by_another() -> None:
     assert "gamma" not in field_help(BCConfig)
 
 
-def test_the_learning_rate_falls_in_a_straight_line_to_its_last_fraction() -> None:
+def test_the_learning_rate_decays_linearly_to_its_final_fraction() -> None:
     config = TrainingConfig(updates=5, learning_rate=1.0, final_learning_rate_fraction=0.2)
     rates = [config.learning_rate_at(step) for step in range(5)]
     assert rates == pytest.approx([1.0, 0.8, 0.6, 0.4, 0.2])
@@ -101,7 +101,7 @@ def test_a_setting_out_of_range_is_refused_by_name(
 
 
 @pytest.mark.parametrize("config_type", [BCConfig, DQNConfig, CQLConfig])
-def test_nan_is_no_setting(config_type: type[TrainingConfig]) -> None:
+def test_nan_is_not_a_valid_setting(config_type: type[TrainingConfig]) -> None:
     with pytest.raises(UsageError, match="learning_rate"):
         config_type(learning_rate=float("nan"))
 

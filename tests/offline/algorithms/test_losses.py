@@ -58,14 +58,14 @@ def test_expected_sarsa_weights_the_next_values_with_the_policy() -> None:
     torch.testing.assert_close(target, torch.tensor([0.5 + 0.9 * 17.5, -1.0, 2.0]))
 
 
-def test_of_quantiles_those_of_the_largest_mean_are_the_target() -> None:
+def test_quantile_targets_are_those_of_the_largest_mean() -> None:
     # Means 2 and 2.5; the largest quantile is the other action's.
     z_t = torch.tensor([[[0.0, 4.0], [2.0, 3.0]]])
     target = q_learning_target(torch.tensor([1.0]), torch.tensor([0.5]), z_t)
     torch.testing.assert_close(target, torch.tensor([[2.0, 2.5]]))
 
 
-def test_what_is_not_allowed_is_not_aimed_at() -> None:
+def test_masked_actions_are_not_bootstrapped_from() -> None:
     q_t = allowed_only(torch.tensor([[5.0, 1.0]]), torch.tensor([[False, True]]))
     assert q_learning_target(torch.tensor([0.0]), torch.tensor([1.0]), q_t).item() == 1.0
 
@@ -90,7 +90,7 @@ def test_huber_is_squared_near_zero_and_linear_beyond_one() -> None:
     torch.testing.assert_close(gradient(loss_of, error), expected)
 
 
-def test_huber_regression_pulls_only_at_the_action_taken() -> None:
+def test_huber_regression_has_a_gradient_only_at_the_action_taken() -> None:
     def loss_of(q_tm1: Tensor) -> Tensor:
         return huber_regression(q_tm1, A_TM1, torch.tensor([1.5, 9.0, 5.0]))
 
@@ -130,7 +130,7 @@ def test_quantile_regression_by_hand() -> None:
     torch.testing.assert_close(gradient(loss_of, z_tm1), torch.tensor(expected))
 
 
-def test_quantile_regression_finds_the_quantiles_of_its_samples() -> None:
+def test_quantile_regression_converges_to_sample_quantiles() -> None:
     # A third is 0, the rest 10: the quantile at 1/8 is 0, those from 3/8 up are 10, but for the
     # Huber loss, whose pull weakens within 1 of a sample. At 3/8, u below 10:
     # 2/3 * 3/8 * u = 1/3 * 5/8.
@@ -151,7 +151,7 @@ def test_conservative_penalty_by_hand() -> None:
     torch.testing.assert_close(cross_entropy(q_tm1, torch.tensor([1, 0])), expected)
 
 
-def test_conservative_penalty_pushes_unseen_actions_down_and_the_logged_one_up() -> None:
+def test_conservative_penalty_lowers_unseen_actions_and_raises_the_logged_one() -> None:
     q_tm1 = torch.tensor([[1.0, 0.0, -1.0]])
     found = gradient(lambda q: cross_entropy(q, torch.tensor([1])), q_tm1)[0]
     # softmax(q) - onehot(a); descent goes against it.
@@ -166,7 +166,7 @@ def test_cross_entropy_by_hand() -> None:
     torch.testing.assert_close(cross_entropy(logits_tm1, torch.tensor([0, 1])), expected)
 
 
-def test_an_action_that_is_not_allowed_has_no_part_in_the_penalty() -> None:
+def test_masked_actions_do_not_enter_the_penalty() -> None:
     def loss_of(q_tm1: Tensor) -> Tensor:
         allowed = allowed_only(q_tm1, torch.tensor([[True, False, True]]))
         return cross_entropy(allowed, torch.tensor([0]))
@@ -176,7 +176,7 @@ def test_an_action_that_is_not_allowed_has_no_part_in_the_penalty() -> None:
     torch.testing.assert_close(gradient(loss_of, q_tm1), torch.tensor([[-0.5, 0.0, 0.5]]))
 
 
-def test_expectile_regression_leans_upwards() -> None:
+def test_expectile_regression_weights_positive_errors_more() -> None:
     def loss_of(v_tm1: Tensor) -> Tensor:
         return expectile_regression(v_tm1, torch.tensor([2.0, -2.0]), 0.9)
 
@@ -185,7 +185,7 @@ def test_expectile_regression_leans_upwards() -> None:
     torch.testing.assert_close(gradient(loss_of, v_tm1), torch.tensor([[-0.9 * 4], [0.1 * 4]]))
 
 
-def test_likely_actions_are_measured_by_the_likeliest() -> None:
+def test_likely_actions_are_relative_to_the_most_likely() -> None:
     logits = torch.log(torch.tensor([[0.6, 0.3, 0.1]]))
     assert likely_actions(logits, 0.4).tolist() == [[True, True, False]]
     assert likely_actions(logits, 0.0).all()
@@ -228,7 +228,7 @@ def test_penalty_is_never_negative_and_ignores_a_common_shift(
 
 
 @given(q_t=finite_values, selector=finite_values)
-def test_double_q_learning_never_aims_above_q_learning(
+def test_double_q_learning_targets_never_exceed_q_learning(
     q_t: NDArray[Any], selector: NDArray[Any]
 ) -> None:
     zeros, q_t_value = torch.zeros(4), torch.from_numpy(q_t)
@@ -237,7 +237,7 @@ def test_double_q_learning_never_aims_above_q_learning(
     assert (double <= plain).all()
 
 
-def test_noise_in_the_values_lifts_q_learning_but_not_double_q_learning() -> None:
+def test_noise_biases_q_learning_but_not_double_q_learning() -> None:
     # Ten actions are all worth 0 and two networks guess them with independent noise.
     generator = torch.Generator().manual_seed(0)
     noise, other_noise = torch.randn(2, 20_000, 10, generator=generator)

@@ -46,7 +46,7 @@ def test_the_nature_network_has_its_published_size() -> None:
     assert weights_of(network) == [*convolutions, (512, 3136), (18, 512)]
 
 
-def test_channels_are_as_many_as_asked_for() -> None:
+def test_the_number_of_channels_is_configurable() -> None:
     architecture = Architecture((256,), channels=(16, 32, 24))
     network = Network(0, [ImageInput((84, 84, 1))], (6,), architecture)
     convolutions = [(16, 1, 8, 8), (32, 16, 4, 4), (24, 32, 3, 3)]
@@ -59,7 +59,7 @@ def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
     assert network(pictures(2, shape)).shape == (2, 4)
 
 
-def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
+def test_images_and_vector_are_joined_after_one_layer_each() -> None:
     network = Network(
         3, [ImageInput((36, 36, 1)), ImageInput((40, 36, 2))], (4,), Architecture((8, 6))
     )
@@ -72,7 +72,7 @@ def test_pictures_and_vector_meet_behind_a_layer_each() -> None:
         assert not torch.equal(network(both), before)
 
 
-def test_channels_are_kept_apart_from_rows() -> None:
+def test_channels_are_not_mixed_with_rows() -> None:
     # Equal channels must give the same in any order of the weights.
     network = Network(0, [ImageInput((36, 36, 2))], (3,), Architecture((16,)))
     image = torch.randint(0, 256, (1, 36, 36, 1), dtype=torch.uint8)
@@ -93,7 +93,7 @@ def test_dueling_advantages_have_mean_zero(output_shape: tuple[int, ...]) -> Non
     torch.testing.assert_close(network(seen).mean(1).flatten(), value.flatten())
 
 
-def test_layer_norm_makes_outputs_blind_to_the_scale_of_the_first_layer() -> None:
+def test_layer_norm_makes_outputs_invariant_to_the_first_layers_scale() -> None:
     network = Network(3, [], (2,), Architecture((32, 16), layer_norm=True))
     seen = vectors(4, 3)
     before = network(seen)
@@ -140,9 +140,7 @@ def alone_and_together(model_type: type[Model], rows: int) -> Sequence[tuple[Ten
 
 @pytest.mark.parametrize("model_type", [StackedMLP, AnyModel])
 @pytest.mark.parametrize("rows", [1, 32, 256])
-def test_a_seed_gets_the_same_bits_alone_and_beside_others(
-    model_type: type[Model], rows: int
-) -> None:
+def test_a_seed_gets_the_same_bits_alone_and_in_a_batch(model_type: type[Model], rows: int) -> None:
     assert all(torch.equal(alone, beside) for alone, beside in alone_and_together(model_type, rows))
 
 
@@ -157,7 +155,7 @@ def test_a_network_shows_the_weights_of_its_model() -> None:
     torch.testing.assert_close(model(seen), expected)
 
 
-def test_a_clone_has_weights_of_its_own() -> None:
+def test_a_copy_has_separate_weights() -> None:
     model = build_model(networks(2))
     clone = model.clone()
     before = clone(vectors(4, 5))

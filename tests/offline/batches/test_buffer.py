@@ -100,7 +100,7 @@ def test_with_gamma_zero_only_the_first_reward_counts() -> None:
     gamma=st.floats(0, 1),
     data=st.data(),
 )
-def test_n_step_returns_are_those_of_a_loop(
+def test_n_step_returns_equal_those_of_a_loop(
     lengths: list[int], n_steps: int, gamma: float, data: st.DataObject
 ) -> None:
     ends = data.draw(st.lists(st.booleans(), min_size=len(lengths), max_size=len(lengths)))
@@ -134,7 +134,7 @@ def test_stacks_repeat_the_first_frame_of_their_episode() -> None:
     assert buffer.vector_width == 3
 
 
-def test_stacked_pictures_are_channels() -> None:
+def test_stacked_images_are_channels() -> None:
     images = np.arange(4, dtype=np.uint8).reshape(4, 1, 1, 1) * np.ones((36, 36, 1), np.uint8)
     dataset = Dataset.from_arrays(
         observations=images[:3],
@@ -167,14 +167,14 @@ def test_a_batch_is_made_of_whole_rows(n_rows: int, batch_size: int, seed: int) 
     assert torch.equal(batch.discounts, (k % 3 != 0).float())
 
 
-def test_the_generator_decides_the_draw() -> None:
+def test_the_generator_determines_the_sample() -> None:
     buffer = TransitionBuffer.from_dataset(numbered(50))
     draws = [buffer.sample(8, torch.Generator().manual_seed(seed)).rows for seed in (1, 1, 2)]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
 
 
-def test_every_row_is_drawn_equally_often() -> None:
+def test_rows_are_sampled_uniformly() -> None:
     buffer = TransitionBuffer.from_dataset(numbered(10))
     rows = buffer.sample_rows(100_000, torch.Generator().manual_seed(0))
     # 10,000 each with a standard deviation of 95.
@@ -182,7 +182,7 @@ def test_every_row_is_drawn_equally_often() -> None:
 
 
 @pytest.mark.parametrize("weights", [[3.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
-def test_rows_are_drawn_by_the_weights_of_their_episodes(weights: list[float]) -> None:
+def test_rows_are_sampled_by_their_episodes_weights(weights: list[float]) -> None:
     buffer = TransitionBuffer.from_dataset(walks([2, 3, 1], [True] * 3), weights=np.array(weights))
     rows = buffer.sample_rows(60_000, torch.Generator().manual_seed(0))
     share = torch.bincount(rows, minlength=6) / 60_000
@@ -192,12 +192,12 @@ def test_rows_are_drawn_by_the_weights_of_their_episodes(weights: list[float]) -
     assert share[2:5].sum() == 0
 
 
-def test_weights_that_leave_nothing_are_refused() -> None:
+def test_weights_that_are_all_zero_are_refused() -> None:
     with pytest.raises(TrainingError, match="all weights are 0"):
         TransitionBuffer.from_dataset(walks([2], [True]), weights=np.zeros(1))
 
 
-def test_normalisation_counts_each_frame_once() -> None:
+def test_normalization_counts_each_frame_once() -> None:
     buffer = TransitionBuffer.from_dataset(walks([3, 2], [True, True]), Packing(normalize=True))
     torch.testing.assert_close(buffer.frames.vector.mean(0), torch.zeros(1), atol=1e-6, rtol=0)
     torch.testing.assert_close(
@@ -205,7 +205,7 @@ def test_normalisation_counts_each_frame_once() -> None:
     )
 
 
-def test_a_given_encoder_keeps_its_normalisation() -> None:
+def test_a_given_encoder_keeps_its_normalization() -> None:
     packing = Packing(normalize=True)
     encoder = TransitionBuffer.from_dataset(walks([3], [True]), packing).encoder
     scale = encoder.scale.copy()
@@ -233,7 +233,7 @@ def test_masks_come_with_the_observations() -> None:
     assert batch.observations.mask.tolist() == [[False, True]] * 3
 
 
-def test_a_logged_action_that_was_not_allowed_is_refused() -> None:
+def test_a_logged_action_that_is_masked_is_refused() -> None:
     with pytest.raises(TrainingError, match="action 0 of row 1 is masked out"):
         TransitionBuffer.from_dataset(masked([1, 0, 1]))
 
@@ -258,7 +258,7 @@ def test_an_empty_dataset_is_refused() -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("column", ["observations", "rewards", "next_observations"])
-def test_a_number_that_is_not_finite_is_named(column: str, bad: float) -> None:
+def test_a_value_that_is_not_finite_is_reported(column: str, bad: float) -> None:
     values: NDArray[Any] = np.array(getattr(numbered(4), column))
     values[2] = bad
     with pytest.raises(TrainingError, match=f"{column} of row 2"):

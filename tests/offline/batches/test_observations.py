@@ -48,13 +48,13 @@ def test_float64_becomes_float32_and_arrays_are_flattened() -> None:
     assert encoder.encode(np.ones((5, 3, 4))).vector.dtype == torch.float32
 
 
-def test_bytes_that_are_no_picture_are_scaled_to_one() -> None:
+def test_uint8_vectors_are_scaled_to_one() -> None:
     encoder = ObservationEncoder(spaces.Box(0, 255, (3,), np.uint8), 2)
     seen = encoder.encode(np.array([[0, 51, 255]], np.uint8))
     torch.testing.assert_close(seen.vector, torch.tensor([[0.0, 0.2, 1.0]]))
 
 
-def test_pictures_stay_bytes_and_gain_a_channel() -> None:
+def test_images_stay_bytes_and_get_a_channel_axis() -> None:
     space = spaces.Box(0, 255, (36, 40), np.uint8)
     pictures = batch(space, 2)
     seen = ObservationEncoder(space, 2).encode(pictures)
@@ -63,7 +63,7 @@ def test_pictures_stay_bytes_and_gain_a_channel() -> None:
     assert np.array_equal(seen.images[0].numpy()[..., 0], pictures)
 
 
-def test_a_dict_becomes_a_vector_and_pictures() -> None:
+def test_a_dict_becomes_a_vector_and_images() -> None:
     encoder = ObservationEncoder(CAR, 2)
     observations = batch(CAR, 4)
     seen = encoder.encode(observations)
@@ -96,7 +96,7 @@ def test_counters_and_flags_are_flattened_as_gymnasium_does(seed: int) -> None:
     np.testing.assert_allclose(encoded, expected)
 
 
-def test_normalisation_gives_mean_zero_and_deviation_one() -> None:
+def test_normalization_has_mean_zero_and_standard_deviation_one() -> None:
     values = np.random.default_rng(0).normal([100, -3], [20, 0.01], (500, 2)).astype(np.float32)
     encoder = ObservationEncoder(spaces.Box(-np.inf, np.inf, (2,)), 2)
     encoder.normalize_to(values)
@@ -106,7 +106,7 @@ def test_normalisation_gives_mean_zero_and_deviation_one() -> None:
 
 
 @pytest.mark.parametrize("constant", [0.0, 7.0, -1e6])
-def test_a_constant_column_becomes_zero_and_a_new_value_is_no_catastrophe(constant: float) -> None:
+def test_a_constant_column_becomes_zero_and_new_values_stay_finite(constant: float) -> None:
     values = np.full((50, 1), constant, np.float32)
     encoder = ObservationEncoder(spaces.Box(-np.inf, np.inf, (1,)), 2)
     encoder.normalize_to(values)
@@ -114,7 +114,7 @@ def test_a_constant_column_becomes_zero_and_a_new_value_is_no_catastrophe(consta
     assert encoder.encode(values + 1).vector.abs().max() == 1
 
 
-def test_a_picture_loses_its_mean_and_keeps_one_scale() -> None:
+def test_images_are_centered_and_scaled_by_one_number() -> None:
     encoder = ObservationEncoder(CAR, 2)
     pictures = np.zeros((4, 36, 40, 1), np.uint8)
     pictures[:, 0, 0, 0] = [10, 10, 30, 30]
@@ -131,7 +131,7 @@ def test_a_picture_loses_its_mean_and_keeps_one_scale() -> None:
     assert encoder.encode(observations).images[0].dtype == torch.uint8, "frames stay small"
 
 
-def test_pictures_that_are_all_alike_keep_their_scale() -> None:
+def test_identical_images_keep_their_scale() -> None:
     alike = np.full((300, 36, 36, 3), 77, np.uint8)
     image = ImageInput((36, 36, 3)).normalized_to(alike)
     assert image.scale == 255
@@ -139,7 +139,7 @@ def test_pictures_that_are_all_alike_keep_their_scale() -> None:
     assert (image.shift == 77).all()
 
 
-def test_a_stack_of_pictures_is_shifted_frame_by_frame() -> None:
+def test_a_stack_of_images_is_centered_frame_by_frame() -> None:
     shift = np.arange(36 * 36 * 2, dtype=np.float32).reshape(36, 36, 2)
     stacked = ImageInput((36, 36, 2), shift, 7.0).stacked(3)
     assert (stacked.shape, stacked.scale) == ((36, 36, 6), 7)
@@ -148,7 +148,7 @@ def test_a_stack_of_pictures_is_shifted_frame_by_frame() -> None:
         np.testing.assert_array_equal(stacked.shift[:, :, 2 * frame : 2 * frame + 2], shift)
 
 
-def test_a_mask_is_no_input() -> None:
+def test_a_mask_is_not_a_network_input() -> None:
     space = spaces.Dict({"action_mask": spaces.MultiBinary(3), "x": spaces.Box(-1, 1, (2,))})
     encoder = ObservationEncoder(space, 3)
     mask = np.array([[1, 0, 1], [0, 0, 0]], np.int8)
@@ -169,7 +169,7 @@ def test_a_mask_of_another_length_is_refused() -> None:
     ("shape", "says"),
     [((35, 84, 1), r"36x36.*\(35, 84, 1\)"), ((4, 84, 84), r"\(height, width, channels\)")],
 )
-def test_pictures_that_convolutions_cannot_take_are_refused(
+def test_images_too_small_for_the_convolutions_are_refused(
     shape: tuple[int, ...], says: str
 ) -> None:
     with pytest.raises(SpaceError, match=says):
@@ -193,7 +193,7 @@ def test_counters_outside_their_space_are_refused() -> None:
         encoder.encode(np.array([2]))
 
 
-def test_stacked_frames_go_side_by_side() -> None:
+def test_stacked_vectors_are_concatenated() -> None:
     vector = torch.arange(8.0).view(4, 2)
     image = torch.arange(4, dtype=torch.uint8).view(4, 1, 1, 1).expand(4, 36, 36, 2)
     mask = torch.tensor([[True, False], [False, True]]).repeat(2, 1)
@@ -205,7 +205,7 @@ def test_stacked_frames_go_side_by_side() -> None:
     assert stacked.mask.tolist() == [[False, True], [False, True]]
 
 
-def test_arrays_that_may_not_be_written_to_are_taken() -> None:
+def test_read_only_arrays_are_accepted() -> None:
     frozen = np.zeros((2, 2), np.float32)
     frozen.flags.writeable = False
     assert len(ObservationEncoder(spaces.Box(-1, 1, (2,)), 2).encode(frozen)) == 2

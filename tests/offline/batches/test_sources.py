@@ -35,7 +35,7 @@ def save(path: Path, episodes: int, width: int) -> None:
     ).save(path)
 
 
-def test_without_weights_all_count_alike() -> None:
+def test_without_weights_all_logs_count_equally() -> None:
     dataset, weights = open_weighted(["logs"])
     assert len(dataset.episodes) == 6
     assert weights.tolist() == [1] * 6
@@ -53,7 +53,7 @@ def test_a_folder_or_a_glob_has_a_weight_too() -> None:
     assert open_weighted(["logs/[ab].mcap:3", "logs/c.mcap"])[1].tolist() == [3] * 5 + [1]
 
 
-def test_a_file_that_is_meant_twice_counts_once() -> None:
+def test_a_file_given_twice_is_read_once() -> None:
     assert len(open_weighted(["logs", "logs/a.mcap"])[0].episodes) == 6
     with pytest.raises(UsageError, match=r"a\.mcap is meant twice, with weights 1 and 2"):
         open_weighted(["logs", "logs/a.mcap:2"])
@@ -70,7 +70,7 @@ def test_a_weight_is_a_number_of_at_least_zero(weight: str) -> None:
         open_weighted([f"logs/a.mcap:{weight}"])
 
 
-def test_what_is_not_there_is_named_whole() -> None:
+def test_a_missing_path_is_named_in_full() -> None:
     with pytest.raises(LogError, match=r"logs/d\.mcap:x: no such file"):
         open_weighted(["logs/d.mcap:x"])
 
@@ -81,7 +81,7 @@ def test_other_spaces_are_refused() -> None:
         open_weighted(["logs", "wide.mcap"])
 
 
-def test_the_command_takes_weights(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_accepts_weights(capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--algo", "bc", "--updates", "5", "--hidden", "4", "--out", "run"]
     assert run(["train-offline", "logs/a.mcap:2", "logs/b.mcap", *small]) == 0
     assert "learns from 5 episodes, 20 transitions" in capsys.readouterr().out

@@ -77,7 +77,7 @@ def test_mean_weights_by_hand() -> None:
     assert mean_weight("WIS", BY_HAND) is None
 
 
-def test_no_weight_at_all_is_a_size_of_nought_and_no_crash() -> None:
+def test_zero_weights_have_an_effective_sample_size_of_zero() -> None:
     never = EpisodeTable(BY_HAND.rewards, 0 * BY_HAND.ratios, 0 * BY_HAND.q, 0 * BY_HAND.v, 0.5)
     assert effective_sample_size("TIS", never) == 0.0
     for estimate in ESTIMATORS.values():
@@ -141,7 +141,7 @@ def test_the_task_agrees_with_its_linear_equations() -> None:
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_estimates_come_to_the_true_value(estimator: str) -> None:
+def test_estimates_converge_to_the_true_value(estimator: str) -> None:
     counts = np.ones((1, 4_000))
     means = [
         ESTIMATORS[estimator](play(None, episodes=4_000, seed=seed)).values(counts)[0]
@@ -151,7 +151,7 @@ def test_estimates_come_to_the_true_value(estimator: str) -> None:
     assert abs(np.mean(means) - true_value()) < 4 * error
 
 
-def test_a_true_model_takes_most_of_the_noise_away() -> None:
+def test_a_true_model_removes_most_of_the_variance() -> None:
     counts = np.ones((1, 200))
     tables_of_200 = [play(None, episodes=200, seed=seed) for seed in range(60)]
     spread = {
@@ -174,6 +174,6 @@ def test_the_order_of_the_episodes_does_not_matter(table: EpisodeTable) -> None:
         )
 
 
-def test_gamma_nought_sees_the_first_reward_alone() -> None:
+def test_with_gamma_zero_only_the_first_reward_counts() -> None:
     table = EpisodeTable(BY_HAND.rewards, BY_HAND.ratios, BY_HAND.q, BY_HAND.v, 0.0)
     assert ESTIMATORS["PDIS"](table).values(ONCE) == pytest.approx([(2 * 1 + 3 * 2) / 2])

@@ -99,7 +99,7 @@ def test_fitted_q_evaluation_learns_the_true_values() -> None:
     np.testing.assert_allclose(learned, task.TRUE_Q, rtol=0.08)
 
 
-def test_every_estimator_finds_the_true_value() -> None:
+def test_every_estimator_converges_to_the_true_value() -> None:
     evaluator = OffPolicyEvaluator(log(1_500), FAST)
     evaluated = evaluator.evaluate(Table(task.EVALUATED), "better")
     found = by_name(evaluated)
@@ -130,7 +130,7 @@ def test_on_policy_they_agree_with_the_logged_returns() -> None:
         assert low - (high - low) < value < high + (high - low)
 
 
-def test_a_log_of_other_actions_gives_no_verdict() -> None:
+def test_a_log_of_other_actions_has_no_verdict() -> None:
     always_one = np.array([[0.001, 0.999], [0.001, 0.999]])
     evaluator = OffPolicyEvaluator(log(40, acting=always_one), NO_MODEL)
     never_one = Table(np.array([[1.0, 0.0], [1.0, 0.0]]))
@@ -140,7 +140,7 @@ def test_a_log_of_other_actions_gives_no_verdict() -> None:
         assert "effective episodes, 10 needed" in found[name].verdict
 
 
-def test_weights_that_do_not_add_up_give_no_verdict() -> None:
+def test_a_mean_weight_far_from_one_has_no_verdict() -> None:
     """Half of the log never does what is asked about: an unbiased mean is half of what it is."""
     always_one = np.array([[1e-6, 1 - 1e-6], [1e-6, 1 - 1e-6]])
     data = Dataset.concatenate([log(60), log(60, seed=1, acting=always_one)])
@@ -152,7 +152,7 @@ def test_weights_that_do_not_add_up_give_no_verdict() -> None:
         assert found[name].trusted, "these divide by the weights"
 
 
-def test_unknown_probabilities_leave_the_model_alone() -> None:
+def test_unknown_probabilities_leave_only_the_model_estimate() -> None:
     data = log(60)
     data.behavior_probs[:5] = math.nan
     found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(None, "random"))
@@ -164,7 +164,7 @@ def test_unknown_probabilities_leave_the_model_alone() -> None:
         )
 
 
-def test_a_model_that_saw_too_little_of_the_horizon_says_so() -> None:
+def test_a_model_with_a_short_horizon_warns() -> None:
     config = FQEConfig(updates=100, target_interval=25, hidden=(4,), gamma=0.9)
     estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")
     assert estimate.estimates[0].verdict.startswith(
@@ -177,7 +177,7 @@ def test_a_single_episode_is_refused() -> None:
         OffPolicyEvaluator(log(1), NO_MODEL)
 
 
-def test_epsilon_mixes_random_actions_in() -> None:
+def test_epsilon_mixes_in_random_actions() -> None:
     evaluator = OffPolicyEvaluator(log(300), NO_MODEL)
     greedy = Table(np.array([[0.0, 1.0], [0.0, 1.0]]))
     half = Table(np.array([[0.25, 0.75], [0.25, 0.75]]))

@@ -38,7 +38,7 @@ def test_a_ratio_by_hand() -> None:
     assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
 
 
-def test_pairs_add_up_with_their_weights() -> None:
+def test_weighted_pairs_are_summed() -> None:
     one = (np.array([[1.0, 2.0], [3.0, 2.0]]), np.array([[1.0, 0.0], [1.0, 4.0]]))
     # (4 / 2 + 4 / 4 of the second) and each twice.
     assert RatioEstimate(np.array([1.0, 10.0]), (one, one)).values(np.ones((1, 2))) == [24.0]
@@ -57,7 +57,7 @@ def test_the_error_of_a_mean_is_scipys(values: NDArray[np.float64]) -> None:
 
 
 @given(columns, st.integers(0, 3))
-def test_an_interval_moves_and_grows_with_its_values(
+def test_an_interval_shifts_and_scales_with_its_values(
     values: NDArray[np.float64], seed: int
 ) -> None:
     counts = resamplings(len(values), 60, seed)
@@ -67,7 +67,7 @@ def test_an_interval_moves_and_grows_with_its_values(
     assert moved == pytest.approx((3 * low + 5, 3 * high + 5), rel=1e-6, abs=1e-6)
 
 
-def test_the_error_is_the_spread_of_the_estimates() -> None:
+def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
     """Over 150 logs of 200 episodes, within what chance makes of a standard deviation."""
     once, logs = np.ones((1, 200)), 150
     tables = [task.play(None, episodes=200, seed=seed) for seed in range(logs)]
@@ -78,7 +78,7 @@ def test_the_error_is_the_spread_of_the_estimates() -> None:
         assert told == pytest.approx(spread, rel=4 / np.sqrt(2 * logs))
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+def test_intervals_have_their_nominal_coverage() -> None:
     """95 % within two points and twice the error of 200 logs; of 50 episodes, which is few."""
     logs, episodes = 200, 50
     margin = 0.02 + 2 * np.sqrt(0.95 * 0.05 / logs)
@@ -105,7 +105,7 @@ def test_degrees_of_freedom_by_hand() -> None:
     assert some.degrees_of_freedom() == pytest.approx(5.0)
 
 
-def test_students_factor_by_the_table() -> None:
+def test_students_t_quantile_by_the_table() -> None:
     # 97.5 % of Student's t: 12.706 of one degree, 2.228 of ten; of the normal distribution 1.960.
     assert student_factor(1.0) == pytest.approx(12.706 / 1.960, rel=1e-3)
     assert student_factor(10.0) == pytest.approx(2.228 / 1.960, rel=1e-3)

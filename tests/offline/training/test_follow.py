@@ -88,7 +88,7 @@ def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
     assert logs.grow()
 
 
-def test_files_may_join_later(tmp_path: Path) -> None:
+def test_new_files_are_read(tmp_path: Path) -> None:
     first = Recorder(tmp_path / "b.mcap")
     first.record(1)
     logs = GrowingLogs([tmp_path])
@@ -105,12 +105,12 @@ def test_files_may_join_later(tmp_path: Path) -> None:
     second.env.close()
 
 
-def test_waiting_has_an_end(tmp_path: Path) -> None:
+def test_waiting_ends_after_the_timeout(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"no episode was finished in .*none"):
         GrowingLogs([tmp_path / "none.mcap"], patience_s=0.0)
 
 
-def test_a_learner_goes_on_as_it_was(tmp_path: Path) -> None:
+def test_a_learner_continues_with_the_same_state(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "log.mcap")
     recorder.record(12)
     logs = GrowingLogs([tmp_path / "log.mcap"])

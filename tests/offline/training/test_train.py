@@ -127,7 +127,7 @@ def test_tensorboard_shows_the_same_curve(tmp_path: Path) -> None:
     assert shown == pytest.approx(written)
 
 
-def test_progress_is_told_each_log_interval(tmp_path: Path) -> None:
+def test_progress_is_reported_at_each_log_interval(tmp_path: Path) -> None:
     told: list[TrainingProgress] = []
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=told.append)
     assert [now.done for now in told] == list(range(10, 101, 10))
@@ -144,7 +144,7 @@ def test_the_same_seed_gives_the_same_curve_and_weights(tmp_path: Path, config: 
     assert_same_result(tmp_path / "a", tmp_path / "b")
 
 
-def test_the_global_generator_is_left_as_it_was(tmp_path: Path) -> None:
+def test_the_global_generator_is_unchanged(tmp_path: Path) -> None:
     torch.manual_seed(1)
     before = torch.get_rng_state()
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
@@ -231,7 +231,7 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
         assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
 
 
-def test_a_row_torn_by_a_kill_is_dropped(tmp_path: Path) -> None:
+def test_an_incomplete_row_after_a_kill_is_dropped(tmp_path: Path) -> None:
     train(corridor(), SHORT_CQL, tmp_path / "whole", progress=silent)
     with pytest.raises(Stopped):
         train(corridor(), SHORT_CQL, tmp_path / "cut", progress=StopAt(50))
@@ -251,7 +251,7 @@ def test_the_checkpoint_is_written_after_the_policy(tmp_path: Path) -> None:
     assert max(times_ns) == times_ns[-1]
 
 
-def test_resuming_adds_seeds_that_are_not_there_yet(tmp_path: Path) -> None:
+def test_resuming_adds_missing_seeds(tmp_path: Path) -> None:
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
     summaries = train(
         corridor(), SHORT_CQL, tmp_path / "run", seeds=2, resume=True, progress=silent
@@ -307,14 +307,14 @@ def test_an_existing_run_is_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("resume", [False, True])
-def test_a_folder_of_other_things_is_left_alone(tmp_path: Path, resume: bool) -> None:
+def test_a_folder_without_a_run_is_not_touched(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "thesis.tex").write_text("")
     with pytest.raises(OutputExistsError, match="choose another folder"):
         train(corridor(), SHORT_CQL, tmp_path, resume=resume, progress=silent)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_resuming_what_never_began_begins_it(tmp_path: Path) -> None:
+def test_resuming_a_missing_run_starts_it(tmp_path: Path) -> None:
     (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (0, 100)
 
@@ -369,7 +369,7 @@ def test_a_refused_request_leaves_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_nothing_is_printed_where_no_terminal_is(
+def test_nothing_is_printed_without_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     train(corridor(), SHORT_CQL, tmp_path / "run")
@@ -382,7 +382,7 @@ def test_importing_the_package_loads_no_torch() -> None:
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
-def test_seeds_that_stopped_at_different_updates_go_on_bit_for_bit(tmp_path: Path) -> None:
+def test_seeds_stopped_at_different_updates_resume_bit_for_bit(tmp_path: Path) -> None:
     # As if a kill had come between the two seeds' checkpoints at update 80.
     train(corridor(), SHORT_CQL, tmp_path / "whole", seeds=2, progress=silent)
     with pytest.raises(Stopped):
@@ -399,7 +399,7 @@ def test_seeds_that_stopped_at_different_updates_go_on_bit_for_bit(tmp_path: Pat
         assert_same_result(tmp_path / "cut", tmp_path / "whole", seed)
 
 
-def test_other_data_are_taken_if_asked_for(tmp_path: Path) -> None:
+def test_other_data_are_accepted_on_request(tmp_path: Path) -> None:
     config = replace(SHORT_CQL, normalize=True)
     with pytest.raises(Stopped):
         train(corridor(), config, tmp_path / "run", progress=StopAt(50))
@@ -430,7 +430,7 @@ def test_weights_are_part_of_the_data(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("leave", [True, False])
-def test_a_start_that_came_to_nothing_blocks_no_other(tmp_path: Path, leave: bool) -> None:
+def test_a_failed_start_does_not_block_the_next(tmp_path: Path, leave: bool) -> None:
     with pytest.raises(Stopped):
         train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=StopAt(20))
     if not leave:
@@ -454,7 +454,7 @@ def test_seeds_are_described_with_mean_and_interval(tmp_path: Path) -> None:
     assert f"loss {np.mean(losses):.4g} [" in mean
 
 
-def test_curves_are_drawn_from_all_seeds(tmp_path: Path) -> None:
+def test_curves_are_plotted_from_all_seeds(tmp_path: Path) -> None:
     train(corridor(), SHORT_CQL, tmp_path / "run", seeds=2, progress=silent)
     path = draw_curves(tmp_path / "run")
     assert path.read_bytes().startswith(b"\x89PNG")

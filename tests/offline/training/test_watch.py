@@ -16,7 +16,7 @@ from tests.offline.training.test_train import SHORT, SHORT_CQL, silent
 from tests.support.offline_tasks import corridor, crossing
 
 
-def test_held_out_episodes_are_not_learned_from_but_judged(tmp_path: Path) -> None:
+def test_held_out_episodes_are_evaluated_but_not_trained_on(tmp_path: Path) -> None:
     # Rewards are 1 in twelve episodes out of 24, chosen to be those held out.
     held_out = choose_held_out(24, 0.5)
     data = crossing((10,) * 24)
@@ -40,7 +40,7 @@ def test_returns_of_episodes_by_hand() -> None:
     assert monte_carlo_returns(data, np.array([1]), 0.0).tolist() == [1, 1]
 
 
-def test_a_return_that_was_cut_off_too_soon_is_not_known() -> None:
+def test_returns_of_short_truncated_episodes_are_unknown() -> None:
     observations = np.zeros((6, 1), np.float32)
     data = Dataset.from_arrays(
         observations=observations,
@@ -60,7 +60,7 @@ def test_about_a_twentieth_of_the_episodes_is_held_out(episodes: int, count: int
     assert len(choose_held_out(episodes, 0.05)) == count
 
 
-def test_too_few_copies_for_the_horizon_are_told(tmp_path: Path) -> None:
+def test_too_few_target_syncs_for_the_horizon_are_reported(tmp_path: Path) -> None:
     config = replace(SHORT_CQL, gamma=0.99)
     with pytest.warns(
         UserWarning, match="3 updates of the target network .* 3% of the horizon of gamma 0.99"
@@ -68,7 +68,7 @@ def test_too_few_copies_for_the_horizon_are_told(tmp_path: Path) -> None:
         train(corridor(), config, tmp_path / "run", progress=silent)
 
 
-def test_values_that_run_away_are_told_once(tmp_path: Path) -> None:
+def test_diverging_values_are_reported_once(tmp_path: Path) -> None:
     # The second action is never seen, and chased by its own value.
     data = crossing((50,), n_actions=2)
     config = DQNConfig(**{**SHORT, "updates": 400, "learning_rate": 0.01}, gamma=0.99)
@@ -83,7 +83,7 @@ def test_values_that_run_away_are_told_once(tmp_path: Path) -> None:
     ("before", "value", "tells"),
     [(10.0, 21.0, True), (10.0, 19.0, False), (30.0, 25.0, False), (-10.0, -21.0, True)],
 )
-def test_values_diverge_if_they_grow_beyond_twice_what_is_possible(
+def test_values_beyond_twice_the_possible_return_diverge(
     before: float, value: float, tells: bool
 ) -> None:
     assert (divergence_warning(before, value, 10.0) is not None) == tells

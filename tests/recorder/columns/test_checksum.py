@@ -1,4 +1,4 @@
-"""CRCs are zlib's, whoever computes them."""
+"""CRCs equal zlib's with each implementation."""
 
 from __future__ import annotations
 

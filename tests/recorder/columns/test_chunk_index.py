@@ -47,13 +47,13 @@ def content_of(chunk: ChunkIndex, after: bytes = b"") -> memoryview:
 
 
 @given(CHUNK_INDEXES, st.sampled_from([b"", b"of later versions"]))
-def test_they_are_what_the_library_wrote(chunk: ChunkIndex, after: bytes) -> None:
+def test_chunk_indexes_equal_those_of_the_library(chunk: ChunkIndex, after: bytes) -> None:
     assert parse_chunk_index(content_of(chunk, after)) == chunk
     assert chunk_index_record(chunk)[RECORD_HEADER.size :] == content_of(chunk)
 
 
 @pytest.mark.parametrize("every", [1, 2])
-def test_indexes_that_the_summary_does_not_tell_of_are_found(log_path: Path, every: int) -> None:
+def test_indexes_missing_from_the_summary_are_found(log_path: Path, every: int) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
     reader = McapReader(log_path)
     told = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
@@ -90,11 +90,10 @@ def test_a_channel_that_is_listed_twice_is_refused() -> None:
 
 @pytest.mark.parametrize("field", ["chunk_start_offset", "chunk_length", "message_index_length"])
 def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
-    """Also where the sum of lengths would wrap around to a byte of the file."""
+    """Also if the sum of lengths would overflow to an offset in the file."""
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5])
     reader = McapReader(log_path)
     data = log_path.read_bytes()[: reader.summary_start]
-    changes: dict[str, Any]
     for value in (2 * len(data), 2**63, 2**64 - 1):
         fields: dict[str, Any] = {field: value}
         chunks = [*reader.chunks[:-1], replace(reader.chunks[-1], **fields)]
@@ -105,8 +104,8 @@ def test_chunks_beyond_the_end_are_refused(log_path: Path, field: str) -> None:
 
 
 @pytest.mark.parametrize("field", [32, 44])
-def test_lengths_that_do_not_fit_are_refused(field: int) -> None:
-    """Bytes 32 and 44 begin the lengths of an empty map and of the name."""
+def test_invalid_lengths_are_refused(field: int) -> None:
+    """The lengths of an empty map and of the name start at bytes 32 and 44."""
     content = bytearray(content_of(ChunkIndex(1, 2, "zstd", 3, 4, 5, {}, 6, 7)))
     for wrong in (61, 2**31, 2**32 - 1):
         struct.pack_into("<I", content, field, wrong)

@@ -1,4 +1,4 @@
-"""Bytes that once broke something, and the seeds of the search for more."""
+"""Inputs that once failed, and the seeds of the fuzzer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CORPUS = sorted((FUZZ_CORPUS).iterdir())
 
 
 @pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
-def test_past_finding(path: Path) -> None:
+def test_past_findings(path: Path) -> None:
     try_bytes(path.read_bytes())
 
 

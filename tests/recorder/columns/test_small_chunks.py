@@ -39,7 +39,7 @@ def test_merged_or_not(
     apart = mcaprl.open(log_path, threads=threads, images="memory")
     assert chunks * 5 < _chunks(log_path)
     assert merged.fingerprint == apart.fingerprint
-    # As text, where NaN equals NaN.
+    # Compared as text, in which NaN equals NaN.
     assert [str(e.summary) for e in merged.episodes] == [str(e.summary) for e in apart.episodes]
     for name in ("rewards", "behavior_probs"):
         assert getattr(merged, name).tobytes() == getattr(apart, name).tobytes()
@@ -67,8 +67,8 @@ def test_an_index_may_not_lead_out_of_its_chunk(log_path: Path) -> None:
         mcaprl.open(log_path)
 
 
-def test_texts_of_one_length_and_another_form(log_path: Path) -> None:
-    """Messages as long as each other, whose texts are not: to text, as all others."""
+def test_strings_of_equal_length_and_different_layout(log_path: Path) -> None:
+    """Messages of equal length whose strings differ in length are decoded one by one."""
     reasons, policies = ["bbbb", "bb", "bbbb"], ["aa", "aaaa", "aa"]
     infos = {"reason": ""}
     rows = [

@@ -1,4 +1,4 @@
-"""Whether logged probabilities can be true: by hand, and for policies that are known."""
+"""Calibration of logged probabilities: by hand, and for known policies."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_an_epsilon_greedy_policy_has_one_likely_action(epsilon: float) -> None:
     assert few.actions == pytest.approx(8, abs=4 * found.error)
 
 
-def test_a_policy_that_never_explores_speaks_of_one_action() -> None:
+def test_a_deterministic_policy_implies_one_action() -> None:
     found = calibration(np.ones(10), spaces.Discrete(4))
     assert found is not None
     assert found.possible
@@ -64,7 +64,7 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
     assert "4.00 +- 0.00 actions; the action space has 2, so" in problems[0].what
 
 
-def test_what_cannot_be_examined_is_not() -> None:
+def test_continuous_or_unknown_probabilities_have_no_calibration() -> None:
     assert calibration(np.array([0.5, math.nan]), spaces.Discrete(2)) is None
     assert calibration(np.array([0.5, 0.0]), spaces.Discrete(2)) is None
     assert calibration(np.array([0.5, 0.5]), spaces.Box(-1, 1, (1,))) is None

@@ -16,7 +16,7 @@ from tests.support.recordings import MIXED_SPACE, record
 
 
 def small() -> mcaprl.Dataset:
-    """Three episodes: two terminal steps, one truncated, and one that just stops."""
+    """Three episodes: one terminated, one truncated, and one that is not finished."""
     return mcaprl.Dataset.from_arrays(
         observations=np.array([[0.0], [1.0], [5.0], [7.0], [8.0]], np.float32),
         next_observations=np.array([[1.0], [2.0], [6.0], [8.0], [9.0]], np.float32),
@@ -151,7 +151,7 @@ def test_logs_of_other_spaces_are_refused(tmp_path: Path) -> None:
         mcaprl.open(tmp_path)
 
 
-def test_a_mixture_claims_no_one_policy(tmp_path: Path) -> None:
+def test_a_mixture_has_no_policy_metadata(tmp_path: Path) -> None:
     box = spaces.Box(-1, 1, (2,), np.float32)
     for name in ("a", "b"):
         record(tmp_path / f"{name}.mcap", box, spaces.Discrete(2), [2], policy=name, epsilon=0.5)
@@ -164,13 +164,13 @@ def test_a_mixture_claims_no_one_policy(tmp_path: Path) -> None:
     assert [episode.policy for episode in again.episodes] == ["a", "b"]
 
 
-def test_a_file_meant_twice_counts_once(tmp_path: Path) -> None:
+def test_a_file_given_twice_is_read_once(tmp_path: Path) -> None:
     record(tmp_path / "a.mcap", spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), [3])
     path = tmp_path / "a.mcap"
     assert len(mcaprl.open([path, str(path), tmp_path, str(tmp_path / "*.mcap")])) == 3
 
 
-def test_save_over_its_own_source(tmp_path: Path) -> None:
+def test_a_dataset_can_be_saved_over_its_source(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     record(path, MIXED_SPACE, spaces.Discrete(2), [3, 4])
     data = mcaprl.open(path)

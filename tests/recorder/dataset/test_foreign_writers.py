@@ -1,4 +1,4 @@
-"""Logs of other writers are read, by whichever path, to the same values."""
+"""Logs of other writers: every path of the reader returns the same values."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TEXTS = {
 
 
 def assert_reads(path: Path, steps: Steps = STEPS, *, lengths: list[int] = LENGTHS) -> None:
-    """The file gives these transitions, and spaces that hold them."""
+    """Check that the file contains these transitions, and spaces that contain them."""
     data = mcaprl.open(path)
     fields, actual = steps.fields, steps.actual
     behind = np.roll(actual, 1)
@@ -97,7 +97,7 @@ def test_padded_payloads(log_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [b"\0" * 4, b""], ids=["too-long", "too-short"])
-def test_messages_that_do_not_fit_their_schema(log_path: Path, wrong: bytes) -> None:
+def test_messages_that_contradict_their_schema(log_path: Path, wrong: bytes) -> None:
     messages = plain_messages(STEPS)
     time_ns, data = messages[5]
     messages[5] = (time_ns, data + wrong if wrong else data[:-4])
@@ -126,8 +126,8 @@ def test_two_channels_of_one_topic(log_path: Path) -> None:
     assert_reads(log_path)
 
 
-def test_two_robots_at_once(log_path: Path) -> None:
-    """Each on a channel of its own, at the same times: one robot's episodes, then the other's."""
+def test_two_robots_record_at_the_same_time(log_path: Path) -> None:
+    """Two channels at the same times: one robot's episodes are read after the other's."""
     first, second = steps_of([4, 5]), steps_of([6, 3], seed=1)
     pairs = zip(plain_messages(first), plain_messages(second), strict=True)
     write_with_mcap(log_path, [m for pair in pairs for m in pair], channels=lambda row: row % 2)
@@ -139,7 +139,7 @@ def test_two_robots_at_once(log_path: Path) -> None:
 
 
 def test_two_channels_of_different_types(log_path: Path) -> None:
-    """The same fields and length, in another order: each is read by its own definition."""
+    """Equal fields and length in another order: each channel is read by its definition."""
     lines = PLAIN.splitlines(keepends=True)
     swapped = "".join([lines[1], lines[0], *lines[2:4], lines[5], lines[4], *lines[6:]])
     codecs = [Codec(PLAIN), Codec(swapped)]
@@ -177,7 +177,7 @@ def test_foxglove_writer(log_path: Path, messages: str) -> None:
 
 
 def test_images_of_another_writer(log_path: Path) -> None:
-    """More pictures than records, of a camera whose frame's name changes in length."""
+    """More images than records, from a camera whose frame_id changes in length."""
     from mcaprl.recorder.format import messages
 
     writer = Writer(str(log_path), chunk_size=3000)
@@ -210,7 +210,7 @@ def test_images_of_another_writer(log_path: Path) -> None:
     assert_same_bits(found.observations["state"], STEPS.fields["observation"][STEPS.actual])
 
 
-def test_an_announced_camera_that_never_sent_a_picture_is_told(log_path: Path) -> None:
+def test_an_image_topic_without_messages_is_reported(log_path: Path) -> None:
     from mcaprl.recorder.format import messages
 
     writer = Writer(str(log_path))
@@ -227,7 +227,7 @@ def test_an_announced_camera_that_never_sent_a_picture_is_told(log_path: Path) -
         mcaprl.open(log_path)
 
 
-def test_missing_fields_are_named(log_path: Path) -> None:
+def test_missing_fields_are_reported(log_path: Path) -> None:
     text = PLAIN.replace("bool final\n", "").replace("float64 reward\n", "")
     codec = Codec(text)
     messages = [
@@ -251,8 +251,8 @@ def test_no_observation(log_path: Path) -> None:
         mcaprl.open(log_path)
 
 
-def test_small_numbers_are_added_up_in_large_ones(log_path: Path) -> None:
-    """Of float32, 2**24 and 1 make 2**24."""
+def test_float32_rewards_are_summed_in_float64(log_path: Path) -> None:
+    """In float32, 2**24 + 1 is 2**24."""
     text = PLAIN.replace("float64 reward", "float32 reward")
     codec, steps = Codec(text), steps_of([3])
     steps.fields["reward"] = np.array([2**24, 1, 1, 0], np.float32)
@@ -295,7 +295,7 @@ NUMBERS = ["float64", "float32", "int64", "uint32", "int16", "uint8", "bool"]
 
 @st.composite
 def types_and_messages(draw: st.DrawFn) -> tuple[str, list[str], list[dict[str, Any]]]:
-    """A message type of numbers, arrays, lists and texts, and messages of it."""
+    """A message type of numbers, arrays, lists and strings, with messages."""
     kinds = draw(st.lists(st.sampled_from([*NUMBERS, "string"]), min_size=1, max_size=8))
     shapes = [
         "" if kind == "string" else draw(st.sampled_from(["", "[3]", "[]", "[<=4]"]))
@@ -323,13 +323,13 @@ def types_and_messages(draw: st.DrawFn) -> tuple[str, list[str], list[dict[str, 
 
 
 @given(types_and_messages(), st.booleans(), st.integers(0, 3))
-def test_columns_are_what_rosbags_decodes(
+def test_columns_equal_what_rosbags_decodes(
     tmp_path_factory: pytest.TempPathFactory,
     drawn: tuple[str, list[str], list[dict[str, Any]]],
     big_endian: bool,
     padding: int,
 ) -> None:
-    """Any type, in any byte order: the fast path, where it is taken, gives the slow one's bits."""
+    """Any type in any byte order: fast and slow path return the same bits."""
     text, names, fields = drawn
     codec = Codec(text)
     encoded = [codec.encode(big_endian=big_endian, **f) + b"\0" * padding for f in fields]

@@ -1,4 +1,4 @@
-"""Each fault of a dataset is found, told with its place, and not found where it is not."""
+"""Each problem of a dataset is reported with its place, and only where it is."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 
 
 def dataset(**changes: Any) -> Dataset:
-    """Two episodes of three steps with nothing to complain of, but for the changes."""
+    """Create two valid episodes of three steps, with the given changes."""
     rising = np.arange(14, dtype=np.float32).reshape(7, 2) / 14
     columns: dict[str, Any] = {
         "observations": rising[[0, 1, 2, 3, 4, 5]],
@@ -35,13 +35,13 @@ def dataset(**changes: Any) -> Dataset:
 
 
 def changed(column: str, at: Any, value: float) -> dict[str, Any]:
-    """A column of `dataset` with one other value."""
+    """Return a column of `dataset` with one changed value."""
     array = np.array(getattr(dataset(), column))
     array[at] = value
     return {column: array}
 
 
-def test_a_sound_dataset_has_no_findings() -> None:
+def test_a_valid_dataset_has_no_findings() -> None:
     assert lint(dataset()) == []
 
 
@@ -113,7 +113,7 @@ def test_repeated_episodes_are_named() -> None:
     )
 
 
-def test_problems_come_before_notes() -> None:
+def test_problems_are_listed_before_notes() -> None:
     findings = lint(dataset(**changed("rewards", 5, -10.0), actions=np.zeros(6, dtype=np.int64)))
     severities = [finding.severity for finding in findings]
     assert severities == sorted(severities, reverse=True)
@@ -122,7 +122,7 @@ def test_problems_come_before_notes() -> None:
 
 def test_gaps_in_time_are_measured_in_usual_steps() -> None:
     gappy = dataset()
-    # Half a second where steps are a tenth apart; from_arrays counts them so.
+    # A gap of half a second between steps of a tenth, the duration that from_arrays assumes.
     gappy.episodes[1].log_time_ns[2:] += 400_000_000
     [finding] = lint(gappy)
     assert str(finding).startswith(
@@ -130,7 +130,7 @@ def test_gaps_in_time_are_measured_in_usual_steps() -> None:
     )
 
 
-def test_several_policies_are_told(tmp_path: Path) -> None:
+def test_several_policies_are_reported(tmp_path: Path) -> None:
     recorder = RecordMcap(gym.make("CartPole-v1"), tmp_path / "mixed.mcap")
     for policy in ("one", "other"):
         recorder.policy = policy

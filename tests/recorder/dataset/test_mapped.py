@@ -1,4 +1,4 @@
-"""Images that stay on disk: the same values as in memory, in the log itself or a copy beside it."""
+"""Images on disk, in the log or in a copy beside it: the same values as in memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ in_every_way = pytest.mark.parametrize("log", ["none", "zstd", "lz4"], indirect=
 
 
 @in_every_way
-def test_mapped_images_are_those_in_memory(log: Path) -> None:
+def test_mapped_images_equal_those_in_memory(log: Path) -> None:
     memory, mapped = mcaprl.open(log, images="memory"), mcaprl.open(log, images="mapped")
     assert isinstance(mapped.observations["camera"], MappedImages)
     assert mapped.fingerprint == memory.fingerprint
@@ -72,14 +72,14 @@ def test_batches(log: Path) -> None:
     [0, -1, slice(3, 40, 7), np.array([5, 5, 2]), slice(0, 0), (slice(2, 5), 0), (4, 1, 2)],
     ids=str,
 )
-def test_indexing_is_that_of_arrays(log: Path, key: Any) -> None:
+def test_indexing_equals_that_of_arrays(log: Path, key: Any) -> None:
     memory, mapped = mcaprl.open(log, images="memory"), mcaprl.open(log, images="mapped")
     assert_same_bits(mapped.observations["camera"][key], memory.observations["camera"][key])
     with pytest.raises(IndexError):
         mapped.observations["camera"][len(mapped)]
 
 
-def test_the_dataset_tells_where_its_images_are(log: Path) -> None:
+def test_the_dataset_reports_where_its_images_are(log: Path) -> None:
     assert mcaprl.open(log).storage == "memory"
     mapped = mcaprl.open(log, images="mapped")
     assert mapped.storage == f"images on disk in {log}"
@@ -88,7 +88,7 @@ def test_the_dataset_tells_where_its_images_are(log: Path) -> None:
 
 
 @pytest.mark.parametrize("log", ["zstd"], indirect=True)
-def test_the_copy_is_made_once(log: Path) -> None:
+def test_the_copy_is_written_once(log: Path) -> None:
     mapped = mcaprl.open(log, images="mapped")
     assert mapped.storage == f"images on disk in {log}.camera.images and 1 more"
     copies = sorted(log.parent.glob("*.images"))
@@ -112,7 +112,7 @@ def test_a_copy_of_another_log_is_replaced(log: Path) -> None:
     assert mcaprl.open(log, images="mapped").fingerprint == memory.fingerprint
 
 
-def test_damage_is_found_when_it_is_read(log: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_when_the_image_is_read(log: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.mcap"
     damage(log, broken, "/rl/observation/camera", number=3)
     memory, mapped = mcaprl.open(log, images="memory"), mcaprl.open(broken, images="mapped")
@@ -138,7 +138,7 @@ def test_several_logs(tmp_path: Path) -> None:
 
 
 @in_every_way
-def test_saving_what_is_on_disk(log: Path, tmp_path: Path) -> None:
+def test_saving_images_on_disk(log: Path, tmp_path: Path) -> None:
     mapped = mcaprl.open(log, images="mapped")
     mapped.filter(lambda episode: episode.length > 100).save(tmp_path / "long.mcap")
     again = mcaprl.open(tmp_path / "long.mcap")
@@ -146,7 +146,7 @@ def test_saving_what_is_on_disk(log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("free", "expected"), [(10, True), (10**12, False)])
-def test_auto_goes_by_free_memory(
+def test_auto_depends_on_free_memory(
     log: Path, monkeypatch: pytest.MonkeyPatch, free: int, expected: bool
 ) -> None:
     monkeypatch.setattr(storage, "free_memory_bytes", lambda: free)

@@ -1,4 +1,4 @@
-"""Parts of logs: what is not asked for is not read."""
+"""Parts of logs: only selected columns and episodes are read."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_columns_of_a_dict_space(log: Path) -> None:
     assert_same_bits(part.rewards, whole.rewards)
 
 
-def test_a_part_of_a_dict_space_is_saved_as_such(log: Path, tmp_path: Path) -> None:
+def test_a_part_of_a_dict_space_is_saved(log: Path, tmp_path: Path) -> None:
     part = mcaprl.open(log, columns=["joints", "gray"])
     part.save(tmp_path / "part.mcap")
     again = mcaprl.open(tmp_path / "part.mcap")
@@ -105,7 +105,7 @@ def test_episodes(log: Path, asked: Any, meant: list[int]) -> None:
 
 
 @pytest.mark.parametrize("asked", [5, -6, [0, 9]])
-def test_episodes_that_are_not_there(log: Path, asked: Any) -> None:
+def test_missing_episodes_are_refused(log: Path, asked: Any) -> None:
     with pytest.raises(UsageError, match="the logs have 5, counted from 0"):
         mcaprl.open(log, episodes=asked)
     with pytest.raises(UsageError, match="no episodes are selected"):
@@ -140,7 +140,7 @@ def test_episodes_of_a_cut_log(log: Path, tmp_path: Path) -> None:
 
 
 def test_episodes_of_another_writer(tmp_path: Path) -> None:
-    """No `/rl/episode`, and records in any order: they are found by their counters."""
+    """Without `/rl/episode` and in any order, episodes are found by their counters."""
     messages = plain_messages(steps_of([4, 9, 2, 6]))
     order = np.random.default_rng(0).permutation(len(messages)).tolist()
     write_with_mcap(tmp_path / "log.mcap", [messages[row] for row in order])
@@ -155,7 +155,7 @@ def test_threads_read_the_same(log: Path, threads: int) -> None:
     assert mcaprl.open(log, threads=threads).fingerprint == mcaprl.open(log).fingerprint
 
 
-def test_threads_tell_of_damage(log: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_with_several_threads(log: Path, tmp_path: Path) -> None:
     damage(log, tmp_path / "log.mcap", "/rl/step", number=2)
     with pytest.raises(CorruptLogError):
         mcaprl.open(tmp_path / "log.mcap", threads=3)
@@ -165,7 +165,7 @@ def test_threads_tell_of_damage(log: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of vectors in several large chunks, forty episodes of a thousand steps."""
+    """Record vectors in several large chunks: forty episodes of a thousand steps."""
     path = tmp_path_factory.mktemp("selection") / "large.mcap"
     steps = 40_000
     frames = np.random.default_rng(0).standard_normal((steps + 1, 4), np.float32)
@@ -181,7 +181,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> None:
-    """Who looks for one episode must not touch a large file all over."""
+    """Reading one episode must not touch the whole of a large file."""
     reader = McapReader(large)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
@@ -201,14 +201,14 @@ def test_indexes_of_other_chunks_are_not_read(large: Path, tmp_path: Path) -> No
         mcaprl.open(path)
 
 
-def test_an_index_that_leads_to_fewer_messages_is_found_out(large: Path, tmp_path: Path) -> None:
+def test_an_index_with_too_few_messages_is_refused(large: Path, tmp_path: Path) -> None:
     reader = McapReader(large)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
     chunk = list(reader.message_ranges(channel))[2].chunk
     assert chunk is not None
     spoilt = bytearray(large.read_bytes())
-    # Behind opcode, length and channel stands how many bytes of entries there are.
+    # The size of the entries follows opcode, length and channel id.
     place = chunk.message_index_offsets[channel.id] + 11
     (told,) = struct.unpack_from("<I", spoilt, place)
     struct.pack_into("<I", spoilt, place, told - 16)

@@ -1,4 +1,4 @@
-"""Others' code reads our logs, and every value is the one that we read ourselves."""
+"""Other libraries read our logs and return the same values as our reader."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 def ours(path: Path) -> dict[str, dict[str, np.ndarray[Any, Any]]]:
-    """What we read: for each topic, its fields as one array over the messages."""
+    """Read each topic with our reader: one array per field."""
     dataset = mcaprl.open(path)
     leaves = observation_leaves(dataset.observation_space)
     topics: dict[str, dict[str, np.ndarray[Any, Any]]] = {}
@@ -121,7 +121,9 @@ READERS = [by_mcap_indexed, by_mcap_streaming, by_rosbags, by_node]
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_every_value_is_ours(log: Path, read: Callable[[Path], Messages]) -> None:
+def test_every_reader_returns_the_recorded_values(
+    log: Path, read: Callable[[Path], Messages]
+) -> None:
     found, expected = read(log), ours(log)
     for topic, fields in expected.items():
         for name, column in fields.items():
@@ -166,14 +168,14 @@ def test_markers_and_frames_pass_through(scene_log: Path, read: Callable[[Path],
         assert tuple(_field(translation, axis) for axis in "xyz") == moment.frames[0].position
 
 
-def test_streaming_gives_all_topics(log: Path) -> None:
+def test_streaming_reads_all_topics(log: Path) -> None:
     counts = {topic: len(messages) for topic, messages in by_mcap_streaming(log).items()}
     indexed = {topic: len(messages) for topic, messages in by_mcap_indexed(log).items()}
     assert counts == indexed
     assert counts["/rosout"] == 6
 
 
-def test_doctor_finds_nothing(log: Path) -> None:
+def test_doctor_reports_no_problem(log: Path) -> None:
     doctor = Path(sys.executable).with_name("pymcap-cli")
     need(doctor.exists(), "pymcap-cli is not installed")
     done = subprocess.run(
@@ -188,13 +190,13 @@ def _field(message: Any, name: str) -> Any:
 
 
 def _assert_equal(values: list[Any], column: np.ndarray[Any, Any], where: str) -> None:
-    """Compare as the dtype of our column, bit for bit; texts and None by their own equality."""
+    """Compare bit for bit in the dtype of our column; strings and None by ==."""
     assert len(values) == len(column), f"{where}: {len(values)} messages, not {len(column)}"
     if column.dtype.kind in "OU":
         assert [_known(value) for value in values] == column.tolist(), where
         return
     dtype = stored_dtype(column.dtype)
-    # One element at a time: a list of big integers as text must not pass through float.
+    # One element at a time: a list of big integers must not be converted to float.
     lists = [list(value) if isinstance(value, bytes) else value for value in values]
     flat = [_number(part, dtype) for value in lists for part in np.ravel(value).tolist()]
     actual = np.array(flat, dtype)
@@ -207,7 +209,7 @@ def _number(value: Any, dtype: np.dtype[Any]) -> Any:
 
 
 def _known(value: Any) -> Any:
-    """`/rl/episode` has -1 where no seed was given."""
+    """`/rl/episode` stores -1 if no seed was passed."""
     if isinstance(value, str) and value.lstrip("-").isdigit():
         value = int(value)
     return None if value == -1 else value

@@ -1,4 +1,4 @@
-"""Logs of format version 1 that were written once: they open, with what is stated, for ever."""
+"""Golden logs of format version 1: later versions read them with the same contents."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ def test_every_golden_file_is_there() -> None:
 
 
 @pytest.mark.parametrize("name", STATED)
-def test_golden_file_reads_as_stated(name: str) -> None:
+def test_golden_file_has_the_reference_contents(name: str) -> None:
     path, stated = FOLDER / f"{name}.mcap", dict(STATED[name])
     assert hashlib.sha256(path.read_bytes()).hexdigest() == stated.pop("sha256"), "it is changed"
     assert json.loads(json.dumps(contents_of(path))) == stated
     assert check_log(path) == []
 
 
-def test_values_that_are_known() -> None:
-    """Beside the hashes, one file whose contents follow from its numbers alone."""
+def test_known_values() -> None:
+    """Check one file by its formula, independently of the stored hashes."""
     (episode,) = mcaprl.open(FOLDER / "told.mcap").episodes
     assert_is_told(episode)
 
 
-def test_learner_of_a_vector() -> None:
+def test_learner_topic_of_a_vector_environment() -> None:
     learner = read_learner(FOLDER / "vector-of-environments.mcap")
     assert set(learner.epsilon.tolist()) == {0.5}
     assert learner.policy_version.max() == 7
 
 
-def test_compressions_are_those_of_their_names() -> None:
+def test_files_have_the_compression_in_their_names() -> None:
     for name, compression in (("zstd", "zstd"), ("lz4", "lz4"), ("none", "")):
         path: Path = FOLDER / f"every-space-{name}.mcap"
         assert {chunk.compression for chunk in McapReader(path).chunks} == {compression}

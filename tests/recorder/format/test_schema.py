@@ -1,4 +1,4 @@
-"""The generated messages: their text, their bytes, their names."""
+"""The generated messages: definitions, bytes and names."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mcaprl.recorder.format.spaces import observation_leaves
 from tests.support.recordings import MIXED_SPACE
 
 
-def test_step_text_by_hand() -> None:
+def test_step_definition_by_hand() -> None:
     box = spaces.Box(-1, 1, (3,), np.float32)
     name, text = step_schema(box, spaces.Discrete(4))
     assert text.splitlines() == [
@@ -48,13 +48,13 @@ def test_step_text_by_hand() -> None:
     assert is_intact("other_msgs/msg/Step", b"anything")
 
 
-def test_other_spaces_have_other_names() -> None:
+def test_different_spaces_have_different_type_names() -> None:
     box, larger = (spaces.Box(-1, 1, (n,), np.float32) for n in (3, 4))
     assert step_schema(box, spaces.Discrete(4))[0] == step_schema(box, spaces.Discrete(5))[0]
     assert step_schema(box, spaces.Discrete(4))[0] != step_schema(larger, spaces.Discrete(4))[0]
 
 
-def test_names_of_dict_leaves() -> None:
+def test_field_names_of_dict_leaves() -> None:
     names = {leaf.path: leaf.name for leaf in observation_leaves(MIXED_SPACE)}
     assert names[("joints", "q")] == "observation_joints_q"
     assert names[("Ünïcode key!",)] == "observation_n_code_key"
@@ -87,8 +87,8 @@ FIELDS = {"float64": 8, "int64": 8, "float32": 4, "uint16": 2, "uint8": 1, "bool
 @given(
     st.lists(st.tuples(st.sampled_from(list(FIELDS)), st.integers(0, 3)), min_size=1, max_size=8)
 )
-def test_any_fixed_message_has_the_bytes_that_rosbags_writes(fields: list[tuple[str, int]]) -> None:
-    """Fields in any order, so with padding; each filled with its own number."""
+def test_fixed_length_messages_equal_those_of_rosbags(fields: list[tuple[str, int]]) -> None:
+    """Fields in any order, so with padding; each field has a distinct value."""
     text = "".join(
         f"{kind}{f'[{count}]' if count else ''} f{number}\n"
         for number, (kind, count) in enumerate(fields)
@@ -111,11 +111,11 @@ def test_any_fixed_message_has_the_bytes_that_rosbags_writes(fields: list[tuple[
 
 
 @pytest.mark.parametrize("text", ["string name\n", "float32[] data\n", "geometry_msgs/Point p\n"])
-def test_no_fixed_length(text: str) -> None:
+def test_variable_length_types_have_no_dtype(text: str) -> None:
     assert message_dtype(text) is None
 
 
-def test_comments_and_constants_take_no_place() -> None:
+def test_comments_and_constants_take_no_bytes() -> None:
     dtype = message_dtype("# nothing\nuint8 A=1\nuint8 x # one byte\n\n")
     assert dtype is not None
     assert dtype.names == ("encapsulation", "x")
@@ -123,7 +123,7 @@ def test_comments_and_constants_take_no_place() -> None:
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.sampled_from(["a", "camera", "x/y_z"]))
-def test_image_layout_is_that_of_rosbags(height: int, width: int, frame: str) -> None:
+def test_image_layout_equals_that_of_rosbags(height: int, width: int, frame: str) -> None:
     from mcaprl.recorder.format.schema import fill_image_constants
 
     dtype = image_dtype(height, width, 3, "rgb8", frame)
@@ -145,7 +145,7 @@ def test_image_layout_is_that_of_rosbags(height: int, width: int, frame: str) ->
 
 
 @pytest.mark.parametrize("name", ["Speed m/s", "2nd", "a__b", "a_", "größe"])
-def test_telemetry_needs_ros_names(name: str) -> None:
+def test_telemetry_names_must_be_ros_field_names(name: str) -> None:
     with pytest.raises(SpaceError, match="no ROS field name"):
         telemetry_schema(["speed_m_s", name])
 
@@ -153,11 +153,11 @@ def test_telemetry_needs_ros_names(name: str) -> None:
 @pytest.mark.parametrize(
     "text", ["float32 x\nfloat32 x\n", "float32[99999999999999999999] x\n", "uint8 encapsulation\n"]
 )
-def test_impossible_definitions(text: str) -> None:
+def test_invalid_definitions_have_no_dtype(text: str) -> None:
     assert message_dtype(text) is None
 
 
-def test_what_a_log_cannot_hold() -> None:
+def test_unsupported_spaces_are_refused() -> None:
     discrete = spaces.Discrete(2)
     cases = [
         (spaces.Tuple([discrete]), "observation is a Tuple space"),
@@ -170,7 +170,7 @@ def test_what_a_log_cannot_hold() -> None:
             step_schema(space, discrete)
 
 
-def test_action_names_are_one_for_each() -> None:
+def test_each_action_has_one_name() -> None:
     box = spaces.Box(-1, 1, (2,), np.float32)
 
     def names(space: spaces.Space[Any], *meanings: str) -> dict[int, str]:
@@ -189,7 +189,7 @@ def test_action_names_are_one_for_each() -> None:
     st.integers(0, 2**62),
     st.none() | st.integers(0, 2**62),
 )
-def test_what_is_told_of_an_episode_is_encoded_as_rosbags_does(
+def test_episode_messages_equal_those_of_rosbags(
     reason: str, policy: str, options: str, time_ns: int, seed: int | None
 ) -> None:
     summary = EpisodeSummary(

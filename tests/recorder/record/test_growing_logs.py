@@ -1,4 +1,4 @@
-"""Logs that grow: appended to, continued in more files, locked, and read while they are written."""
+"""Growing logs: appending, rotation, locks, and reading during recording."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ONES = np.ones(2, np.int64)
 
 
 def joined(*parts: Truth) -> Truth:
-    """What several recordings were made of, one behind the other."""
+    """Concatenate the recorded values of several recordings."""
     whole = Truth()
     for part in parts:
         for name, rows in vars(part).items():
@@ -62,8 +62,8 @@ def cartpole_log(path: Path, episodes: int, first: int = 0, **options: Any) -> N
                 pass
 
 
-def test_appending_in_parts_gives_the_file_of_one_recording(log_path: Path) -> None:
-    """Byte for byte, but for the versions and times that tell when it was made."""
+def test_appending_equals_one_recording(log_path: Path) -> None:
+    """Compare byte for byte except versions and times of creation."""
     whole = log_path.with_name("whole.mcap")
     start = 10**18
     cartpole_log(whole, 6, start_time_ns=start)
@@ -77,7 +77,7 @@ def _end_of(path: Path) -> int:
     return int(mcaprl.open(path).episodes[-1].log_time_ns[-1])
 
 
-def test_appending_begins_a_file_that_is_not_there(log_path: Path) -> None:
+def test_appending_creates_a_missing_file(log_path: Path) -> None:
     cartpole_log(log_path, 2, append=True)
     assert len(mcaprl.open(log_path).episodes) == 2
 
@@ -113,7 +113,7 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
         (gym.make("CartPole-v1"), {"overwrite": True}, "choose one of the two"),
     ],
 )
-def test_what_does_not_fit_is_not_appended(
+def test_incompatible_recordings_are_not_appended(
     log_path: Path, env: Any, options: dict[str, Any], told: str
 ) -> None:
     cartpole_log(log_path, 2)
@@ -124,7 +124,7 @@ def test_what_does_not_fit_is_not_appended(
     cartpole_log(log_path, 1, append=True)
 
 
-def test_damaged_file_is_not_appended_to(log_path: Path) -> None:
+def test_a_damaged_file_is_not_appended_to(log_path: Path) -> None:
     cartpole_log(log_path, 2)
     whole = log_path.read_bytes()
     for damaged in (whole[:-9], whole[: len(whole) // 2], whole[:-40] + b"x" + whole[-39:]):
@@ -135,7 +135,7 @@ def test_damaged_file_is_not_appended_to(log_path: Path) -> None:
 
 
 def test_killed_while_appending(log_path: Path) -> None:
-    """From the first byte that is appended on, the file is one that is being written."""
+    """From the first appended byte on, the file counts as being written."""
     cartpole_log(log_path, 2)
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path, append=True)
     env.reset(seed=5)
@@ -151,7 +151,7 @@ def test_killed_while_appending(log_path: Path) -> None:
 
 @settings(max_examples=12)
 @given(st.lists(st.integers(1, 30), min_size=1, max_size=12), st.integers(1, 20_000))
-def test_rotated_files_are_the_one_file(
+def test_rotated_files_equal_one_file(
     tmp_path_factory: pytest.TempPathFactory, lengths: list[int], max_file_bytes: int
 ) -> None:
     folder = tmp_path_factory.mktemp("rotated")
@@ -169,7 +169,7 @@ def test_rotated_files_are_the_one_file(
     for path in parts:
         assert check_log(path) == []
         assert len(mcaprl.open(path).episodes) >= 1, "a file of whole episodes"
-    # Each but the last is full, and was not yet before its last episode.
+    # Each file but the last is full, and was not before its last episode.
     assert all(path.stat().st_size >= max_file_bytes for path in parts[:-1])
 
 
@@ -195,7 +195,7 @@ def test_rotation_and_appending(tmp_path: Path) -> None:
         cartpole_log(path, 1, max_file_bytes=0, overwrite=True)
 
 
-def test_file_that_got_no_episode_is_removed(tmp_path: Path) -> None:
+def test_a_file_without_episodes_is_removed(tmp_path: Path) -> None:
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), tmp_path / "a.mcap", max_file_bytes=1)
     for _ in range(2):
         env.reset(seed=0)
@@ -207,8 +207,8 @@ def test_file_that_got_no_episode_is_removed(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_part_without_a_finished_episode_is_left_out(tmp_path: Path) -> None:
-    """As a killed recorder leaves it: the other files are read all the same."""
+def test_a_file_without_a_finished_episode_is_skipped(tmp_path: Path) -> None:
+    """A killed recorder leaves such a file; the other files are read."""
     cartpole_log(tmp_path / "a.mcap", 2)
     cartpole_log(tmp_path / "b.mcap", 0)
     with pytest.warns(UserWarning, match=r"b\.mcap has no finished episode: left out"):
@@ -250,7 +250,7 @@ def _hold(path: Path) -> None:
         time.sleep(600)
 
 
-def test_lock_ends_with_its_process(log_path: Path) -> None:
+def test_the_lock_is_released_when_its_process_ends(log_path: Path) -> None:
     process = multiprocessing.get_context("spawn").Process(target=_hold, args=(log_path,))
     process.start()
     try:
@@ -266,7 +266,7 @@ def test_lock_ends_with_its_process(log_path: Path) -> None:
     cartpole_log(log_path, 1, overwrite=True)
 
 
-def test_overwriting_leaves_the_old_file_to_its_readers(log_path: Path) -> None:
+def test_overwriting_keeps_the_old_file_for_its_readers(log_path: Path) -> None:
     cartpole_log(log_path, 3)
     reader = McapReader(log_path)
     before = bytes(reader.view)
@@ -274,8 +274,8 @@ def test_overwriting_leaves_the_old_file_to_its_readers(log_path: Path) -> None:
     assert bytes(reader.view) == before
 
 
-def test_readers_see_the_finished_episodes_of_a_writer_at_work(log_path: Path) -> None:
-    """Whatever moment it is, what is read was recorded, and nothing finished is missing."""
+def test_readers_see_finished_episodes_during_recording(log_path: Path) -> None:
+    """At any time, what is read was recorded, and no finished episode is missing."""
     told: list[int] = []
     space = spaces.Dict({"x": BOX, "image": spaces.Box(0, 255, (8, 8), np.uint8)})
 
@@ -310,7 +310,7 @@ def test_readers_see_the_finished_episodes_of_a_writer_at_work(log_path: Path) -
 
 
 class Counting(gym.Env[Any, Any]):
-    """Episodes of growing length whose observations count the steps."""
+    """Record episodes of increasing length whose observations count the steps."""
 
     action_space = spaces.Discrete(2)
 

@@ -1,4 +1,4 @@
-"""What goes into a log comes out of it, bit for bit."""
+"""Round trips: a log returns what was recorded, bit for bit."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_space_json_round_trip(space: spaces.Space[Any]) -> None:
         ("{", "[" * 100_000),
     ],
 )
-def test_a_damaged_description_of_a_space_is_one_error(old: str, new: str) -> None:
+def test_a_damaged_space_description_is_one_error(old: str, new: str) -> None:
     text = space_to_json(spaces.Box(0, 255, (2, 3), np.uint8))
     assert old in text
     with pytest.raises(SpaceError, match="no description of a space"):

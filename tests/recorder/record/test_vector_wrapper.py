@@ -1,4 +1,4 @@
-"""RecordVecMcap: the log of many environments is the log of each, episode after episode."""
+"""RecordVecMcap: the log of a vector environment has the episodes of each sub-environment."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MODES = list(AutoresetMode)
 
 
 class Wanderer(gym.Env[Any, Any]):
-    """Random observations in episodes of given lengths; no reward of two members is the same."""
+    """Environment with random observations, given episode lengths and unique rewards."""
 
     metadata: dict[str, Any] = {"render_fps": 10}  # noqa: RUF012 (as Gymnasium declares it)
 
@@ -58,7 +58,7 @@ class Wanderer(gym.Env[Any, Any]):
 def members(
     folder: Path, space: spaces.Space[Any], lengths: list[list[int]]
 ) -> list[Callable[[], gym.Env[Any, Any]]]:
-    """Environments that each record themselves, so that the vector's log can be compared."""
+    """Create sub-environments that are recorded individually, for comparison."""
 
     def make(number: int) -> gym.Env[Any, Any]:
         env = Wanderer(space, lengths[number], seed=number)
@@ -68,7 +68,7 @@ def members(
 
 
 def act_for(env: mcaprl.RecordVecMcap, steps: int, *, seed: int = 0) -> None:
-    """Act at random, with a probability that the action tells; reset what has ended, if needed."""
+    """Act at random with a probability that follows from the action; reset if required."""
     env.reset(seed=seed)
     random = np.random.default_rng(seed)
     for _ in range(steps):
@@ -93,7 +93,7 @@ def assert_same_episode(found: Episode, expected: Episode) -> None:
 
 
 def check_against_members(folder: Path) -> None:
-    """Each episode of the vector's log is one of a member's, and none is missing."""
+    """Each episode of the vector's log is one of a sub-environment's, and none is missing."""
     data = mcaprl.open(folder / "vector.mcap")
     assert check_log(folder / "vector.mcap") == []
     waiting: list[Episode] = []
@@ -126,10 +126,10 @@ def check_against_members(folder: Path) -> None:
     ],
     ids=["vector", "scalar", "discrete", "multi-discrete", "multi-binary", "image", "dict"],
 )
-def test_every_member_is_in_the_log(
+def test_every_sub_environment_is_recorded(
     tmp_path: Path, space: spaces.Space[Any], mode: AutoresetMode
 ) -> None:
-    """The vector returns its own buffers, which it overwrites in the next step."""
+    """The vector environment overwrites the returned buffers in the next step."""
     makers = members(tmp_path, space, [[3, 1, 70], [5], [1, 2]])
     envs = SyncVectorEnv(makers, copy=False, autoreset_mode=mode)
     with closing(mcaprl.RecordVecMcap(envs, tmp_path / "vector.mcap", start_time_ns=5)) as env:
@@ -143,7 +143,7 @@ def test_every_member_is_in_the_log(
     mode=st.sampled_from(MODES),
     steps=st.integers(1, 30),
 )
-def test_any_lengths(
+def test_episodes_of_any_lengths(
     tmp_path_factory: pytest.TempPathFactory,
     lengths: list[list[int]],
     mode: AutoresetMode,
@@ -188,7 +188,7 @@ def cartpoles(count: int, mode: AutoresetMode = AutoresetMode.NEXT_STEP) -> Any:
     )
 
 
-def test_metadata_is_that_of_one_environment(log_path: Path) -> None:
+def test_metadata_describes_one_sub_environment(log_path: Path) -> None:
     mcaprl.RecordVecMcap(cartpoles(2), log_path, seed=3, policy="random", epsilon=1.0).close()
     single = log_path.with_name("single.mcap")
     env = gym.make("CartPole-v1", sutton_barto_reward=True)
@@ -205,7 +205,7 @@ def test_natively_batched_environment(log_path: Path) -> None:
             env.step(np.ones(4, np.int64))
     data = mcaprl.open(log_path)
     assert data.env_id == "CartPole-v1"
-    # Pushed one way only, every pole falls within a dozen steps.
+    # Pushed to one side only, every pole falls within a dozen steps.
     assert {episode.reason for episode in data.episodes[:-4]} == {"terminated"}
     assert all(8 <= episode.length <= 11 for episode in data.episodes[:-4])
 
@@ -220,7 +220,7 @@ def test_learner_topic(log_path: Path) -> None:
     times = np.concatenate([episode.log_time_ns[:-1] for episode in data.episodes])
     assert learner.log_time_ns.tolist() == times.tolist(), "one message for each transition"
     firsts = [episode.epsilon for episode in data.episodes]
-    # The first three episodes begin before any step; `epsilon` was not known then.
+    # The first three episodes start before any step, when `epsilon` was unknown.
     assert all(math.isnan(epsilon) for epsilon in firsts[:3])
     start = 0
     for episode in data.episodes[:3]:
@@ -239,7 +239,7 @@ def test_log_without_learner(log_path: Path) -> None:
         read_learner(log_path)
 
 
-def test_error_ends_all_episodes_before_the_step(log_path: Path) -> None:
+def test_an_error_ends_all_episodes_before_the_step(log_path: Path) -> None:
     envs = cartpoles(2)
     env = mcaprl.RecordVecMcap(envs, log_path)
     env.reset(seed=0)
@@ -258,7 +258,7 @@ def test_error_ends_all_episodes_before_the_step(log_path: Path) -> None:
     assert told == [(2, "interrupted"), (2, "interrupted")]
 
 
-def test_ended_environment_needs_its_reset(log_path: Path) -> None:
+def test_an_ended_environment_has_to_be_reset(log_path: Path) -> None:
     with closing(mcaprl.RecordVecMcap(cartpoles(2, AutoresetMode.DISABLED), log_path)) as env:
         env.reset(seed=0)
         with pytest.raises(gym.error.ResetNeeded):  # noqa: PT012
@@ -266,7 +266,7 @@ def test_ended_environment_needs_its_reset(log_path: Path) -> None:
                 env.step(np.ones(2, np.int64))
 
 
-def test_what_is_refused(log_path: Path) -> None:
+def test_invalid_arguments_are_refused(log_path: Path) -> None:
     with pytest.raises(UsageError, match="RecordMcap wraps single"):
         mcaprl.RecordVecMcap(gym.make("CartPole-v1"), log_path)  # type: ignore[arg-type]
     silent = cartpoles(2)
@@ -286,7 +286,7 @@ def test_what_is_refused(log_path: Path) -> None:
         env.reset()
 
 
-def test_final_observation_must_be_told(log_path: Path) -> None:
+def test_the_final_observation_is_required(log_path: Path) -> None:
     class Forgetful(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         def step(self, actions: Any) -> Any:
             return *self.env.step(actions)[:4], {}
@@ -300,7 +300,7 @@ def test_final_observation_must_be_told(log_path: Path) -> None:
     assert {e.reason for e in mcaprl.open(log_path).episodes} == {"interrupted"}
 
 
-def test_large_images_take_little_room_at_first(log_path: Path) -> None:
+def test_large_images_preallocate_little_memory(log_path: Path) -> None:
     class Film(gym.Env[Any, Any]):
         observation_space = spaces.Box(0, 255, (480, 640, 3), np.uint8)
         action_space = spaces.Discrete(2)

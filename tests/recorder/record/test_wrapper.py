@@ -1,4 +1,4 @@
-"""RecordMcap: what is logged when, and what happens to episodes that are broken off."""
+"""RecordMcap: what is recorded when, and what happens to interrupted episodes."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_episode_ends_before_an_exception(log_path: Path) -> None:
     assert data.next_observations.tolist() == [[1, 10]]
 
 
-def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
+def test_another_dtype_is_cast_with_one_warning(log_path: Path) -> None:
     rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
     env = mcaprl.RecordMcap(scripted(rows), log_path)
     with pytest.warns(UserWarning, match="observation is float64, its space declares float32"):
@@ -197,7 +197,7 @@ def test_other_dtype_is_said_once_and_cast(log_path: Path) -> None:
     assert mcaprl.open(log_path).observations.tolist() == [two(0.1, 0.2).tolist()]
 
 
-def test_what_a_space_cannot_hold_is_refused(log_path: Path) -> None:
+def test_values_that_the_dtype_cannot_represent_are_refused(log_path: Path) -> None:
     scalar = spaces.Dict({"a": spaces.Box(0, 255, (), np.uint8), "b": spaces.Discrete(5)})
     for number, bad in enumerate([{"a": 300, "b": 1}, {"a": 3, "b": 2.7}, {"a": 3}, None]):
         rows = [({"a": 1, "b": 2}, 0.0, False, False), (bad, 1.0, False, False)]
@@ -224,7 +224,7 @@ def test_what_a_space_cannot_hold_is_refused(log_path: Path) -> None:
         (spaces.Box(-1, 1, (2,), np.float32), [0.5, -0.5], [0.5, -0.5]),
     ],
 )
-def test_actions_are_kept_or_refused(log_path: Path, space: Any, action: Any, kept: Any) -> None:
+def test_actions_are_stored_or_refused(log_path: Path, space: Any, action: Any, kept: Any) -> None:
     env = mcaprl.RecordMcap(ScriptedEnv(BOX, space, [ONE]), log_path)
     env.reset()
     if kept is None:
@@ -238,7 +238,7 @@ def test_actions_are_kept_or_refused(log_path: Path, space: Any, action: Any, ke
 
 
 def test_large_observations_make_small_chunks(log_path: Path) -> None:
-    """Chunks are bounded in bytes, too: no reader takes one of any size."""
+    """Chunks are limited in bytes, because readers limit the size of chunks."""
     image = spaces.Box(0, 255, (720, 1280, 3), np.uint8)
     rows = [(np.full(image.shape, k, np.uint8), 0.0, False, k == 9) for k in range(10)]
     env = mcaprl.RecordMcap(ScriptedEnv(image, spaces.Discrete(3), [rows]), log_path)
@@ -250,7 +250,7 @@ def test_large_observations_make_small_chunks(log_path: Path) -> None:
     assert mcaprl.open(log_path).observations[:, 5, 7, 1].tolist() == list(range(9))
 
 
-def test_policy_is_that_of_the_episodes_start(log_path: Path) -> None:
+def test_the_policy_name_is_read_at_the_episodes_start(log_path: Path) -> None:
     env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="a")
     env.reset()
     env.step(0)
@@ -262,13 +262,13 @@ def test_policy_is_that_of_the_episodes_start(log_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [{"step_duration_s": 0.0}, {"start_time_ns": -5}])
-def test_times_must_rise(log_path: Path, options: dict[str, Any]) -> None:
+def test_log_times_must_increase(log_path: Path, options: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="times must rise"):
         mcaprl.RecordMcap(scripted(ONE), log_path, **options)
     assert not log_path.exists()
 
 
-def test_what_reset_refuses(log_path: Path) -> None:
+def test_invalid_reset_arguments_are_refused(log_path: Path) -> None:
     env = mcaprl.RecordMcap(scripted(ONE), log_path)
     with pytest.raises(UsageError, match="2\\*\\*63"):
         env.reset(seed=2**64)
@@ -310,7 +310,7 @@ def test_disk_full_leaves_the_finished_episodes(
 
 @pytest.fixture
 def _hears_sigint() -> Iterator[None]:
-    """A test run in the background may ignore SIGINT, as shells arrange it."""
+    """Restore SIGINT, which shells make background processes ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -318,7 +318,7 @@ def _hears_sigint() -> Iterator[None]:
 
 @pytest.mark.usefixtures("_hears_sigint")
 def test_interrupts_at_any_moment_leave_whole_episodes(log_path: Path) -> None:
-    """Ctrl-C a hundred times, each at another moment of a recording."""
+    """Interrupt a recording a hundred times, each at another time."""
     main = threading.get_ident()
     for trial in range(100):
         path = log_path.with_name(f"{trial}.mcap")
@@ -355,13 +355,13 @@ def test_existing_file_is_kept(log_path: Path) -> None:
     mcaprl.RecordMcap(scripted(ONE), log_path, overwrite=True).close()
 
 
-def test_unwritable_place(tmp_path: Path) -> None:
+def test_an_unwritable_path_is_one_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="cannot write"):
         mcaprl.RecordMcap(scripted(ONE), tmp_path / "file" / "log.mcap")
 
 
-def test_unsupported_spaces_make_no_file(log_path: Path) -> None:
+def test_unsupported_spaces_create_no_file(log_path: Path) -> None:
     env = ScriptedEnv(spaces.Text(5), spaces.Discrete(2), [])
     with pytest.raises(SpaceError, match="observation is a Text space"):
         mcaprl.RecordMcap(env, log_path)
@@ -417,10 +417,10 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
     assert math.isclose(data.episodes[0].total_reward, data.episodes[0].length)
 
 
-def test_a_signal_that_waits_keeps_nothing_alive() -> None:
-    """A buffer that is looked at when the signal comes can be emptied before it is handled."""
+def test_a_deferred_signal_keeps_no_references() -> None:
+    """A buffer that is exported when the signal arrives can be cleared before it is handled."""
     buffer = BytesIO(b"pictures")
-    # A shell that starts pytest in the background has it ignore Ctrl-C.
+    # A shell that starts pytest in the background makes it ignore Ctrl-C.
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def look() -> int:

@@ -1,4 +1,4 @@
-"""Files that are no logs, or no longer whole: a clear refusal, never a wrong value."""
+"""Files that are not logs or are damaged: a clear error, never a wrong value."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def test_no_mcap(tmp_path: Path) -> None:
+def test_a_file_that_is_not_mcap(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_text("hello")
     with pytest.raises(NotMcapError, match="is not an MCAP file"):
@@ -60,7 +60,7 @@ def test_log_without_episodes(log_path: Path) -> None:
         mcaprl.open(log_path)
 
 
-def test_later_version(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_later_format_version_is_refused(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as later:
         later.setattr("mcaprl.recorder.format.metadata.FORMAT_VERSION", "2")
         record(log_path, BOX, spaces.Discrete(2), [2])
@@ -78,7 +78,7 @@ def test_good_log_has_no_problems(log_path: Path, good: bytes) -> None:
 def test_a_flipped_bit_is_found(
     tmp_path_factory: pytest.TempPathFactory, good: bytes, data: st.DataObject
 ) -> None:
-    """Wherever it is: `check` tells of it, and reading gives the same data or one of our errors."""
+    """`check` reports a flipped bit anywhere; reading returns the same data or raises our errors."""
     where = data.draw(st.integers(0, 8 * len(good) - 1))
     broken = bytearray(good)
     broken[where // 8] ^= 1 << where % 8
@@ -90,7 +90,7 @@ def test_a_flipped_bit_is_found(
 
 @settings(max_examples=100)
 @given(data=st.data())
-def test_a_cut_file_gives_its_finished_episodes(
+def test_the_finished_episodes_of_a_cut_file_are_read(
     tmp_path_factory: pytest.TempPathFactory, good: bytes, data: st.DataObject
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "cut.mcap"
@@ -115,7 +115,7 @@ def _reads_right_or_refuses(path: Path, good: bytes) -> None:
     assert found.actions.tobytes() == expected.actions[:steps].tobytes()
 
 
-def test_zip_bomb_is_not_inflated() -> None:
+def test_a_decompression_bomb_is_refused() -> None:
     bomb = zstandard.compress(bytes(2**28))
     assert len(bomb) < 50_000
     chunk = _chunk(bomb, claimed=100)
@@ -145,7 +145,7 @@ def test_index_outside_its_chunk(offset: int) -> None:
 @settings(max_examples=50)
 @given(st.permutations(range(12)), st.integers(0, 5))
 def test_gather_of_any_order(order: list[int], gap: int) -> None:
-    """Messages with others between them, in any order: the fancy index and the plain view agree."""
+    """Interleaved messages in any order: indexed and contiguous access return the same."""
     dtype = message_dtype("uint32 x\n")
     assert dtype is not None
     rows = message_rows(12, dtype, 1)
@@ -156,7 +156,7 @@ def test_gather_of_any_order(order: list[int], gap: int) -> None:
     assert gather(memoryview(chunk), index, rows.dtype)["payload"]["x"].tolist() == list(order)
 
 
-def test_doubled_channel(log_path: Path) -> None:
+def test_duplicate_channels_are_refused(log_path: Path) -> None:
     writer = Writer(str(log_path))
     writer.start("ros2")
     schema = writer.register_schema("a/msg/B", "ros2msg", b"float64 x\n")

@@ -1,4 +1,4 @@
-"""`check`: whatever contradicts itself in a log is told, with its place and what to do."""
+"""`check` reports every contradiction in a log, with its place and the next step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Change = Callable[[np.ndarray[Any, Any]], None]
 
 
 def unchanged(message: np.ndarray[Any, Any]) -> None:
-    """Leave a record as it is."""
+    """Return a record unchanged."""
 
 
 def rewritten(
@@ -46,7 +46,7 @@ def rewritten(
     strings: dict[str, str] | None = None,
     leave_out: str = "",
 ) -> Path:
-    """The same log by a writer with a fault: every byte is where and what its CRCs say.
+    """Write the same log by a faulty writer, with valid CRCs.
 
     Args:
         path: of a good log.
@@ -118,17 +118,17 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 2, truncated=False), "reports truncated True, its records False"),
     ],
 )
-def test_episodes_that_contradict_themselves(good: Path, change: Change, told: str) -> None:
+def test_inconsistent_episodes_are_reported(good: Path, change: Change, told: str) -> None:
     problems = check_log(rewritten(good, change))
     assert any(told in problem.what for problem in problems), problems
     assert all("mcaprl recover" in problem.next for problem in problems)
 
 
-def test_nothing_is_changed_by_rewriting(good: Path) -> None:
+def test_rewriting_changes_no_value(good: Path) -> None:
     assert check_log(rewritten(good)) == []
 
 
-def test_return_that_is_not_the_rewards_sum(log_path: Path) -> None:
+def test_a_wrong_return_is_reported(log_path: Path) -> None:
     write_log(log_path, 2)
     problems = check_log(rewritten(log_path, at(1, 1, reward=1e6)))
     assert ["reports return" in problem.what for problem in problems] == [True]
@@ -136,7 +136,7 @@ def test_return_that_is_not_the_rewards_sum(log_path: Path) -> None:
 
 
 def resealed(data: bytearray) -> bytes:
-    """Give a changed file the CRCs of its data and summary, so that only the change is wrong."""
+    """Update the CRCs of a changed file's data and summary, so that only the change is wrong."""
     footer = len(data) - 8 - 29
     summary_start, _ = struct.unpack_from("<QQ", data, footer + 9)
     struct.pack_into("<I", data, summary_start - 4, zlib.crc32(data[: summary_start - 13]))
@@ -144,7 +144,7 @@ def resealed(data: bytearray) -> bytes:
     return bytes(data)
 
 
-def test_message_index_that_is_wrong(good: Path) -> None:
+def test_a_wrong_message_index_is_reported(good: Path) -> None:
     reader = McapReader(good)
     channel = reader.channel_of("/rl/step")
     assert channel is not None
@@ -159,11 +159,11 @@ def test_message_index_that_is_wrong(good: Path) -> None:
     assert f"chunk at byte {chunk.chunk_start_offset}, /rl/step, log_time" in problem.where
 
 
-def test_summary_that_miscounts(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_message_count_is_reported(log_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counted = Summary.to_bytes
 
     def miscount(summary: Summary, start: int) -> bytes:
-        # /rl/episode: of /rl/step the reader itself says so.
+        # Of /rl/episode; the reader itself reports it for /rl/step.
         summary.counts[2] += 1
         return counted(summary, start)
 
@@ -173,15 +173,15 @@ def test_summary_that_miscounts(log_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert any("the summary counts" in problem.what for problem in check_log(log_path))
 
 
-def test_metadata_of_other_spaces(good: Path) -> None:
+def test_metadata_with_other_spaces_is_reported(good: Path) -> None:
     other = spaces.Dict({**SPACE.spaces, "x": spaces.Box(-1, 1, (3,), np.float32)})
     strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
     (problem,) = check_log(rewritten(good, strings=strings))
     assert "is not that of the metadata's spaces" in problem.what
 
 
-def test_pictures_that_are_missing(good: Path) -> None:
-    """Or are of another size than the metadata says."""
+def test_missing_images_are_reported(good: Path) -> None:
+    """Images are missing, or their size differs from the metadata."""
     (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
     assert problem.what == "11 images for 15 records, 4 have none"
     other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
@@ -190,8 +190,8 @@ def test_pictures_that_are_missing(good: Path) -> None:
     assert problem.what == "images on /rl/observation/eye do not match the metadata's space"
 
 
-def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) -> None:
-    """Where no CRC covers the schema: it is told of, and nothing is recovered from it."""
+def test_an_image_type_without_a_field_is_reported(log_path: Path, tmp_path: Path) -> None:
+    """The schema is not covered by a CRC: it is reported, and nothing is recovered from it."""
     write_log(log_path, 2)
     data = without_crcs(log_path.read_bytes())
     assert data.count(b"string encoding") >= 2
@@ -203,7 +203,7 @@ def test_pictures_whose_type_has_lost_a_field(log_path: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("threads", [2, 5])
-def test_threads_find_the_same(good: Path, threads: int) -> None:
+def test_several_threads_find_the_same_problems(good: Path, threads: int) -> None:
     assert check_log(good, threads=threads) == []
     spoilt = bytearray(good.read_bytes())
     for chunk in McapReader(good).chunks[1:3]:
@@ -214,7 +214,7 @@ def test_threads_find_the_same(good: Path, threads: int) -> None:
     assert check_log(good, threads=threads) == problems
 
 
-def test_attachment_that_is_damaged(good: Path) -> None:
+def test_a_damaged_attachment_is_reported(good: Path) -> None:
     data = bytearray(good.read_bytes())
     data[data.index(b"foxglove-layout.json") + 60] ^= 1
     good.write_bytes(resealed(data))
@@ -222,7 +222,7 @@ def test_attachment_that_is_damaged(good: Path) -> None:
 
 
 def test_each_chunk_is_read_once(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for those of `/rl/episode`, which are read again with all of them at hand."""
+    """Except the chunks of `/rl/episode`, which are read again at the end."""
     read: list[int] = []
     once = chunks.chunk_records
 

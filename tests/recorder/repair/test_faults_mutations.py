@@ -1,4 +1,4 @@
-"""Spoilt files are read right or refused: no crash, no hang, no wrong value, no flood."""
+"""Mutated files are read correctly or refused: no crash, no hang, no wrong value."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FORKS.set_forkserver_preload(["tests.support.faults"])
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.__name__)
 def test_mutated_files(tmp_path: Path, mutation: Mutation) -> None:
-    """In a process of its own, which has so much memory and no more."""
+    """Run in a separate process with limited memory."""
     told, telling = FORKS.Pipe(duplex=False)
     trials = count(12, 1250)
     process = FORKS.Process(target=_try_all, args=(tmp_path, mutation, trials, telling))
@@ -61,7 +61,7 @@ def _try_all(folder: Path, mutation: Mutation, trials: int, telling: Any) -> Non
         spoilt = mutation(chance.choice(originals), chance)
         path.write_bytes(spoilt)
         try:
-            # A hang is a failure, too.
+            # A hang is a failure.
             signal.alarm(60)
             began = time.process_time()
             seen[_outcome(path)] += 1
@@ -82,7 +82,7 @@ def _limit_memory() -> None:
 
 
 def _outcome(path: Path) -> str:
-    """Read, check and recover a file; what is given must be what was recorded."""
+    """Read, check and recover a file; returned values must be those that were recorded."""
     out = path.with_name("out.mcap")
     problems = check_log(path)
     with warnings.catch_warnings():

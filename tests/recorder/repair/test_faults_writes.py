@@ -1,4 +1,4 @@
-"""Disks that are full, and writes that fail: one clear error, and no finished episode is lost."""
+"""Full disks and failing writes: one clear error, and no finished episode is lost."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 
 
 class FailingFile(FileIO):
-    """Counts writes, and fails from one on; a part of that one may have been written."""
+    """File that counts writes and fails from the n-th on, after writing a part of it."""
 
     writes_left = 0
     error = errno.ENOSPC
@@ -53,7 +53,7 @@ class FailingFile(FileIO):
 
 @contextlib.contextmanager
 def failing(writes: int, chance: random.Random) -> Iterator[None]:
-    """Let so many writes pass; those behind them fail, each time in another way."""
+    """Let this many writes pass; later ones fail in different ways."""
     FailingFile.writes_left, FailingFile.error = writes, chance.choice(ERRORS)
     FailingFile.part = chance.choice([0.0, 0.5, 0.99])
     FailingFile.truncates = chance.random() < 0.5
@@ -63,7 +63,7 @@ def failing(writes: int, chance: random.Random) -> Iterator[None]:
 
 
 def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
-    """Record; how many episodes were finished when it failed."""
+    """Record, and return the number of episodes finished at the failure."""
     env = None
     try:
         env = mcaprl.RecordMcap(Told(), path, **options)
@@ -78,13 +78,13 @@ def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
     finally:
         finished = env.episodes if env is not None else 0
         if env is not None:
-            # What fails once is not tried again, nor told of again.
+            # A failed write is not repeated, nor reported twice.
             env.close()
     return finished
 
 
 def assert_all_there(path: Path, finished: int) -> None:
-    """All finished episodes come back, and one more if the write that failed had its chunk."""
+    """All finished episodes are read, and one more if the failing write had written its chunk."""
     out = path.with_name("out.mcap")
     try:
         recover_log(path, out, overwrite=True)
@@ -116,7 +116,7 @@ def test_every_write_fails_once(log_path: Path) -> None:
 
 
 class Later(Told):
-    """Begins with the fourth episode."""
+    """Start with the fourth episode."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -153,8 +153,8 @@ def test_vector_recording_on_a_full_disk(log_path: Path) -> None:
                 assert len(mcaprl.open(log_path).episodes) >= env.episodes
 
 
-def test_file_may_not_grow(log_path: Path) -> None:
-    """The system itself refuses: a limit to the size of files stands for a full disk."""
+def test_a_file_size_limit_is_one_error(log_path: Path) -> None:
+    """A file size limit of the system simulates a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     for limit in (3_000, 5_000, 20_000, 60_000):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
@@ -167,7 +167,7 @@ def test_file_may_not_grow(log_path: Path) -> None:
 
 
 def test_recovering_onto_a_full_disk(log_path: Path) -> None:
-    """The damaged file is as before, and nothing half done is left."""
+    """The damaged file is unchanged, and no partial file remains."""
     write_log(log_path, 3)
     before = log_path.read_bytes()
     with failing(6, random.Random(0)), pytest.raises(LogError, match="cannot write"):
@@ -176,7 +176,7 @@ def test_recovering_onto_a_full_disk(log_path: Path) -> None:
     assert log_path.read_bytes() == before
 
 
-def test_environment_is_closed_all_the_same(log_path: Path) -> None:
+def test_the_environment_is_closed_after_a_failed_write(log_path: Path) -> None:
     closed = []
 
     class Closes(Told):

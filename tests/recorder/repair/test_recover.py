@@ -1,4 +1,4 @@
-"""Recovering: all that is sound is in the new file, what is not is told, and nothing is wrong."""
+"""Recovery: all valid records are in the new file, losses are reported, no value is wrong."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LENGTHS = [40, 9, 60, 25]
 
 
 class Recorded(tuple[bytes, Truth]):
-    """A log and what it was made of; short in hypothesis' reports."""
+    """A log and the values that it was recorded from, with a short repr."""
 
     def __repr__(self) -> str:
         return "Recorded"
@@ -62,7 +62,7 @@ def good(truth: tuple[bytes, Truth]) -> bytes:
 
 
 def episodes_of(truth: Truth, chosen: list[int]) -> Truth:
-    """The part of a recording that some of its episodes are."""
+    """Select some episodes of the recorded values."""
     bounds = np.cumsum([0, *LENGTHS])
     rows = [row for k in chosen for row in range(bounds[k], bounds[k + 1])]
     return Truth(**{name: [column[row] for row in rows] for name, column in vars(truth).items()})
@@ -79,7 +79,7 @@ def recovered(path: Path, damaged: bytes, **options: Any) -> tuple[Recovery, mca
 
 
 def chunks_of(data: bytes, topic: str, path: Path) -> list[tuple[int, int]]:
-    """Where the chunks of a topic begin and how long they are."""
+    """Return offsets and lengths of a topic's chunks."""
     path.write_bytes(data)
     reader = McapReader(path)
     channel = reader.channel_of(topic)
@@ -91,7 +91,7 @@ def chunks_of(data: bytes, topic: str, path: Path) -> list[tuple[int, int]]:
     ]
 
 
-def test_whole_file_loses_nothing(log_path: Path, truth: tuple[bytes, Truth]) -> None:
+def test_an_intact_file_loses_nothing(log_path: Path, truth: tuple[bytes, Truth]) -> None:
     recovery, data = recovered(log_path, truth[0])
     assert not recovery.has_losses
     assert recovery.episodes == 4
@@ -134,20 +134,18 @@ def test_file_without_summary_loses_nothing(log_path: Path, truth: tuple[bytes, 
         assert not recovery.has_losses or cut < start
 
 
-def test_a_damaged_header_costs_nothing_else(log_path: Path, truth: tuple[bytes, Truth]) -> None:
+def test_a_damaged_header_loses_nothing_else(log_path: Path, truth: tuple[bytes, Truth]) -> None:
     good, recorded = truth
     spoilt = bytearray(good)
-    # Behind the magic, opcode and length: the length of the profile.
+    # The length of the profile follows the magic, the opcode and the record length.
     spoilt[8 + RECORD_HEADER_BYTES + 3] = 255
     recovery, data = recovered(log_path, bytes(spoilt))
     assert_holds(data, recorded)
     assert [damage.offset for damage in recovery.damages][:1] == [8]
 
 
-def test_a_lost_channel_costs_its_messages_alone(
-    log_path: Path, truth: tuple[bytes, Truth]
-) -> None:
-    """They stand in chunks with those of a channel that is known."""
+def test_a_lost_channel_loses_only_its_messages(log_path: Path, truth: tuple[bytes, Truth]) -> None:
+    """Its messages are in chunks with those of a known channel."""
     good, recorded = truth
     log_path.write_bytes(good)
     reader = McapReader(log_path)
@@ -166,7 +164,7 @@ def test_a_lost_channel_costs_its_messages_alone(
 
 @pytest.mark.parametrize("topic", ["/rl/step", "/rl/observation/picture"])
 @pytest.mark.parametrize("number", range(4))
-def test_damaged_chunk_costs_its_episode(
+def test_a_damaged_chunk_loses_its_episode(
     log_path: Path, truth: tuple[bytes, Truth], topic: str, number: int
 ) -> None:
     good, recorded = truth
@@ -181,7 +179,7 @@ def test_damaged_chunk_costs_its_episode(
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Offset, opcode and length of all records."""
+    """Return offset, opcode and length of all records."""
     offset = 8
     while offset < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, offset)
@@ -191,10 +189,10 @@ def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 @pytest.mark.parametrize("claimed", [0, 7, 10_000, 2**62, 2**64 - 1])
 @pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA])
-def test_wrong_length_costs_no_more_than_its_record(
+def test_a_wrong_length_loses_only_its_record(
     log_path: Path, truth: tuple[bytes, Truth], opcode: Opcode, claimed: int
 ) -> None:
-    """What stands behind is found again, wherever the length says that it would be."""
+    """The records after it are found despite the wrong length."""
     good, recorded = truth
     places = [offset for offset, found, _ in records_of(good) if found == opcode]
     step_chunks = [start for start, _ in chunks_of(good, "/rl/step", log_path)]
@@ -226,7 +224,7 @@ def test_records_in_any_order(log_path: Path, truth: tuple[bytes, Truth]) -> Non
     assert_holds(data, recorded)
 
 
-def test_doubled_chunks_count_once(log_path: Path, truth: tuple[bytes, Truth]) -> None:
+def test_duplicate_chunks_are_read_once(log_path: Path, truth: tuple[bytes, Truth]) -> None:
     good, recorded = truth
     start, length = chunks_of(good, "/rl/step", log_path)[2]
     chunk = good[start : start + length]
@@ -236,18 +234,18 @@ def test_doubled_chunks_count_once(log_path: Path, truth: tuple[bytes, Truth]) -
 
 
 def killed(path: Path, steps: int) -> tuple[bytes, Truth]:
-    """A recording that was killed in its second episode, which has some chunks on disk."""
+    """Record a log that is killed in its second episode, with some of its chunks on disk."""
     space, whole = spaces.Box(0, 255, (20, 20), np.uint8), path.with_name("whole.mcap")
     truth = record(whole, space, spaces.Discrete(2), [3, steps + 50])
     pictures = chunks_of(whole.read_bytes(), "/rl/observation/image", path)
     data = whole.read_bytes()
     whole.unlink()
-    # Pictures are written each hundred, rows of /rl/step each 8192.
+    # Images are written in chunks of 100, rows of /rl/step in chunks of 8192.
     behind = [offset for offset, _ in pictures if offset > 0]
     return data[: behind[-1]], truth
 
 
-def test_unfinished_episode_can_be_kept(log_path: Path) -> None:
+def test_an_unfinished_episode_can_be_kept(log_path: Path) -> None:
     damaged, truth = killed(log_path, 8200)
     recovery, data = recovered(log_path, damaged)
     assert [episode.length for episode in data.episodes] == [3]
@@ -280,7 +278,7 @@ def test_only_an_unfinished_episode(log_path: Path) -> None:
     assert recovery.episodes == len(data.episodes) == 1
 
 
-def test_hopeless_files(log_path: Path, good: bytes) -> None:
+def test_unrecoverable_files(log_path: Path, good: bytes) -> None:
     out = log_path.with_name("out.mcap")
     for data, kind in (
         (b"", NotMcapError),
@@ -312,8 +310,8 @@ def test_paths_that_are_refused(log_path: Path, good: bytes) -> None:
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_files_of_others_keep_their_topics(log_path: Path, use_chunking: bool) -> None:
-    """Any MCAP can be recovered, JSON and all, with profile, metadata and attachments."""
+def test_files_of_other_writers_keep_their_topics(log_path: Path, use_chunking: bool) -> None:
+    """Any MCAP file can be recovered, including JSON topics, profile, metadata, attachments."""
     writer = Writer(
         str(log_path), use_chunking=use_chunking, chunk_size=500, compression=CompressionType.LZ4
     )
@@ -345,7 +343,7 @@ def test_files_of_others_keep_their_topics(log_path: Path, use_chunking: bool) -
     ]
 
 
-def test_command_tells_and_exits(
+def test_command_output_and_exit_codes(
     log_path: Path, good: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log_path.write_bytes(good)
@@ -367,10 +365,8 @@ def test_command_tells_and_exits(
 
 
 @pytest.mark.parametrize("other", [b"/rl/step", b"/rl/episode", b"mcaprl_msgs/msg/Episode"])
-def test_a_log_whose_steps_have_lost_their_name(
-    log_path: Path, tmp_path: Path, other: bytes
-) -> None:
-    """What else is in it is no log: nothing is kept of a log without an episode."""
+def test_a_log_without_the_step_topic(log_path: Path, tmp_path: Path, other: bytes) -> None:
+    """Nothing is kept of a log without an episode."""
     record(log_path, SPACE, spaces.Discrete(2), [4, 5])
     data = log_path.read_bytes()
     for name in {b"mcaprl.dataset", b"/rl/step", other}:
@@ -382,8 +378,8 @@ def test_a_log_whose_steps_have_lost_their_name(
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_the_search_for_records_copies_nothing_of_the_rest(log_path: Path) -> None:
-    """A copy of the rest of a file at each of its records would make the search quadratic."""
+def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
+    """Copying the rest of the file at each record would make the scan quadratic."""
     steps = 20_000
     frames = np.random.default_rng(0).standard_normal((steps + 1, 20))
     mcaprl.Dataset.from_arrays(

@@ -1,4 +1,4 @@
-"""What is added to a copy of a log: policies' opinions, and scenes that were left out."""
+"""Annotation: values of policies, or a scene, added to a copy of a log."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIELDS = ("q", "value", "advantage", "td_error", "entropy", "policy_action", "ag
 
 
 class Table:
-    """Q-values of the four observations of an episode, or no values but probabilities."""
+    """Policy with Q-values of an episode's four observations, or with probabilities only."""
 
     name = "table"
 
@@ -52,7 +52,7 @@ class Table:
 
 
 class Elsewhere(gym.Wrapper[Any, Any, Any, Any]):
-    """Starts somewhere else than it was asked to."""
+    """Environment that ignores the requested start."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -76,7 +76,7 @@ def episode() -> Any:
 
 @pytest.fixture
 def plain(tmp_path: Path) -> Path:
-    """Two short episodes of the lane sim without a scene."""
+    """Record two short episodes of the lane sim without a scene."""
     path = tmp_path / "plain.mcap"
     command = ["record", "lane", "--episodes", "2", "--policy", "random", "--no-scene"]
     assert run([*command, "--out", str(path)]) == 0
@@ -97,7 +97,7 @@ def test_values_by_hand(episode: Any) -> None:
     assert found["entropy"][2] == pytest.approx(1.0)
 
 
-def test_a_truncated_episode_has_a_future() -> None:
+def test_a_truncated_episode_is_bootstrapped() -> None:
     actions, rewards = np.zeros(1, np.int64), np.zeros(1)
     q = np.array([[0.0], [10.0]], np.float32)
     for terminated, error in ((True, 0.0), (False, 9.0)):
@@ -105,7 +105,7 @@ def test_a_truncated_episode_has_a_future() -> None:
     assert td_errors(q, actions, rewards, np.array([False]), 0.0).tolist() == [0.0]
 
 
-def test_a_policy_without_values_has_doubts_all_the_same(episode: Any) -> None:
+def test_a_policy_without_values_has_an_entropy(episode: Any) -> None:
     found = value_columns(Table(has_values=False), episode, spaces.Discrete(2), 0.9)
     for name in ("q", "value", "advantage", "td_error"):
         assert np.isnan(found[name]).all()
@@ -114,7 +114,7 @@ def test_a_policy_without_values_has_doubts_all_the_same(episode: Any) -> None:
     assert found["policy_action"].tolist() == [0, 1, 0]
 
 
-def test_actions_that_begin_elsewhere_and_single_ones(episode: Any) -> None:
+def test_actions_with_an_offset_and_single_actions(episode: Any) -> None:
     vars(episode)["actions"] = episode.actions - 1
     found = value_columns(Table(), episode, spaces.Discrete(2, start=-1), 0.5)
     assert found["policy_action"].tolist() == [0, -1, -1]
@@ -124,14 +124,14 @@ def test_actions_that_begin_elsewhere_and_single_ones(episode: Any) -> None:
         value_columns(Table(), episode, spaces.Box(-1, 1), 0.5)
 
 
-def test_gamma_is_the_runs(tmp_path: Path) -> None:
+def test_gamma_is_read_from_the_run(tmp_path: Path) -> None:
     (tmp_path / "seed-0").mkdir()
     assert gamma_of_run(tmp_path / "seed-0") == 0.97
     (tmp_path / "config.json").write_text(json.dumps({"config": {"gamma": 0.5}}))
     assert gamma_of_run(tmp_path / "seed-0") == gamma_of_run(tmp_path) == 0.5
 
 
-def test_a_copy_keeps_all_and_adds_values(plain: Path, tmp_path: Path) -> None:
+def test_annotating_keeps_all_messages_and_adds_values(plain: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "annotated.mcap"
     data = mcaprl.open(plain)
     columns = [
@@ -168,7 +168,7 @@ def test_a_copy_keeps_all_and_adds_values(plain: Path, tmp_path: Path) -> None:
     assert (odd.kind, odd.step % 2) == ("disagreement", 1)
 
 
-def test_an_error_leaves_no_half_copy(plain: Path, tmp_path: Path) -> None:
+def test_an_error_leaves_no_partial_copy(plain: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.mcap"
     with pytest.raises(ZeroDivisionError), AnnotatedCopy(plain, out):
         raise ZeroDivisionError
@@ -182,8 +182,8 @@ def test_an_error_leaves_no_half_copy(plain: Path, tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_scene_is_added_later(plain: Path, tmp_path: Path) -> None:
-    """The same messages as those of a recording with a scene."""
+def test_a_scene_can_be_added_later(plain: Path, tmp_path: Path) -> None:
+    """The added messages equal those of a recording with a scene."""
     out, full = tmp_path / "out.mcap", tmp_path / "full.mcap"
     assert run(["annotate", str(plain), "--scene", "--out", str(out)]) == 0
     start_ns = int(mcaprl.open(plain).episodes[0].log_time_ns[0])
@@ -203,7 +203,7 @@ def test_scene_is_added_later(plain: Path, tmp_path: Path) -> None:
     assert layout["configById"]["3D!scene"]["followTf"] == "car"
 
 
-def test_no_scene_of_another_sim(plain: Path, tmp_path: Path) -> None:
+def test_a_different_sim_adds_no_scene(plain: Path, tmp_path: Path) -> None:
     data, out = mcaprl.open(plain), tmp_path / "out.mcap"
     other = Elsewhere(make_sim("lane"))
     reason = "no scene was added, for the sim is another now: episode 0"

@@ -1,4 +1,4 @@
-"""The live server, as a viewer meets it; and the clock behind it."""
+"""The live server as a viewer sees it, and the player's clock."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def topics_of(player: Player, played: list[Played]) -> list[str]:
     return [player.tracks[m.track].reader.channels[m.channel_id].topic for m in played]
 
 
-def test_playing_gives_every_message_once_and_in_order(log: Path) -> None:
+def test_playback_yields_every_message_once_in_order(log: Path) -> None:
     reader = McapReader(log)
     player = Player([Track(reader)], speed=3.0, playing=True)
     played = [message for _ in range(200) for message in player.advance(0.05)]
@@ -67,7 +67,7 @@ def test_playing_gives_every_message_once_and_in_order(log: Path) -> None:
     assert sorted((m.channel_id, m.time_ns, m.data) for m in played) == sorted(expected)
 
 
-def test_clock_stops_seeks_and_begins_again(log: Path) -> None:
+def test_clock_pauses_seeks_and_restarts(log: Path) -> None:
     player = Player([Track(McapReader(log))])
     assert player.advance(1.0) == []
     player.seek(START_NS + 4 * STEP_NS)
@@ -84,7 +84,7 @@ def test_clock_stops_seeks_and_begins_again(log: Path) -> None:
     assert player.playing
 
 
-def test_picture_has_the_last_message_of_each_topic(log: Path) -> None:
+def test_the_current_state_is_the_last_message_of_each_topic(log: Path) -> None:
     player = Player([Track(McapReader(log))])
     player.seek(START_NS + 3 * STEP_NS + 1)
     seen = dict(zip(topics_of(player, player.picture()), player.picture(), strict=True))
@@ -120,7 +120,7 @@ def test_two_logs_share_their_time(log: Path, tmp_path: Path) -> None:
     assert player.end_ns == START_NS + last - first
 
 
-def test_frames_of_two_logs_do_not_meet(log: Path) -> None:
+def test_frames_of_two_logs_have_different_names(log: Path) -> None:
     reader = McapReader(log)
     for topic, type_name in (
         ("/tf", "tf2_msgs/msg/TFMessage"),
@@ -137,7 +137,7 @@ def test_frames_of_two_logs_do_not_meet(log: Path) -> None:
             assert moved.transforms[0].header.stamp.sec == START_NS // 10**9 + 1
 
 
-def test_layouts_stand_side_by_side(log: Path) -> None:
+def test_layouts_are_combined_side_by_side(log: Path) -> None:
     layout = layout_of_log(McapReader(log))
     both = side_by_side([layout, layout], ["a", "b"])
     panels = both["configById"]
@@ -153,7 +153,7 @@ def test_layouts_stand_side_by_side(log: Path) -> None:
 
 
 def test_a_log_of_an_hour_plays_from_anywhere(tmp_path: Path) -> None:
-    """The player holds indexes in the mapped file, and a few chunks: not the log."""
+    """The player keeps indexes in the mapped file and a few chunks in memory, not the log."""
     steps = 60_000
     path = tmp_path / "long.mcap"
     zeros = np.zeros((steps, 4), np.float32)
@@ -186,7 +186,7 @@ def viewer_is_there() -> None:
 
 
 def _hear_signals() -> None:
-    """A shell that starts pytest in the background, or nohup, has children ignore some."""
+    """Child processes ignore some signals if pytest runs in the background or under nohup."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
@@ -194,7 +194,7 @@ def _hear_signals() -> None:
 def look(
     arguments: list[str], plan: list[list[Any]], how: signal.Signals = signal.SIGINT
 ) -> tuple[Any, list[str]]:
-    """Run the server and a viewer that follows a plan; what it saw, and what was printed.
+    """Run the server and a scripted viewer; returns what it received and what was printed.
 
     Args:
         arguments: of `replay`.
@@ -227,7 +227,7 @@ def look(
     return json.loads(seen.stdout), lines
 
 
-def test_a_viewer_connects_seeks_and_gets_the_files_own_bytes(log: Path) -> None:
+def test_a_viewer_connects_seeks_and_receives_the_files_bytes(log: Path) -> None:
     viewer_is_there()
     reader, data = McapReader(log), mcaprl.open(log)
     where = int(data.episodes[1].log_time_ns[3])
@@ -265,18 +265,18 @@ def test_a_viewer_connects_seeks_and_gets_the_files_own_bytes(log: Path) -> None
     assert seen["parameters"][-1][0] == {"name": "episode", "value": 2}
 
 
-def test_two_policies_side_by_side(log: Path, tmp_path: Path) -> None:
+def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
     viewer_is_there()
     other = record(tmp_path / "pilot.mcap", (5,), 4)
     arguments = [str(log), str(other), "--episode", "0", "--speed", "2"]
-    # With the terminal, too, it ends as with Ctrl-C.
+    # Closing the terminal ends it like Ctrl-C.
     seen, _ = look(arguments, [["seek", str(START_NS + STEP_NS)]], signal.SIGHUP)
     assert {"/lane/rl/step", "/pilot/rl/step", "/pilot/scene"} <= seen["topics"].keys()
     times = {message["topic"]: message["time"] for message in seen["steps"][0]["messages"]}
     assert times["/lane/tf"] == times["/pilot/tf"] == str(START_NS + STEP_NS)
 
 
-def test_a_port_that_is_taken(log: Path) -> None:
+def test_a_port_in_use_is_refused(log: Path) -> None:
     from mcaprl.recorder.viewer.player_server import LiveServer
 
     player = Player([Track(McapReader(log))])

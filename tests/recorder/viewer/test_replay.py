@@ -1,4 +1,4 @@
-"""What a viewer gets: scene, frames, depth, log lines, layout; complete at any moment."""
+"""Display topics: scene, frames, depth, log lines and layout, complete at any time."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ EPISODES, STEPS = 2, 12
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes of the lane sim with everything there is to see."""
+    """Record two episodes of the lane sim with all display topics."""
     path = tmp_path_factory.mktemp("replay") / "lane.mcap"
     env = gym.make("mcaprl/LaneKeeping-v0")
     pilot = make_pilot(env)
@@ -60,7 +60,7 @@ def step_times(path: Path) -> list[list[int]]:
     return [episode.log_time_ns.tolist() for episode in mcaprl.open(path).episodes]
 
 
-def test_the_lane_sim_has_all_there_is_to_show() -> None:
+def test_the_lane_sim_records_all_display_topics() -> None:
     env = gym.make("mcaprl/LaneKeeping-v0").unwrapped
     assert isinstance(env, SceneSource)
     assert isinstance(env, TelemetrySource)
@@ -77,7 +77,7 @@ def test_moving_topics_have_one_message_a_step(log: Path) -> None:
         assert [time for time, _ in read(log, topic, type_name)] == times, topic
 
 
-def test_static_topics_come_once_if_nothing_changes(log: Path) -> None:
+def test_unchanged_static_topics_are_written_once(log: Path) -> None:
     start = step_times(log)[0][0]
     scenes = read(log, "/scene/static", "visualization_msgs/msg/MarkerArray")
     assert [time for time, _ in scenes] == [start]
@@ -88,8 +88,8 @@ def test_static_topics_come_once_if_nothing_changes(log: Path) -> None:
         assert len(names) > 20
 
 
-def test_a_scene_that_changes_often_is_thinned_out(tmp_path: Path) -> None:
-    """The racer takes ten steps a second; the scene is drawn five times, and at the end."""
+def test_a_frequently_changing_scene_is_subsampled(tmp_path: Path) -> None:
+    """The racer has ten steps a second; the scene is written five times a second and at the end."""
     path = tmp_path / "racer.mcap"
     with closing(mcaprl.RecordMcap(gym.make("mcaprl/Racer-v0"), path)) as recorder:
         for _ in range(2):
@@ -103,8 +103,8 @@ def test_a_scene_that_changes_often_is_thinned_out(tmp_path: Path) -> None:
     assert moved == [time for episode in times for time in episode]
 
 
-def test_each_scene_message_stands_alone(log: Path) -> None:
-    """A viewer that jumps anywhere clears the topic and draws what this one message has."""
+def test_each_scene_message_is_complete(log: Path) -> None:
+    """A viewer that seeks clears the topic and draws only this message."""
     for topic in ("/scene", "/scene/static"):
         for _, array in read(log, topic, "visualization_msgs/msg/MarkerArray"):
             first, *rest = array.markers
@@ -140,7 +140,7 @@ def test_frames_form_a_tree_under_map(log: Path) -> None:
         assert np.isclose(q.x**2 + q.y**2 + q.z**2 + q.w**2, 1, atol=1e-3)
 
 
-def test_car_frame_is_where_the_telemetry_says(log: Path) -> None:
+def test_car_frame_agrees_with_the_telemetry(log: Path) -> None:
     told = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
     frames = [m.transforms[0] for _, m in read(log, "/tf", "tf2_msgs/msg/TFMessage")]
     assert [frame.child_frame_id for frame in frames] == ["car"] * len(told["x_m"])
@@ -150,7 +150,7 @@ def test_car_frame_is_where_the_telemetry_says(log: Path) -> None:
     assert (told["speed_m_s"] >= 0).all()
 
 
-def test_depth_is_millimetres() -> None:
+def test_depth_is_in_millimeters() -> None:
     metres = np.array([[0.0, 1.2344, np.inf], [65.535, 65.536, 50.0]], np.float32)
     assert depth_millimeters(metres).tolist() == [[0, 1234, 0], [65535, 0, 50000]]
 
@@ -183,7 +183,7 @@ def test_layout_is_attached_and_classic(log: Path) -> None:
 
 
 @pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
-def test_layouts_name_what_the_log_has(sim: str, tmp_path: Path) -> None:
+def test_layouts_refer_to_paths_in_the_log(sim: str, tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     env = make_sim(sim)
     with closing(mcaprl.RecordMcap(env, path)) as recorder:
@@ -199,7 +199,7 @@ def test_layouts_name_what_the_log_has(sim: str, tmp_path: Path) -> None:
     assert set(data.action_names.values()) <= set(labels)
 
 
-def test_return_so_far_adds_up(log: Path) -> None:
+def test_cumulative_return_is_the_sum_of_rewards(log: Path) -> None:
     told = Topic(McapReader(log), "/telemetry").read(("return_so_far",))["return_so_far"]
     rewards = [episode.rewards for episode in mcaprl.open(log).episodes]
     sums = np.concatenate([[0.0, *np.cumsum(reward)] for reward in rewards])
@@ -238,7 +238,7 @@ def test_layout_without_a_scene() -> None:
     assert series["action (0 left, 1 right)"] == "/rl/step.action"
 
 
-def test_marker_of_each_kind_has_its_place() -> None:
+def test_each_kind_of_marker_has_its_position() -> None:
     assert set(MARKER_TYPES) == set(get_args(Kind))
     shapes = [
         Shape(name=kind, kind=kind, color=(1, 0, 0, 1), points=np.eye(3), yaw_rad=np.pi / 2)
@@ -251,7 +251,7 @@ def test_marker_of_each_kind_has_its_place() -> None:
         assert [(p.x, p.y, p.z) for p in marker.points] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
 
 
-def test_no_scene_leaves_only_the_transitions(tmp_path: Path) -> None:
+def test_without_a_scene_only_transitions_are_recorded(tmp_path: Path) -> None:
     path = tmp_path / "plain.mcap"
     env = gym.make("mcaprl/LaneKeeping-v0")
     with closing(mcaprl.RecordMcap(env, path, scene=False)) as recorder:
@@ -262,7 +262,7 @@ def test_no_scene_leaves_only_the_transitions(tmp_path: Path) -> None:
 
 
 def test_vectors_are_read_without_the_images(tmp_path: Path) -> None:
-    """Chunks hold one kind of topic each, and steps are never in a chunk with pictures."""
+    """Each chunk contains one kind of topic; steps are never in a chunk with images."""
     path = tmp_path / "depth.mcap"
     env = gym.make("mcaprl/LaneKeeping-v0", observation="depth")
     with closing(mcaprl.RecordMcap(env, path)) as recorder:

@@ -1,4 +1,4 @@
-"""A log stepped again: the same bits, or the first place where they differ."""
+"""Verification: stepping through a log again gives the same bits or the first difference."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WALK_LENGTH = 9
 
 
 class Walk(gym.Env[Any, Any]):
-    """A random walk: each step depends on all random numbers since the last seed."""
+    """Random walk: each step depends on all random numbers since the last seed."""
 
     metadata: dict[str, Any] = {"render_fps": 10}  # noqa: RUF012 (as Gymnasium declares it)
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
@@ -31,7 +31,7 @@ class Walk(gym.Env[Any, Any]):
     observation_names = ("place_m", "count")
 
     def __init__(self, fault: tuple[str, int] = ("", -1)) -> None:
-        """Make one that goes wrong in some way at the n-th step of its life."""
+        """Create an environment that fails at the n-th step after its creation."""
         self._fault, self._life = fault, -1
 
     def reset(
@@ -61,7 +61,7 @@ class Walk(gym.Env[Any, Any]):
 def walk(
     path: Path, seeds: list[int | None], options: dict[str, Any] | None = None, cut: int = 0
 ) -> mcaprl.Dataset:
-    """Record an episode for each seed, the last one broken off `cut` steps before its end."""
+    """Record an episode for each seed; the last is interrupted `cut` steps before its end."""
     with closing(mcaprl.RecordMcap(Walk(), path, start_time_ns=5 * 10**9)) as env:
         env.action_space.seed(0)
         for number, seed in enumerate(seeds):
@@ -72,7 +72,7 @@ def walk(
 
 
 @pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
-def test_what_a_simulator_gave_it_gives_again(
+def test_a_repeated_simulation_reproduces_the_log(
     sim: str, log_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["record", sim, "--policy", "random", "--steps", "60", "--out", str(log_path)]
@@ -83,7 +83,7 @@ def test_what_a_simulator_gave_it_gives_again(
     assert f"{episodes} and 60 steps compared: every" in capsys.readouterr().out
 
 
-def test_pictures_and_dict_observations_are_compared(log_path: Path) -> None:
+def test_images_and_dict_observations_are_compared(log_path: Path) -> None:
     random = np.random.default_rng(0)
     MIXED_SPACE.seed(1)
     rewards = [0.0, np.nan, -0.0, 1e-320]
@@ -115,7 +115,7 @@ def test_pictures_and_dict_observations_are_compared(log_path: Path) -> None:
         ("end", ["terminated"]),
     ],
 )
-def test_the_first_difference_is_told_with_its_place(
+def test_the_first_difference_is_reported_with_its_place(
     kind: str, names: list[str], log_path: Path
 ) -> None:
     data = walk(log_path, [1, 2])
@@ -132,7 +132,7 @@ def test_the_first_difference_is_told_with_its_place(
     assert "episode 1 differs first at step 4 (0.400 s in" in str(difference.to_problem())
 
 
-def test_an_episode_without_a_seed_goes_on_from_the_one_before(log_path: Path) -> None:
+def test_an_episode_without_a_seed_continues_the_random_state(log_path: Path) -> None:
     data = walk(log_path, [None, 7, None, None])
     found = verify(data, Walk())
     assert found == Verification(3, 3 * WALK_LENGTH, (0,), None)
@@ -140,8 +140,8 @@ def test_an_episode_without_a_seed_goes_on_from_the_one_before(log_path: Path) -
     assert verify(data, Walk(), only=0) == Verification(0, 0, (0,), None)
 
 
-def test_a_start_that_is_not_known_is_no_difference(log_path: Path) -> None:
-    """The environment was reset once more between the two, which leaves no trace in the log."""
+def test_an_unknown_start_is_not_a_difference(log_path: Path) -> None:
+    """An additional reset between two episodes is not visible in the log."""
     with closing(mcaprl.RecordMcap(Walk(), log_path)) as env:
         for seed in (3, None):
             env.reset(seed=seed)
@@ -151,20 +151,20 @@ def test_a_start_that_is_not_known_is_no_difference(log_path: Path) -> None:
     assert verify(mcaprl.open(log_path), Walk()) == Verification(1, WALK_LENGTH, (1,), None)
 
 
-def test_options_and_broken_off_episodes(log_path: Path) -> None:
+def test_options_and_interrupted_episodes(log_path: Path) -> None:
     data = walk(log_path, [4, 5], {"place": 3.5}, cut=2)
     assert data.episodes[1].reason == "interrupted"
     assert verify(data, Walk()) == Verification(2, 2 * WALK_LENGTH - 2, (), None)
 
 
-def test_each_frame_is_shown_while_the_environment_stands_there(log_path: Path) -> None:
+def test_frames_are_drawn_in_the_state_of_their_step(log_path: Path) -> None:
     data, env = walk(log_path, [1, 2]), Walk()
     seen = []
     verify(data, env, on_frame=lambda e, step: seen.append((e.index, step, env._count)))
     assert seen == [(e, step, step) for e in (0, 1) for step in range(WALK_LENGTH + 1)]
 
 
-def test_an_environment_that_fails_or_is_another(log_path: Path) -> None:
+def test_failing_or_different_environments_are_reported(log_path: Path) -> None:
     data = walk(log_path, [1])
     with pytest.raises(LogError, match=r"fails at step 3 of episode 0.*engine is on fire"):
         verify(data, Walk(("crash", 2)))

@@ -1,4 +1,4 @@
-"""Films and stills of logged episodes."""
+"""Videos and contact sheets of logged episodes."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def box(color: Any, x_m: float, frame: str = "map", **others: Any) -> Shape:
 
 
 def share(picture: Any, channel: int) -> float:
-    """Of the picture that is of one pure colour, however it is lit."""
+    """Return the mask of the pixels of one pure color at any brightness."""
     others = [c for c in range(3) if c != channel]
     pure = (picture[..., channel] > 100) & (picture[..., others].max(-1) < 60)
     return float(pure.mean())
 
 
-def test_the_body_is_in_the_middle_wherever_it_is(view: ChaseView) -> None:
+def test_the_followed_frame_is_in_the_image_center(view: ChaseView) -> None:
     pictures = [
         view.draw([box(RED, 0.0, "car")], [], car_at(*place), "car", [])
         for place in ((0.0, 0.0, 0.0), (500.0, -80.0, 2.0))
@@ -66,7 +66,7 @@ def test_the_body_is_in_the_middle_wherever_it_is(view: ChaseView) -> None:
     assert abs(share(pictures[0], 0) - share(pictures[1], 0)) < 2e-3
 
 
-def test_the_nearer_thing_hides_the_farther(view: ChaseView) -> None:
+def test_nearer_shapes_hide_farther_ones(view: ChaseView) -> None:
     wall = Shape("wall", "box", GREEN, size=(0.5, 9.0, 9.0), position=(-4.0, 0.0, 2.0))
     for scene in ([box(RED, 0.0), wall], [wall, box(RED, 0.0)]):
         picture = view.draw(scene, [], car_at(0.0), "car", [])
@@ -76,7 +76,7 @@ def test_the_nearer_thing_hides_the_farther(view: ChaseView) -> None:
     assert share(view.draw([box(RED, 900.0)], [], car_at(0.0), "car", []), 0) == 0.0
 
 
-def test_every_kind_of_shape_can_be_seen(view: ChaseView) -> None:
+def test_every_kind_of_shape_is_visible(view: ChaseView) -> None:
     points = np.array([[0.0, -1.0, 0.2], [0.0, 1.0, 0.2], [0.0, 0.0, 2.0]])
     for kind in ("box", "sphere", "cylinder", "line", "segments", "points", "triangles", "arrow"):
         some = points[:2] if kind == "segments" else points
@@ -88,7 +88,7 @@ def test_every_kind_of_shape_can_be_seen(view: ChaseView) -> None:
     assert (view.draw([], [label], [], "", []) != empty).any()
 
 
-def test_frames_hang_on_frames() -> None:
+def test_frames_are_relative_to_their_parents() -> None:
     quarter = yaw_rotation(np.pi / 2)
     frames = [Frame("b", (1.0, 0.0, 0.0), quarter, "a"), Frame("a", (5.0, 0.0, 0.0), quarter)]
     poses = poses_of(frames)
@@ -101,7 +101,7 @@ def test_frames_hang_on_frames() -> None:
     assert np.linalg.det(eye.axes) == pytest.approx(1.0)
 
 
-def test_a_log_gives_back_what_was_seen(tmp_path: Path) -> None:
+def test_a_log_reproduces_the_recorded_scene(tmp_path: Path) -> None:
     path, env = tmp_path / "lane.mcap", make_sim("lane")
     with closing(mcaprl.RecordMcap(env, path)) as recorder:
         recorder.reset(seed=0)
@@ -133,14 +133,14 @@ def test_sheet() -> None:
     assert evenly_spaced(2, 12) == [0, 1, 2]
 
 
-def test_a_fast_film_leaves_steps_out() -> None:
+def test_a_fast_video_skips_steps() -> None:
     assert shown_steps(3, 50.0) == (range(4), 50.0)
     steps, pictures_per_s = shown_steps(7, 120.0)
     assert list(steps) == [1, 4, 7], "the end is shown"
     assert pictures_per_s == 40.0
 
 
-def test_films_of_a_scene_and_of_a_sim(
+def test_videos_of_a_scene_and_of_a_sim(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import imageio.v3 as imageio
@@ -154,7 +154,7 @@ def test_films_of_a_scene_and_of_a_sim(
         assert run(["replay", f"{name}.mcap", "--video", f"{name}.gif"]) == 0
         for kind, plugin in (("mp4", "pyav"), ("gif", "pillow")):
             film = imageio.imread(f"{name}.{kind}", plugin=plugin)
-            # In a GIF, a picture like the one before makes that one stay longer.
+            # In a GIF, an image equal to the previous one extends its duration.
             assert len(film) == 6 if kind == "mp4" else 2 <= len(film) <= 6
             assert film.shape[1:] == (*size, 3)
             assert (film[0] != film[-1]).any()
@@ -171,7 +171,9 @@ def test_films_of_a_scene_and_of_a_sim(
     assert not Path("new.mp4").exists()
 
 
-def test_no_film_of_what_cannot_be_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_without_a_scene_has_no_video(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "cart.mcap"
     with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), path)) as env:
         env.reset()

@@ -1,4 +1,4 @@
-"""The depth camera against ray casters that share no line with it, and its codes."""
+"""The depth camera against independent ray casters, and its codes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def cast_on_course(eye_m: Floats, rays: Floats) -> Floats:
     return np.asarray(np.minimum(to_boxes, np.where(on_ground, to_ground, np.inf)))
 
 
-def test_the_course_looks_as_ray_casting_says() -> None:
+def test_the_course_matches_ray_casting() -> None:
     """Of 240,000 pixels at 60 random poses, fewer than 1 in 10,000 differ, at box edges."""
     random = np.random.default_rng(3)
     camera = DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
@@ -80,7 +80,7 @@ def test_the_course_looks_as_ray_casting_says() -> None:
 
 
 def nearest_front(triangles: Floats, ray: Floats) -> float:
-    """Return 1/distance along z of the nearest front that a ray from the origin meets, or 0.
+    """Return 1/z of the nearest front that a ray from the origin hits, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -88,7 +88,7 @@ def nearest_front(triangles: Floats, ray: Floats) -> float:
     for a, b, c in triangles:
         across = np.cross(ray, c - a)
         determinant = (b - a) @ across
-        # A front has its corners counter-clockwise: its normal points against the ray.
+        # The normal of a front points against the ray.
         if determinant <= 0.0:
             continue
         u, turned = -a @ across / determinant, np.cross(-a, b - a)
@@ -98,14 +98,14 @@ def nearest_front(triangles: Floats, ray: Floats) -> float:
     return best
 
 
-def test_backs_are_told_by_the_planes_of_their_fronts() -> None:
-    # In the plane z = 2, counter-clockwise seen from above: its front looks up.
+def test_planes_tell_fronts_from_backs() -> None:
+    # In the plane z = 2, counter-clockwise seen from above: its front faces up.
     flat = np.array([[[0.0, 0, 2], [1, 0, 2], [0, 1, 2]]])
     np.testing.assert_allclose(fronts(flat), [[0, 0, 1, 2]])
     np.testing.assert_allclose(fronts(flat[:, ::-1]), [[0, 0, -1, -2]])
 
 
-def test_a_soup_of_triangles_looks_as_ray_casting_says() -> None:
+def test_random_triangles_match_ray_casting() -> None:
     random = np.random.default_rng(4)
     image = np.empty((12, 16))
     for _ in range(40):
@@ -130,7 +130,7 @@ def test_level_ground_ends_at_the_middle_row() -> None:
     image = np.empty((144, 256))
     draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.7), LENS.focal_px, image)
     assert np.all(image[:72] == 0.0)
-    # The middle of row 72 lies half a pixel under the horizon: z = 1.4 m x 128 / 0.5.
+    # The middle of row 72 is half a pixel below the horizon: z = 1.4 m x 128 / 0.5.
     np.testing.assert_allclose(1.0 / image[72], 1.4 * 128 / 0.5, rtol=1e-9)
     np.testing.assert_allclose(1.0 / image[143], 1.4 * 128 / 71.5, rtol=1e-9)
 
@@ -144,7 +144,7 @@ def test_left_of_the_car_is_left_in_the_image() -> None:
     assert np.all(image[:, 128:] == 0)
 
 
-def test_what_is_behind_or_inside_is_not_seen() -> None:
+def test_surfaces_behind_or_around_the_camera_are_not_visible() -> None:
     image = np.empty((144, 256))
     for mesh in (box_mesh((-5.0, 0.0, 0.0), (2.0, 2.0, 2.0)), box_mesh((0, 0, 0), (9.0, 9.0, 9.0))):
         draw_mesh(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, image)
@@ -158,7 +158,7 @@ def test_neighboring_triangles_leave_no_gap_and_share_no_pixel() -> None:
     covered = np.zeros((64, 64))
     for i in range(37):
         image = np.empty((64, 64))
-        # y points down in the image: clockwise there is counter-clockwise for the eye.
+        # y points down in the image, which reverses the orientation.
         slice_of = np.array([[[0, 0, 5.0], rim[i + 1], rim[i]]])
         draw_mesh(slice_of, np.zeros(3), np.eye(3), 30.0, image)
         covered += image > 0
@@ -197,7 +197,7 @@ def shrunk(inverse: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def test_shrinking_by_hand() -> None:
-    """1/2 and 1/4 average to 3/8; half sky keeps the hit half; three quarters of sky are sky."""
+    """1/2 and 1/4 average to 3/8; half sky counts its other half; three quarters of sky are sky."""
     inverse = np.array([[0.5, 0.25, 0.1, 0.0], [0.5, 0.25, 0.0, 0.1]])
     np.testing.assert_allclose(shrunk(inverse, (1, 2)), [[8 / 3, 10.0]], rtol=1e-6)
     inverse[1, 3] = 0.0
@@ -217,7 +217,7 @@ def test_each_new_pixel_is_made_of_whole_shares(old: int, new: int) -> None:
 
 
 def test_a_plane_keeps_its_depth_when_shrunk() -> None:
-    """Inverse depth is linear on the ground: each new row has its middle's value within 1 %."""
+    """Inverse depth is linear on the ground, so each new row has its middle's value within 1 %."""
     image = np.empty((144, 256))
     draw_mesh(ground_mesh(1e6), np.array([0.0, 0.0, 1.4]), level_axes(0.0), LENS.focal_px, image)
     small = shrunk(image, (84, 84))

@@ -34,11 +34,11 @@ Codes = NDArray[np.uint8]
 
 POSES = 40
 MOST_DIFFERING = 1e-5
-"""The share of pixels, all of them at edges, that single precision decides otherwise."""
+"""Maximum share of pixels, all at edges, that differ because of Embree's single precision."""
 
 
 class RayTracer:
-    """Embree, looking at a mesh through a lens."""
+    """Ray tracer that renders a mesh with Embree."""
 
     def __init__(self, mesh: Floats, view: Lens) -> None:
         need(importlib.util.find_spec("embreex") is not None, "pip install embreex")
@@ -54,7 +54,7 @@ class RayTracer:
         self._rays = np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def look(self, eye_m: Floats, axes: Floats) -> tuple[Codes, NDArray[np.bool_]]:
-        """Return the image's codes, and where they are at an edge."""
+        """Return the image's codes, and which of them are at an edge."""
         rays = self._rays @ axes
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         flat = rays.reshape(-1, 3)
@@ -71,15 +71,15 @@ class RayTracer:
 
 
 def check(drawn: Floats, expected: Codes, at_edge: NDArray[np.bool_]) -> int:
-    """Make sure that an image of 1/m is exact but at edges; give how many codes differ there."""
+    """Check that an image of 1/m is exact except at edges; return the number that differ there."""
     with np.errstate(divide="ignore"):
         differs = encode_depth(1.0 / drawn) != expected
     assert not np.any(differs & ~at_edge)
     return int(differs.sum())
 
 
-def test_the_streets_are_exact_but_for_edges() -> None:
-    """From 40 places in the lane, anywhere along the course, in any direction."""
+def test_the_streets_are_exact_except_at_edges() -> None:
+    """From 40 random places and directions in the lane."""
     random = np.random.default_rng(11)
     camera = DepthCamera(lane_mesh(), LANE_LENS, IMAGE_SHAPE)
     tracer = RayTracer(lane_mesh(), LANE_LENS)
@@ -93,7 +93,7 @@ def test_the_streets_are_exact_but_for_edges() -> None:
 
 
 def random_drone(random: np.random.Generator) -> Drone:
-    """A drone somewhere near the line, tilted by up to half a radian, that touches nothing."""
+    """Return a drone near the line, tilted by up to half a radian, without a collision."""
     while True:
         point = point_on_line(random.uniform(0.0, LENGTH_M))
         spot = Vector(*(np.array(point) + random.uniform(-5, 5, 3)).tolist())
@@ -104,7 +104,7 @@ def random_drone(random: np.random.Generator) -> Drone:
 
 
 @pytest.mark.parametrize("view", ["down", "front"])
-def test_terrain_and_towers_are_exact_but_for_edges(view: str) -> None:
+def test_terrain_and_towers_are_exact_except_at_edges(view: str) -> None:
     random = np.random.default_rng(12)
     camera, tracer = DroneCamera(view), RayTracer(world_mesh(), DRONE_LENS)
     differing = 0

@@ -1,4 +1,4 @@
-"""Episodes that run together are those that run one after the other."""
+"""Batched episodes equal those that run one after the other."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.sims.evaluation.rollout import EpsilonGreedy, batch_rollout, run_epi
 
 
 class Swaying:
-    """Acts by the first number that it sees, row by row: batches change nothing."""
+    """Policy of the first observed number, row by row, so that batching changes nothing."""
 
     name = "swaying"
 
@@ -35,22 +35,22 @@ class Swaying:
         ("CartPole-v1", {}),
     ],
 )
-def test_together_or_one_by_one(sim: str, arguments: dict[str, Any]) -> None:
+def test_batched_episodes_equal_single_episodes(sim: str, arguments: dict[str, Any]) -> None:
     env, envs = make_sim(sim, **arguments), make_sims(sim, 5, **arguments)
     actions = int(env.action_space.n)  # type: ignore[attr-defined]
     policy, seeds = Swaying(actions), [3, 1, 4, 1, 5]
-    told: list[int] = []
-    together = batch_rollout(envs, policy, seeds, lambda result: told.append(result.seed))
+    reported: list[int] = []
+    together = batch_rollout(envs, policy, seeds, lambda result: reported.append(result.seed))
     behavior = EpsilonGreedy(policy, 0.0, env.action_space)
     for seed, result in zip(seeds, together, strict=True):
         alone = run_episode(env, behavior, seed=seed)
         assert (result.seed, result.length, result.reason) == (seed, alone.length, alone.reason)
         assert result.total_reward == pytest.approx(alone.total_reward, rel=1e-12)
         np.testing.assert_allclose(result.positions, alone.positions, atol=1e-9)
-    assert sorted(told) == sorted(seeds)
+    assert sorted(reported) == sorted(seeds)
 
 
-def test_scores_are_the_same_and_success_is_told() -> None:
+def test_scores_are_equal_and_success_is_reported() -> None:
     env = make_sim("lane", max_episode_steps=8)
     envs = make_sims("lane", 6, max_episode_steps=8)
     options: dict[str, Any] = {"name": "swaying", "episodes": 6, "seed": 2}

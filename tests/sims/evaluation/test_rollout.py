@@ -33,10 +33,10 @@ def env() -> gym.Env[Any, Any]:
 def test_probabilities_by_hand(env: gym.Env[Any, Any]) -> None:
     behavior = EpsilonGreedy(AlwaysLeft(), 0.2, env.action_space)
     behavior.begin(3)
-    told = [behavior.choose(np.zeros(4, np.float32)) for _ in range(4000)]
-    assert {probability for action, probability in told if action == 0} == {0.2 / 2 + 0.8}
-    assert {probability for action, probability in told if action == 1} == {0.1}
-    assert np.mean([action for action, _ in told]) == pytest.approx(0.1, abs=0.02)
+    drawn = [behavior.choose(np.zeros(4, np.float32)) for _ in range(4000)]
+    assert {probability for action, probability in drawn if action == 0} == {0.2 / 2 + 0.8}
+    assert {probability for action, probability in drawn if action == 1} == {0.1}
+    assert np.mean([action for action, _ in drawn]) == pytest.approx(0.1, abs=0.02)
 
 
 def test_random_policy_has_equal_probabilities(env: gym.Env[Any, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What is said of returns: by hand, against SciPy, and how often intervals are right."""
+"""Statistics of returns: by hand, against SciPy, and the coverage of intervals."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def test_means_by_hand() -> None:
     numbers = np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])
     assert mean(numbers) == pytest.approx(21 / 8)
     assert median(numbers) == 3.5
-    # Two of eight are left out on each side: 2, 3, 4, 5 stay.
+    # Two of eight are dropped at each end: 2, 3, 4, 5 remain.
     assert interquartile_mean(numbers) == 3.5
     assert interquartile_mean(np.array([[1.0, 2.0, 6.0]])) == 3.0, "a quarter of three is none"
 
 
 def test_improvement_by_hand() -> None:
     first, second = np.array([[1.0, 3.0]]), np.array([[2.0], [3.0]])
-    # 1 loses twice; 3 wins against 2 and is even with 3.
+    # 1 loses twice; 3 wins against 2 and ties with 3.
     assert improvement_probability(first, second) == (0 + 0 + 1 + 0.5) / 4
     assert improvement_probability(second, first) == 1 - 1.5 / 4
     assert improvement_probability(first, first) == 0.5
@@ -63,13 +63,13 @@ def test_the_interval_of_an_improvement_holds_it() -> None:
     random = np.random.default_rng(0)
     first, second = random.normal(1, 1, (4, 30)), random.normal(0, 1, (4, 30))
     low, high = improvement_interval(first, second)
-    # Of two normal numbers with means a spread apart, the larger mean wins with .76.
+    # For two normal distributions with means one standard deviation apart, the probability is .76.
     assert 0.5 < low < 0.76 < high < 1.0
     assert low < improvement_probability(first, second) < high
 
 
 def test_bootstrap_interval_covers_as_often_as_it_says() -> None:
-    """Of 95 % intervals of the mean of 30 normal numbers, about 93 % hold the true mean."""
+    """Of 95 % intervals of the mean of 30 normal numbers, about 93 % contain the true mean."""
     random = np.random.default_rng(0)
     hits = 0
     for trial in range(200):

@@ -1,4 +1,4 @@
-"""The lane sim's car against highway-env's, which was written by others from the same equations."""
+"""The lane sim's car against highway-env's independent implementation of the same equations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mcaprl.sims.lane.rules import (
 
 
 def their_car(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Vehicle:
-    """Make a car as long as our wheelbase: their equations call the distance of the axles so."""
+    """Return a car as long as our wheelbase, since highway-env uses the length as the wheelbase."""
     car = Vehicle(None, np.array([x_m, y_m]), yaw_rad, speed_m_s)
     car.LENGTH = WHEELBASE_M
     return car
@@ -54,7 +54,7 @@ def test_each_step_of_a_trajectory_agrees(
 @given(st.floats(0.0, 30.0), st.lists(st.integers(0, 5), min_size=1, max_size=40))
 @settings(max_examples=50)
 def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -> None:
-    """Equal besides: the wheel angle of `wheel_angle`, and throttle and brake as documented."""
+    """Also equal: the wheel angle of `wheel_angle`, and throttle and brake as documented."""
     theirs = their_car(20.0, 1.0, 0.0, speed_m_s)
     ours = located(moving(20.0, 1.0, 0.0, speed_m_s), 0.0, 20.0, 0.0)
     steering = 0.0
@@ -75,7 +75,7 @@ def test_each_decision_of_a_drive_agrees(speed_m_s: float, actions: list[int]) -
 
 
 @pytest.mark.parametrize("action", range(len(ACTION_MEANINGS)))
-def test_actions_turn_the_way_they_are_called(action: int) -> None:
+def test_actions_turn_in_the_named_direction(action: int) -> None:
     after = drive(located(moving(20.0, 1.0, 0.0, 8.0), 0.0, 20.0, 0.0), action)
     meaning = ACTION_MEANINGS[action]
     assert (after.yaw_rad > 0) == ("left" in meaning)

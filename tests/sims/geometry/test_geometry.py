@@ -1,4 +1,4 @@
-"""Closed paths, worked by hand and against a search over many points; and the bicycle's formula."""
+"""Closed paths, by hand and against a search over many points, and the bicycle's formula."""
 
 from __future__ import annotations
 
@@ -93,18 +93,18 @@ def test_wrapping_keeps_the_direction(angle_rad: float) -> None:
 
 
 @given(st.floats(-math.pi / 4, math.pi / 4))
-def test_the_series_is_the_sine_to_two_last_bits(angle_rad: float) -> None:
+def test_the_series_is_the_sine_to_two_ulp(angle_rad: float) -> None:
     assert sine(angle_rad) == pytest.approx(math.sin(angle_rad), rel=4.5e-16, abs=0.0)
 
 
 @given(st.floats(-10.0, 10.0), st.floats(-math.pi / 2, math.pi / 2))
-def test_turning_adds_angles(yaw_rad: float, angle_rad: float) -> None:
+def test_turning_adds_the_angles(yaw_rad: float, angle_rad: float) -> None:
     expected = heading_of(yaw_rad + angle_rad)
     assert turned(heading_of(yaw_rad), angle_rad) == pytest.approx(expected, abs=2e-15)
     assert turned(Heading(1.0, 0.0), math.pi / 2) == pytest.approx((0.0, 1.0), abs=1e-15)
 
 
-def test_going_on_from_a_spot_by_hand() -> None:
+def test_a_spot_further_on_by_hand() -> None:
     here = spot_at(SQUARE, 38.0)
     assert here == Spot(3, 8.0)
     assert further(SQUARE, here, 1.0) == Spot(3, 9.0)
@@ -138,7 +138,7 @@ def test_the_course_is_as_published() -> None:
     assert len(streets()) == 7
 
 
-def test_buildings_stand_beside_the_streets_and_apart() -> None:
+def test_buildings_are_beside_the_streets_and_apart() -> None:
     boxes = buildings()
     assert len(boxes) > 60
     low = np.array([(b.x_m - b.length_m / 2, b.y_m - b.width_m / 2) for b in boxes])
@@ -162,7 +162,7 @@ def test_rails_follow_the_road_but_never_cross_it() -> None:
 
 
 def test_pavement_has_the_streets_area() -> None:
-    """Seven streets 7 m wide with square ends, less the overlaps at the six corners.
+    """Seven streets 7 m wide with square ends, minus the overlaps at the six corners.
 
     Lengths: 3 x 130 + 2 x 126 + 2 x 127 = 896 m, each longer by 7 m. Two streets share 49 m^2 at
     the four outer corners, three share it at the two inner ones (counted twice too often).
@@ -195,7 +195,7 @@ def test_a_constant_steering_drives_a_circle() -> None:
 
 
 @given(st.floats(4.0, 30.0), st.floats(0.5, 9.0))
-def test_the_slip_for_a_sideways_acceleration_gives_it(
+def test_the_slip_for_a_lateral_acceleration_causes_it(
     speed_m_s: float, lateral_m_s2: float
 ) -> None:
     slip_sine = slip_for_lateral(lateral_m_s2, speed_m_s, 2.7)
@@ -209,7 +209,7 @@ def test_a_slow_car_may_slip_freely() -> None:
 
 
 @given(st.floats(-math.pi / 4, math.pi / 4))
-def test_slip_and_steering_belong_together(steering_rad: float) -> None:
+def test_slip_and_steering_are_inverse(steering_rad: float) -> None:
     assert slip_of(steering_rad) == pytest.approx(math.sin(math.atan(math.tan(steering_rad) / 2)))
     assert steering_of(slip_of(steering_rad)) == pytest.approx(steering_rad)
 

@@ -1,4 +1,4 @@
-"""The lanes of highway-env's roads, strung together."""
+"""The courses of highway-env's roads."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def a_ring() -> Course:
 
 
 def test_a_straight_road_by_hand() -> None:
-    """In their axes 3 m right of it at y = +3; in ROS axes that is y = -3, and negative."""
+    """3 m to the right is y = +3 in highway-env's axes and y = -3 in ROS axes."""
     network = RoadNetwork()
     network.add_lane("a", "b", StraightLane([0, 0], [30, 0], width=8))
     (road,) = courses_of(network)
@@ -46,7 +46,7 @@ def test_a_straight_road_by_hand() -> None:
 
 
 def test_a_ring_by_hand() -> None:
-    """Their clockwise, on images with y down, turns right: clockwise in ROS axes as well."""
+    """Clockwise turns right in images with y down, and in ROS axes as well."""
     ring = a_ring()
     assert ring.is_closed
     assert ring.length_m == pytest.approx(2 * math.pi * 20.0, rel=1e-3)
@@ -85,7 +85,7 @@ def test_racetracks_are_closed_and_their_lanes_5_m_apart(road: str, lanes: int) 
         assert course.is_closed
         np.testing.assert_array_equal(course.points_m[0], course.points_m[-1])
         assert 0.4 < np.diff(course.along_m).min() < np.diff(course.along_m).max() < 1.6
-        # Their lanes' ends miss each other by some centimeters.
+        # The ends of highway-env's lanes differ by some centimeters.
         turns = np.diff(np.unwrap(np.arctan2(*np.diff(course.points_m, axis=0).T[::-1])))
         assert np.abs(turns).max() < 0.25
     for inner, outer in itertools.pairwise(found):

@@ -1,4 +1,4 @@
-"""The highway-lane sim: highway-env's own physics and rewards, under our names."""
+"""The highway-lane sim: highway-env's physics and rewards with our names."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def made(**kwargs: Any) -> HighwayLaneEnv:
     [("lane-keeping-v0", LaneKeepingEnv, math.pi / 3), (TRACK, RacetrackEnv, math.pi / 4)],
 )
 def test_it_drives_as_highway_env_does(road: str, theirs: Any, range_rad: float) -> None:
-    """The same seed and steering: the same places and rewards to the bit; their y points down."""
+    """The same seed and steering result in the same bits; highway-env's y points down."""
     ours, inner = made(road=road, start="line"), theirs()
     ours.reset(seed=4)
     inner.reset(seed=4)
@@ -57,7 +57,7 @@ def test_it_drives_as_highway_env_does(road: str, theirs: Any, range_rad: float)
 
 
 @pytest.mark.parametrize("action", range(len(ACTION_MEANINGS)))
-def test_actions_turn_the_way_they_are_called(action: int) -> None:
+def test_actions_turn_in_the_named_direction(action: int) -> None:
     sim = made(road=TRACK)
     sim.reset(seed=0, options={"pose": ON_THE_TRACK})
     sim.step(action)
@@ -66,7 +66,7 @@ def test_actions_turn_the_way_they_are_called(action: int) -> None:
     assert (sim.car.yaw_rad < 0) == ("right" in meaning)
 
 
-def test_the_observation_by_hand() -> None:
+def test_observation_by_hand() -> None:
     """On the straight of the racetrack, 1 m to the left, 0.1 rad to the left, at 8 m/s."""
     sim = made(road=TRACK)
     seen, info = sim.reset(seed=0, options={"pose": (50.0, 1.0, 0.1, 8.0)})
@@ -88,7 +88,7 @@ def test_another_car_is_seen_where_it_is() -> None:
     sim = made(road=TRACK)
     sim.reset(seed=0, options={"pose": ON_THE_TRACK})
     (other,) = sim.others
-    # 8 m behind it and 1.5 m to its right, heading as it does.
+    # 8 m behind it and 1.5 m to its right, with the same heading.
     cos, sin = math.cos(other.yaw_rad), math.sin(other.yaw_rad)
     x_m, y_m = other.x_m - 8 * cos + 1.5 * sin, other.y_m - 8 * sin - 1.5 * cos
     seen, _ = sim.reset(seed=0, options={"pose": (x_m, y_m, other.yaw_rad)})
@@ -124,7 +124,7 @@ def test_leaving_the_lane_ends() -> None:
     assert set(reasons[:-1]) == {None}
 
 
-def test_the_end_of_the_road_is_an_end() -> None:
+def test_the_end_of_the_road_ends_an_episode() -> None:
     sim = made()
     x_m, y_m = sim.courses[0].point(sim.courses[0].length_m - 6.0)
     sim.reset(options={"pose": (x_m, y_m, 0.3)})
@@ -133,7 +133,7 @@ def test_the_end_of_the_road_is_an_end() -> None:
     assert (terminated, info["reason"]) == (True, "finished")
 
 
-def test_a_collision_is_an_end() -> None:
+def test_a_collision_ends_an_episode() -> None:
     sim = made(road=TRACK)
     sim.reset(seed=0, options={"pose": ON_THE_TRACK})
     (other,) = sim.others
@@ -148,7 +148,7 @@ def test_a_collision_is_an_end() -> None:
 
 
 def test_highway_envs_own_limit_truncates() -> None:
-    """A racetrack is cut after 300 s."""
+    """A racetrack is truncated after 300 s."""
     sim = made(road=TRACK)
     pilot = HighwayPilot(sim)
     seen, _ = sim.reset(seed=0)
@@ -165,7 +165,7 @@ def test_starts_are_on_the_road_and_clear_of_others(road: str) -> None:
     for seed in range(30):
         _, info = sim.reset(seed=seed)
         assert abs(info["lateral_offset_m"]) <= 1.51
-        # Half a sample's turn besides, in the tightest bend.
+        # Plus half a sample's turn in the tightest bend.
         assert abs(info["heading_error_rad"]) <= 0.25
         for other in sim.others:
             assert math.hypot(other.x_m - sim.car.x_m, other.y_m - sim.car.y_m) > 20.0
@@ -183,7 +183,9 @@ def test_a_pose_has_highway_envs_speed_unless_it_says_another() -> None:
 
 def test_a_pose_off_the_road_or_in_another_car_is_refused() -> None:
     sim = made(road=TRACK)
-    with pytest.raises(UsageError, match=r"is 40.0 m from the middle of a lane: at most 2.5 m"):
+    with pytest.raises(
+        UsageError, match=r"is 40.0 m from the middle of a lane: the lane ends at 2.5 m"
+    ):
         sim.reset(options={"pose": (60.0, -45.0, 0.0)})
     sim.reset(seed=0)
     (other,) = sim.others
@@ -191,19 +193,21 @@ def test_a_pose_off_the_road_or_in_another_car_is_refused() -> None:
         sim.reset(seed=0, options={"pose": (other.x_m, other.y_m, 0.0)})
 
 
-def test_a_road_that_is_none_is_refused() -> None:
+def test_an_unknown_road_is_refused() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown road 'motorway': .*racetrack-oval-v0"):
         made(road="motorway")
 
 
-def test_without_highway_env_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_highway_env_the_error_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "highway_env", None)
     with pytest.raises(MissingExtraError, match=r"highway_env is not .*'mcaprl\[sims\]'"):
         make_sim("highway-lane")
 
 
-def test_it_keeps_nothing_of_earlier_episodes() -> None:
-    """Their environment remembers all its states; ours forgets them with each episode."""
+def test_it_keeps_no_states_of_earlier_episodes() -> None:
+    """highway-env's list of states is cleared at each reset."""
     sim = made()
     for seed in range(3):
         sim.reset(seed=seed)
@@ -216,7 +220,7 @@ def test_each_road_decides_at_its_own_rate() -> None:
 
 
 def test_many_are_stepped_one_after_the_other() -> None:
-    """As environments of others are: each as it is alone, from the seed after the last one's."""
+    """Environment i equals a single environment with the i-th seed."""
     many, alone = make_sims("highway-lane", 2), made()
     seen, _ = many.reset(seed=7)
     for row, seed in enumerate((7, 8)):

@@ -1,4 +1,4 @@
-"""The scripted driver of the highway-lane sim."""
+"""The pilot of the highway-lane sim."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_it_laps_the_racetracks_around_other_cars(road: str) -> None:
     assert [drive_through(seed, **kwargs)[0] for seed in range(4)] == ["time_limit"] * 4
 
 
-def test_on_the_middle_it_goes_straight_and_from_the_side_it_returns() -> None:
+def test_in_the_middle_it_drives_straight_and_from_the_side_it_returns() -> None:
     sim: Any = make_sim("highway-lane", road="racetrack-v0").unwrapped
     pilot = make_pilot(sim)
     signs = []

@@ -1,4 +1,4 @@
-"""What the highway-lane sim shows, and that a recorder of any environment records it."""
+"""The scene of the highway-lane sim, and its recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def shapes_of(sim: Any) -> dict[str, Any]:
     return {shape.name: shape for shape in [*sim.static_scene(), *sim.scene()]}
 
 
-def test_the_road_lies_on_the_ground_and_looks_up() -> None:
+def test_the_road_is_on_the_ground_and_faces_up() -> None:
     sim = made(**TRACK)
     sim.reset(seed=0)
     triangles = shapes_of(sim)["road"].points.reshape(-1, 3, 3)
@@ -47,7 +47,7 @@ def test_lines_are_at_the_edges_of_lanes() -> None:
     offsets = np.array(
         [[course.nearest(x_m, y_m).offset_m for course in sim.courses] for x_m, y_m in points]
     )
-    # Their lanes' ends miss each other by some decimeters.
+    # The ends of highway-env's lanes differ by some decimeters.
     assert np.quantile(np.abs(np.abs(offsets).min(axis=1) - 2.5), 0.95) < 0.1
     # The first lane is the left one.
     left = np.isclose(offsets[:, 0], 2.5, atol=0.1)
@@ -55,7 +55,7 @@ def test_lines_are_at_the_edges_of_lanes() -> None:
     assert left.sum() > 1.3 * between.sum()
 
 
-def test_cars_are_where_they_are() -> None:
+def test_other_cars_are_shown_at_their_positions() -> None:
     sim = made(**TRACK)
     sim.reset(seed=0, options={"pose": (60.0, 0.0, 0.2)})
     (frame,) = sim.frames()
@@ -99,7 +99,7 @@ def test_a_window_shows_each_step() -> None:
     env.close()
 
 
-def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
+def test_it_is_recorded_and_replayed_like_any_environment(tmp_path: Path) -> None:
     log, layout = tmp_path / "highway.mcap", tmp_path / "layout.json"
     assert run(["record", "highway-lane", "--out", str(log), "--episodes", "2"]) == 0
     assert run(["check", str(log)]) == 0
@@ -119,7 +119,7 @@ def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
                 store.deserialize_cdr(message.data, schema.name)
             )
     assert {marker.ns for marker in shown["/scene/static"][0].markers} >= {"road", "lines"}
-    # One at least at each episode's start and end, at most one for each observation.
+    # At least one at each episode's start and end, at most one for each observation.
     for topic in ("/scene", "/tf"):
         assert 4 <= len(shown[topic]) <= len(data.rewards) + 2
     place = shown["/tf"][0].transforms[0]
@@ -129,7 +129,7 @@ def test_it_is_recorded_and_replayed_like_any_other(tmp_path: Path) -> None:
     assert "lateral_offset_m" in json.dumps(panels)
 
 
-def test_what_was_logged_can_be_driven_again(tmp_path: Path) -> None:
+def test_logged_actions_can_be_repeated(tmp_path: Path) -> None:
     log = tmp_path / "highway.mcap"
     arguments = ["--episodes", "2", "--policy", "random", "--seed", "5"]
     assert run(["record", "highway-lane", "--out", str(log), *arguments]) == 0

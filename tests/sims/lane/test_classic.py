@@ -1,4 +1,4 @@
-"""The published rules of the lane sim: numbers worked by hand, and its faults shown by driving."""
+"""The published rules of the lane sim: numbers worked by hand, and their faults."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
         # In the middle at 10 m/s: (1 - .5) + (0 - .5) = 0; at rest 10 / 290 less.
         (60.0, 1.0, 10.0, STRAIGHT, False, 0.0, DRIVING, DRIVING),
         (60.0, 1.0, 0.0, BRAKE, False, -0.034483, DRIVING, DRIVING),
-        # The same without braking: too slow by the text, up to 5 m/s.
+        # The same without braking: up to 5 m/s, too slow by the text.
         (60.0, 1.0, 0.0, STRAIGHT, False, -0.034483, SLOW, DRIVING),
         (60.0, 1.0, 5.0, LEFT, False, -0.017241, SLOW, DRIVING),
         (60.0, 1.0, 5.1, LEFT, False, -0.016897, DRIVING, DRIVING),
-        # The fastest car there is, 20 / 290 more.
+        # At the maximum speed, 20 / 290 more.
         (60.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
         # 0.5 m beside it at 10 m/s: e^-1.5 - 1.
         (60.0, 1.5, 10.0, STRAIGHT, False, -0.776870, DRIVING, DRIVING),
@@ -57,17 +57,17 @@ def lane(rules: str = "classic", **kwargs: Any) -> LaneKeepingEnv:
         # 3.4 m beside it, fast: e^-10.2 - 1 + 10 / 290 is no less than -1; at 9 m/s it is.
         (60.0, 4.4, 20.0, STRAIGHT, False, -0.965480, DRIVING, DRIVING),
         (60.0, 4.4, 9.0, STRAIGHT, False, -1.003411, LOW_REWARD, LOW_REWARD),
-        # The hidden lane at rest ends at ln(29) / 3 = 1.1224 m: there e^-3d is 10 / 290.
+        # The second lane at rest ends at ln(29) / 3 = 1.1224 m: there e^-3d is 10 / 290.
         (60.0, 2.122, 0.0, BRAKE, False, -0.999955, DRIVING, DRIVING),
         (60.0, 2.123, 0.0, BRAKE, False, -1.000059, LOW_REWARD, LOW_REWARD),
-        # Beyond 3.5 m: -3 and the end, however fast.
+        # Beyond 3.5 m: -3 and the end, at any speed.
         (60.0, 4.51, 20.0, STRAIGHT, False, -3.0, OFF_LANE, OFF_LANE),
         (60.0, -60.0, 30.0, BRAKE, True, -3.0, OFF_LANE, OFF_LANE),
-        # A collision ends by the code, and only driving straight ahead.
+        # By the code, a collision is an end, but only while driving straight ahead.
         (60.0, 1.5, 10.0, STRAIGHT, True, -0.776870, DRIVING, COLLISION),
         (60.0, 1.5, 10.0, LEFT, True, -0.776870, DRIVING, DRIVING),
         (60.0, 1.0, 4.0, BRAKE, True, -0.020690, DRIVING, DRIVING),
-        # 200 m past the first corner, on the first leg's extension: the line is endless.
+        # 200 m past the first corner, on the first leg's extension: the line is infinite.
         (330.0, 1.0, 30.0, STRAIGHT, False, 0.068966, DRIVING, DRIVING),
         # 500 m south of it all, 0.1 m beside the extension of x = 0: e^-0.3 - 1.
         (-0.1, -500.0, 10.0, STRAIGHT, False, -0.259182, DRIVING, DRIVING),
@@ -103,14 +103,14 @@ def test_rewards_and_ends_by_hand(
         (1.0, 700.0, 1.0),
     ],
 )
-def test_the_distance_is_to_the_nearest_endless_line(
+def test_the_distance_is_to_the_nearest_infinite_line(
     x_m: float, y_m: float, distance_m: float
 ) -> None:
     """The lines are y = 1, x = 130, y = -125, x = 0 and y = 128."""
     assert classic_distance(x_m, y_m) == pytest.approx(distance_m)
 
 
-def test_a_decision_lasts_a_second() -> None:
+def test_a_decision_takes_one_second() -> None:
     """Full throttle from 10 m/s: v(t) = 30 - 20 e^(-4 t / 30), in steps of 0.05 s."""
     car = located(moving(20.0, 1.0, 0.0, 10.0), 0.0, 20.0, 0.0)
     after, hit = classic_decide(car, STRAIGHT)
@@ -158,7 +158,7 @@ def test_the_two_published_ends_differ() -> None:
 
 
 def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
-    """The reward of the pilot's lap; it even decides four times as often as the rules allow."""
+    """The reward of the pilot's lap, although it decides four times as often as the rules allow."""
     sim = make_sim("lane", start="line").unwrapped
     assert isinstance(sim, LaneKeepingEnv)
     pilot = make_pilot(sim)
@@ -177,8 +177,8 @@ def test_fault_a_whole_lap_scores_far_below_leaving_at_once() -> None:
     assert score < 5 * -3.0
 
 
-def test_fault_speed_is_hardly_paid() -> None:
-    """From 10 to 30 m/s it is worth 0.069 a second: as much as 2.4 cm beside the middle costs."""
+def test_fault_speed_is_hardly_rewarded() -> None:
+    """From 10 to 30 m/s it adds 0.069 per second, the cost of an offset of 2.4 cm."""
     gain = classic_reward(0.0, 30.0) - classic_reward(0.0, 10.0)
     assert gain == pytest.approx(20.0 / 290.0)
     assert classic_reward(0.0, 10.0) - classic_reward(0.024, 10.0) > gain
@@ -190,7 +190,7 @@ def test_fault_speed_is_hardly_paid() -> None:
 
 
 def test_fault_a_hidden_lane_at_low_speed() -> None:
-    """1.2 m beside the middle: over at 1 m/s, paid on at 10 m/s, though the lane is 3.5 m wide."""
+    """1.2 m beside the middle, an episode ends at 1 m/s but not at 10 m/s."""
     sim = lane()
     ends = {}
     for speed_m_s in (2.0, 20.0):
@@ -201,8 +201,8 @@ def test_fault_a_hidden_lane_at_low_speed() -> None:
     assert ends == {2.0: True, 20.0: False}
 
 
-def test_fault_driving_off_along_the_extension_is_paid() -> None:
-    """Straight on at the first corner, through rail and houses: paid as the street is, for ever."""
+def test_fault_leaving_along_the_extension_is_rewarded() -> None:
+    """Driving straight on at the first corner, through rail and houses, has the street's reward."""
     sim = lane()
     sim.reset(options={"pose": (100.0, 1.0, 0.0, 20.0)})
     for _ in range(60):
@@ -213,7 +213,7 @@ def test_fault_driving_off_along_the_extension_is_paid() -> None:
     assert abs(info["lateral_offset_m"]) > 1000.0
 
 
-def test_fault_braking_to_a_stand_never_ends() -> None:
+def test_fault_standing_still_never_ends() -> None:
     sim = lane()
     sim.reset(options={"pose": (60.0, 1.0, 0.0, 10.0)})
     for _ in range(400):
@@ -223,7 +223,7 @@ def test_fault_braking_to_a_stand_never_ends() -> None:
 
 
 def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
-    """Through the same rail while braking: nothing happens."""
+    """Driving through the same rail while braking is no end."""
     sim = lane("classic-code")
     reasons = []
     for action in (STRAIGHT, BRAKE):
@@ -234,14 +234,14 @@ def test_fault_by_the_code_walls_count_only_straight_ahead() -> None:
 
 
 def test_fault_in_a_second_nothing_can_be_corrected() -> None:
-    """At 15 m/s, the slightest steering leads from the middle of the lane out of it."""
+    """At 15 m/s, the smallest steering angle leaves the lane from its middle."""
     sim = lane()
     for action in (RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT):
         sim.reset(options={"pose": (60.0, 1.0, 0.0, 15.0)})
         assert sim.step(action)[4]["reason"] == "off_lane"
 
 
-def test_fault_half_of_the_image_s_codes_are_for_1_to_2_m() -> None:
+def test_fault_half_of_the_image_codes_are_for_1_to_2_m() -> None:
     sim = lane(observation="depth")
     observation, _ = sim.reset(seed=0)
     depth_m = sim.depth_image_m()

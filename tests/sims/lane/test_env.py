@@ -1,4 +1,4 @@
-"""The lane sim as a Gymnasium environment."""
+"""The Gymnasium environment of the lane sim."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mcaprl.sims.lane.env import LaneKeepingEnv
 
 
 def lane(**kwargs: Any) -> LaneKeepingEnv:
-    """The sim itself, without wrappers."""
+    """Return the sim without wrappers."""
     sim = make_sim("lane", **kwargs).unwrapped
     assert isinstance(sim, LaneKeepingEnv)
     return sim
@@ -68,7 +68,7 @@ def test_a_pose_is_kept() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: at most 3.5 m"),
+        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: the lane ends at 3.5 m"),
         ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s must be 0 to 30, not -1.0"),
     ],
 )
@@ -119,7 +119,7 @@ def test_progress_counts_along_the_path() -> None:
     assert total == pytest.approx(info["progress_m"] / 7.5)
 
 
-def test_what_the_camera_sees_is_what_is_observed() -> None:
+def test_the_camera_image_is_observed() -> None:
     sim = lane(observation="depth")
     seen, _ = sim.reset(seed=4)
     assert seen.shape == (84, 84, 1)
@@ -136,9 +136,9 @@ def test_what_the_camera_sees_is_what_is_observed() -> None:
     ("along_m", "turn"),
     [(10.0, -1), (129.9, -1), (130.1, -1), (511.0, -1), (513.0, 1), (1025.9, 1)],
 )
-def test_a_dashboard_tells_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
+def test_a_dashboard_has_speed_steering_and_the_next_turn(along_m: float, turn: int) -> None:
     # The shared street comes before the fifth corner: its first passage ends in a right turn, the
-    # second, 512 m on, in a left one.
+    # second, 512 m later, in a left one.
     sim = lane(observation="dashboard")
     sim.reset(seed=4)
     sim.fleet._cars[0, 5] = along_m + 3 * COURSE.length_m
@@ -151,7 +151,7 @@ def test_a_dashboard_tells_speed_steering_and_the_next_turn(along_m: float, turn
     assert moved["motion"][0] == pytest.approx(sim.car.speed_m_s / 30)
 
 
-def test_names_fit_what_they_name() -> None:
+def test_names_and_metadata_fit_the_sim() -> None:
     sim = lane()
     assert len(sim.action_meanings) == 6
     assert len(sim.observation_names) == 12

@@ -1,4 +1,4 @@
-"""The course's own searches find what those of any path find, to the bit."""
+"""The branch-free functions of the course equal the general ones bit for bit."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from mcaprl.sims.lane.path import (
 )
 from mcaprl.sims.lane.rules import AHEAD_M, BEHIND_M, LOOKAHEADS_M
 
-# A subnormal number before the start ends behind it, a distance that no car can tell.
+# A subnormal distance before the start is rounded to a distance after it.
 along = st.one_of(
     st.floats(-20, 5000, allow_subnormal=False), st.sampled_from(COURSE.along_m.tolist())
 )
 
 
-def test_nobody_looks_further_than_the_shortest_leg() -> None:
+def test_no_lookahead_exceeds_the_shortest_leg() -> None:
     assert LONGEST_LOOK_M == 126.0
     assert max(*LOOKAHEADS_M, BEHIND_M + AHEAD_M) < LONGEST_LOOK_M
 

@@ -1,4 +1,4 @@
-"""The scripted driver of the lane sim."""
+"""The pilot of the lane sim."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_it_laps_the_course_from_the_start_line() -> None:
         assert progress_m > 1026.0
 
 
-def test_it_thinks_ahead_where_pursuit_would_fail() -> None:
+def test_it_searches_where_pursuit_would_fail() -> None:
     """8 m before a corner at 11.4 m/s it is too late to brake first and turn then."""
     car = located(moving(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
     assert worth(car) < HORIZON

@@ -1,4 +1,4 @@
-"""What the lane sim's car can touch, and how far its rays reach, by hand and by an outline."""
+"""Contacts and ray lengths of the lane sim's car, by hand and against an outline."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def in_a_box(x_m: float, y_m: float) -> bool:
         (-math.pi / 2, 4.0),
         (math.pi / 4, 4.0 * math.sqrt(2.0)),
         (-math.pi / 4, 4.0 * math.sqrt(2.0)),
-        # Ahead, the rail behind the first corner, at x = 134; behind, the one at x = -4.
+        # Ahead, the rail after the first corner, at x = 134; behind the car, the one at x = -4.
         (0.0, 74.0),
         (math.pi, 64.0),
         (math.radians(30.0), 8.0),
@@ -67,7 +67,7 @@ def test_a_ray_from_within_something_is_0() -> None:
 
 @given(st.floats(-20.0, 150.0), st.floats(-150.0, 150.0), st.floats(-math.pi, math.pi))
 def test_a_ray_ends_where_the_first_box_begins(x_m: float, y_m: float, angle_rad: float) -> None:
-    """Sampled every 2 cm: nothing before the end, something behind it."""
+    """Sampled every 2 cm: nothing before the end, an obstacle after it."""
     length_m = ray_length(x_m, y_m, angle_rad)
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     along_m = np.arange(0.0, length_m - 1e-6, 0.02)
@@ -82,7 +82,7 @@ def test_a_ray_ends_where_the_first_box_begins(x_m: float, y_m: float, angle_rad
         )
 
 
-def test_what_is_observed_by_hand() -> None:
+def test_observations_by_hand() -> None:
     sim = lane()
     observation, _ = sim.reset(options={"pose": (60.0, 2.0, 0.0, 15.0)})
     seen = dict(zip(sim.observation_names, observation.tolist(), strict=True))
@@ -98,7 +98,7 @@ def test_what_is_observed_by_hand() -> None:
     assert len(RAYS_DEG) == 16
 
 
-def test_the_way_tells_the_crossing_s_streets_apart() -> None:
+def test_the_path_point_distinguishes_the_streets_of_a_crossing() -> None:
     """The shared leg ends with a right turn on one pass and with a left turn on the other."""
     observation = np.zeros(20, dtype=np.float32)
     way = []
@@ -128,7 +128,7 @@ def test_the_way_tells_the_crossing_s_streets_apart() -> None:
         (60.0, 7.0, 0.0, False),
     ],
 )
-def test_what_a_car_touches_by_hand(x_m: float, y_m: float, yaw_rad: float, hit: bool) -> None:
+def test_contacts_of_a_car_by_hand(x_m: float, y_m: float, yaw_rad: float, hit: bool) -> None:
     assert touches(car_at(x_m, y_m, yaw_rad)) is hit
 
 

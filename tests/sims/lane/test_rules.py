@@ -32,7 +32,7 @@ STRAIGHT, RIGHT, LEFT, SLIGHTLY_RIGHT, SLIGHTLY_LEFT = 1, 2, 3, 4, 5
 
 
 def placed(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float, near_m: float) -> Car:
-    """A car at a pose, its place on the path looked for around a distance along it."""
+    """Return a car at a pose, its place on the path searched around a distance along it."""
     return located(moving(x_m, y_m, yaw_rad, speed_m_s), 0.0, near_m, 0.0)
 
 
@@ -49,7 +49,7 @@ def observed(car: Car) -> list[float]:
 @pytest.mark.parametrize(
     ("speed_km_h", "share"), [(0.0, 1.0), (10.0, 0.95), (20.0, 0.9), (25.0, 0.8875)]
 )
-def test_the_wheels_turn_less_at_speed(speed_km_h: float, share: float) -> None:
+def test_the_steering_angle_decreases_with_speed(speed_km_h: float, share: float) -> None:
     angle_rad = wheel_angle(0.5, speed_km_h / 3.6)
     assert math.degrees(angle_rad) == pytest.approx(20.0 * share)
 
@@ -89,7 +89,7 @@ def test_braking_keeps_the_last_steering() -> None:
     assert drive(turning, BRAKE).yaw_rad > turning.yaw_rad
 
 
-def test_left_and_right_are_as_the_eye_sees_them() -> None:
+def test_left_and_right_are_not_mirrored() -> None:
     car = placed(50.0, 1.0, 0.0, 6.0, 50.0)
     y_m = [drive(car, action).y_m for action in (LEFT, SLIGHTLY_LEFT, STRAIGHT)]
     assert y_m[0] > y_m[1] > y_m[2] == 1.0
@@ -107,7 +107,7 @@ def test_reward_by_hand() -> None:
     assert reward_of(before, after._replace(slow_s=3.0)) == -5.0
 
 
-def test_what_ends_an_episode() -> None:
+def test_ends_of_episodes() -> None:
     car = at_rest()
     assert end_of(car) == DRIVING
     assert end_of(car._replace(offset_m=3.5)) == DRIVING
@@ -144,7 +144,7 @@ def test_observation_before_the_first_corner() -> None:
     assert observed(car)[4:] == [1.0, 0.0, 0.5, -0.5, 0.25, -0.75, 0.125, -0.875]
 
 
-def test_the_shared_leg_is_seen_as_the_pass_it_is() -> None:
+def test_the_shared_leg_is_observed_by_its_pass() -> None:
     first, second = (placed(125.0, 1.0, 0.0, 0.0, near_m) for near_m in (125.0, 637.0))
     assert (first.along_m, second.along_m) == (125.0, 637.0)
     assert observed(first)[7] == -0.5
@@ -161,7 +161,7 @@ def test_observations_stay_inside_their_limits() -> None:
     st.sampled_from([1, 12]),
 )
 def test_many_cars_drive_as_one_does(starts: list[tuple[float, int]], copies: int) -> None:
-    # So many copies fill a block and more.
+    # The copies fill a block and more.
     starts = starts * copies
     cars = np.array([placed(x_m, 1.5, 0.1, 8.0, x_m) for x_m, _ in starts])
     actions = np.array([action for _, action in starts])

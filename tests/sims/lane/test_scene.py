@@ -1,4 +1,4 @@
-"""What the lane sim shows to a 3D viewer."""
+"""The scene of the lane sim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.sim_shapes import rotated
 
 @pytest.fixture
 def sim() -> LaneKeepingEnv:
-    """A car halfway along the second leg, which leads towards -y."""
+    """Return a car in the middle of the second leg, which is toward -y."""
     made = make_sim("lane").unwrapped
     assert isinstance(made, LaneKeepingEnv)
     made.reset(options={"pose": (131.0, -60.0, -math.pi / 2, 6.0)})
@@ -67,7 +67,7 @@ def test_the_car_stands_on_the_ground_on_its_wheels(sim: LaneKeepingEnv) -> None
     assert {shape.frame for shape in sim.static_scene() if "car" in shape.name} == {"car"}
 
 
-def test_the_lane_borders_lie_half_a_metre_inside_the_rails(sim: LaneKeepingEnv) -> None:
+def test_the_lane_borders_are_half_a_meter_inside_the_rails(sim: LaneKeepingEnv) -> None:
     shapes = {shape.name: shape for shape in sim.static_scene()}
     borders, road = shapes["lane_borders"].points, shapes["road"].points
     np.testing.assert_allclose(borders[:, :2].max(axis=0), road[:, :2].max(axis=0) - 0.5)

@@ -1,4 +1,4 @@
-"""The images of the lane sim from above, and the flattening of shapes behind them."""
+"""The top view of the lane sim, and the projection of shapes to patches."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def image_at(pose: tuple[float, float, float]) -> Image:
 
 
 def near(image: Image, color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a color, but for rounding."""
+    """Return which pixels have a color, up to rounding."""
     wanted = np.round(255 * np.array(color[:3]))
     return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
-def test_a_image_has_the_car_in_its_middle() -> None:
+def test_the_car_is_in_the_middle_of_the_image() -> None:
     image = image_at((50.0, 1.0, 0.0))
     assert image.shape == (600, 600, 3)
     assert image.dtype == np.uint8
@@ -77,7 +77,7 @@ def test_a_window_shows_each_step() -> None:
 
 
 def test_rendering_needs_a_mode() -> None:
-    """The env itself draws nothing without one; Gymnasium's own wrapper would warn."""
+    """The unwrapped environment renders nothing without a mode; Gymnasium's wrapper would warn."""
     env = gym.make(ENV_ID).unwrapped
     env.reset(seed=0)
     assert env.render() is None

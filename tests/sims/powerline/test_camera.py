@@ -1,4 +1,4 @@
-"""What the drone's camera sees, against ray casting and geometry by hand."""
+"""The drone's camera against ray casting and geometry by hand."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def level_at(x: float, y: float, z: float) -> Drone:
 
 
 def cast(eye: Floats, ray: Floats) -> float:
-    """Return 1/distance of the nearest front of the world that a unit ray meets, or 0.
+    """Return 1/distance of the nearest front of the world that a unit ray hits, or 0.
 
     Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", 1997.
     """
@@ -55,7 +55,7 @@ def cast(eye: Floats, ray: Floats) -> float:
 
 
 @pytest.mark.parametrize("view", ["down", "front"])
-def test_the_world_looks_as_ray_casting_says(view: str) -> None:
+def test_the_world_matches_ray_casting(view: str) -> None:
     """Of 3,000 pixels at 30 random poses, tilted too, at most 3 differ in uint8, at edges."""
     random = np.random.default_rng(5)
     camera = DroneCamera(view)
@@ -100,7 +100,7 @@ def test_forward_is_up_in_the_lower_camera_and_right_is_right() -> None:
 
 
 def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
-    """From above every hill, nothing is seen in the upper half."""
+    """From above every hill, the upper half of the image is empty."""
     image = DroneCamera("front").image_m(level_at(100.0, -58.0, -75.0))
     assert np.all(np.isinf(image[:42]))
     assert np.isfinite(image[83]).all()
@@ -108,7 +108,7 @@ def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
 
 @pytest.mark.parametrize("view", ["down", "front"])
 def test_conductors_are_seen_all_along_the_line(view: str) -> None:
-    """Above the middle of each span; without them, the same image shows but the ground."""
+    """Above the middle of each span; without wires, the image shows only the ground."""
     camera = DroneCamera(view)
     bare = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
     for leg in range(4):
@@ -121,7 +121,7 @@ def test_conductors_are_seen_all_along_the_line(view: str) -> None:
 def test_the_conductor_below_has_its_distance() -> None:
     middle = WIRES_M[7, 8]
     image = DroneCamera("down").image_m(level_at(*np.add(middle, [0.0, 0.0, -7.1]).tolist()))
-    # The nearest pixel's ray leads to the wire, or to half a pixel beside it.
+    # The nearest pixel's ray ends on the wire, or half a pixel beside it.
     assert image.min() == pytest.approx(7.0, abs=0.05)
 
 
@@ -142,7 +142,7 @@ def test_a_steep_wire_takes_one_pixel_of_each_row() -> None:
     assert np.all(image[:, 8] > 0)
 
 
-def test_a_wire_hides_behind_what_is_nearer_and_the_lens() -> None:
+def test_a_wire_is_hidden_by_nearer_surfaces_and_clipped() -> None:
     wires = np.array([[[-9.0, 0.0, 10.0], [9.0, 0.0, 10.0]], [[-9.0, 0.0, -1.0], [9.0, 0.0, -1.0]]])
     image = np.full((12, 16), 0.5)
     draw_wires(wires, np.zeros(3), np.eye(3), 8.0, 8.0, image)

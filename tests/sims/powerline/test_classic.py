@@ -1,4 +1,4 @@
-"""The published rules of the powerline sim: numbers worked by hand, and its faults shown."""
+"""The published rules of the powerline sim: numbers worked by hand, and their faults."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NORTH, SOUTH, NOTHING = 0, 3, 6
 
 
 def beside(leg: int, along_m: float, distance_m: float) -> Vector:
-    """A place at a level distance, to the right of a leg or of its extension."""
+    """Return a place at a horizontal distance to the right of a leg or of its extension."""
     across = np.cross([0.0, 0.0, 1.0], TANGENTS[leg])
     across /= np.linalg.norm(across)
     return Vector(*(POINTS_M[leg] + along_m * TANGENTS[leg] + distance_m * across).tolist())
@@ -47,13 +47,13 @@ def beside(leg: int, along_m: float, distance_m: float) -> Vector:
         (beside(2, 100.0, -3.0), 0.5, False, -0.450213, FLYING),
         # 6.99 m beside it: e^-6.99 - .5 + 9.5, for 10 m/s in any direction.
         (beside(3, 100.0, 6.99), 10.0, False, 9.000921, FLYING),
-        # Beyond 7 m: -10 and the end, however fast.
+        # Beyond 7 m: -10 and the end, at any speed.
         (beside(3, 100.0, 7.01), 10.0, False, -10.0, OFF_LINE),
         (beside(0, -30.0, 7.5), 1.0, False, -10.0, OFF_LINE),
-        # A collision outweighs all.
+        # A collision has priority.
         (beside(1, 60.0, 0.0), 3.0, True, -100.0, COLLISION),
         (beside(1, 60.0, 9.0), 3.0, True, -100.0, COLLISION),
-        # 50 m before the start, on the first leg's extension: the line is endless.
+        # 50 m before the start, on the first leg's extension: the line is infinite.
         (beside(0, -50.0, 0.0), 1.0, False, 1.0, FLYING),
         # 100 m past the first tower on the same extension.
         (beside(0, LEG_LENGTHS_M[0] + 100.0, 0.0), 1.0, False, 1.0, FLYING),
@@ -80,7 +80,7 @@ def test_the_distance_is_the_published_formula() -> None:
 
 
 def classic() -> PowerlineEnv:
-    """The sim itself, started."""
+    """Return the sim without wrappers, after a reset."""
     sim = make_sim("powerline", rules="classic").unwrapped
     assert isinstance(sim, PowerlineEnv)
     sim.reset(seed=0)
@@ -88,7 +88,7 @@ def classic() -> PowerlineEnv:
 
 
 def test_an_action_changes_the_measured_velocity() -> None:
-    """Commanded 1 + .25 m/s; after 5 s, ten lags, all but e^-10 of it is reached."""
+    """Commanded 1 + .25 m/s; after 5 s, ten lags, the error is e^-10 of the step."""
     flight = begin(point_on_line(150.0), Vector(1.0, 0.0, 0.0), ZERO)
     flight = flight._replace(command_m_s=Vector(4.0, 4.0, 4.0))
     after, hit = classic_decide(POINT, flight, NORTH)
@@ -107,11 +107,11 @@ def test_it_starts_with_5_seconds_at_the_published_velocity() -> None:
     drone = classic().flight.drone
     assert drone.velocity_m_s == pytest.approx((1.0, -0.67, -0.8), abs=1e-3)
     flown = np.subtract(drone.position_m, POINTS_M[0])
-    # 5 s, less the lag of half a second.
+    # 5 s, minus the lag of half a second.
     np.testing.assert_allclose(flown, 4.5 * np.array([1.0, -0.67, -0.8]), atol=0.25)
 
 
-def test_fault_coasting_past_the_first_tower_is_paid_for_100_m() -> None:
+def test_fault_flying_past_the_first_tower_is_rewarded_for_100_m() -> None:
     sim = classic()
     paid_until_m = 0.0
     for _ in range(60):
@@ -124,8 +124,8 @@ def test_fault_coasting_past_the_first_tower_is_paid_for_100_m() -> None:
     assert paid_until_m > 90.0
 
 
-def test_fault_flying_to_and_fro_earns_more_than_following_the_line() -> None:
-    """10 m/s either way is paid 10 a decision; following at 2 m/s earns 2."""
+def test_fault_flying_to_and_fro_has_a_higher_return_than_following() -> None:
+    """10 m/s in either direction has a reward of 10 per decision, following at 2 m/s one of 2."""
     place = beside(2, 100.0, 0.0)
     assert classic_reward(place, 10.0, False) == pytest.approx(10.0)
     assert classic_reward(place, 2.0, False) == pytest.approx(2.0)
@@ -134,7 +134,7 @@ def test_fault_flying_to_and_fro_earns_more_than_following_the_line() -> None:
     assert classic_reward(after.drone.position_m, 2.25, False) > 0.0
 
 
-def test_fault_flying_on_beyond_the_end_is_paid() -> None:
+def test_fault_flying_on_beyond_the_end_is_rewarded() -> None:
     sim = classic()
     end = POINTS_M[-1] - TANGENTS[-1]
     sim.reset(options={"pose": (*end, *(2.0 * TANGENTS[-1]))})
@@ -154,8 +154,8 @@ def test_fault_hovering_on_the_line_costs_nothing_and_never_ends() -> None:
         assert (round(reward, 9), terminated) == (0.0, False)
 
 
-def test_fault_what_wind_adds_is_kept() -> None:
-    """Each decision takes the velocity that the wind has left for the command."""
+def test_fault_commands_keep_the_effect_of_wind() -> None:
+    """Each decision starts from the measured velocity, which wind has changed."""
     sim = make_sim("powerline", rules="classic", plant="quad").unwrapped
     assert isinstance(sim, PowerlineEnv)
     flight = begin(point_on_line(300.0), ZERO, Vector(0.0, 4.0, 0.0))
@@ -164,14 +164,14 @@ def test_fault_what_wind_adds_is_kept() -> None:
 
 
 def test_fault_in_5_seconds_nothing_can_be_corrected() -> None:
-    """From the line, 2 m/s sideways: 10 m by the next decision, whatever is done now."""
+    """At 2 m/s sideways, the next decision is 10 m from the line, whatever the action."""
     sim = classic()
     for action in range(7):
         sim.reset(options={"pose": (*beside(2, 100.0, 0.0), -0.9, 1.8, 0.0)})
         assert sim.step(action)[4]["reason"] == "off_line"
 
 
-def test_fault_half_of_the_image_s_codes_are_for_1_to_2_m() -> None:
+def test_fault_half_of_the_image_codes_are_for_1_to_2_m() -> None:
     sim = make_sim("powerline", rules="classic", observation="depth").unwrapped
     assert isinstance(sim, PowerlineEnv)
     observation, _ = sim.reset(seed=0)

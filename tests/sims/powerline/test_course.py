@@ -49,14 +49,14 @@ def test_a_point_of_the_line_is_its_own_nearest(along_m: float) -> None:
 
 
 @given(st.tuples(st.floats(-50, 600), st.floats(-150, 200), st.floats(-90, 0)))
-def test_the_nearest_point_beats_all_others(position: tuple[float, float, float]) -> None:
+def test_no_other_point_is_nearer_than_the_nearest(position: tuple[float, float, float]) -> None:
     place = nearest_on_line(Vector(*position))
     others = [point_on_line(along) for along in np.linspace(0, LENGTH_M, 400)]
     distances = np.linalg.norm(np.array(others) - position, axis=1)
     assert place.distance_m <= distances.min() + 1e-9
 
 
-def test_beyond_the_end_the_endless_line_is_nearer() -> None:
+def test_beyond_the_end_the_infinite_line_is_nearer() -> None:
     """3 m beside the first leg's extension, 50 m beyond its end."""
     along = (POINTS_M[1] - POINTS_M[0]) / LEG_LENGTHS_M[0]
     beside = np.cross(along, [0, 0, 1.0])
@@ -91,7 +91,7 @@ def test_a_conductor_hangs_under_the_line_with_its_sag() -> None:
 
 
 @given(st.integers(0, 11), st.floats(0, 15.99), st.tuples(*[st.floats(-1.5, 1.5)] * 3))
-def test_the_distance_to_wires_is_the_smallest_of_all_pieces(
+def test_the_distance_to_wires_is_the_smallest_of_all_segments(
     wire: int, place: float, away: tuple[float, float, float]
 ) -> None:
     chord = int(place)
@@ -103,13 +103,13 @@ def test_the_distance_to_wires_is_the_smallest_of_all_pieces(
     assert wire_distance(position) == min(pieces)
 
 
-def test_the_distance_to_a_piece_by_hand() -> None:
+def test_the_distance_to_a_segment_by_hand() -> None:
     start, end = np.zeros(3), np.array([10.0, 0.0, 0.0])
     for position, distance_m in (((4, 3, 0), 3.0), ((-3, 0, 4), 5.0), ((13, 4, 0), 5.0)):
         assert distance_to_segment(Vector(*map(float, position)), start, end) == distance_m
 
 
-def test_towers_stand_on_the_ground_under_the_line() -> None:
+def test_towers_are_on_the_ground_under_the_line() -> None:
     for tower, point in zip(towers(), POINTS_M, strict=True):
         assert (tower.x_m, tower.y_m) == (point[0], point[1])
         assert -tower.foot_z_m == pytest.approx(ground_height(tower.x_m, tower.y_m))
@@ -119,7 +119,7 @@ def test_towers_stand_on_the_ground_under_the_line() -> None:
 
 
 def test_arms_lie_across_the_line() -> None:
-    """The first tower's arm is square to the first leg; the second's halves the corner."""
+    """The first tower's arm is perpendicular to the first leg; the second's bisects the corner."""
     first, second = towers()[:2]
     legs = np.diff(POINTS_M, axis=0)[:, :2]
     units = legs / np.hypot(*legs.T)[:, None]
@@ -138,7 +138,7 @@ def test_no_conductor_touches_the_ground_or_a_tree() -> None:
 
 
 def test_the_mesh_of_the_ground_is_near_the_ground() -> None:
-    """Within 1.5 m in the middle of each triangle near the line, and all of them face up."""
+    """Within 1.5 m in the middle of each triangle near the line; all triangles face up."""
     triangles = ground_triangles()
     up = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     assert np.all(up[:, 2] > 0)

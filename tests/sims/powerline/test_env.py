@@ -1,4 +1,4 @@
-"""The powerline sim as a Gymnasium environment."""
+"""The Gymnasium environment of the powerline sim."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ NORTH, DOWN, NOTHING = 0, 2, 6
 
 
 def powerline(**kwargs: Any) -> PowerlineEnv:
-    """The sim itself, without wrappers."""
+    """Return the sim without wrappers."""
     sim = make_sim("powerline", **kwargs).unwrapped
     assert isinstance(sim, PowerlineEnv)
     return sim
 
 
 def last_step(sim: PowerlineEnv, action: int) -> tuple[float, str]:
-    """Repeat one action until the episode ends; give the last reward and the reason."""
+    """Repeat one action until the episode ends; return the last reward and the reason."""
     while True:
         _, reward, terminated, _, info = sim.step(action)
         if terminated:
@@ -33,7 +33,7 @@ def last_step(sim: PowerlineEnv, action: int) -> tuple[float, str]:
 
 
 def test_starts_on_the_line_are_near_the_published_one() -> None:
-    """5 s at (1, -.5, -1), less the lag, from the first point; not all the same."""
+    """5 s at (1, -.5, -1), minus the lag, from the first point; not all the same."""
     sim = powerline(start="line")
     places = set()
     for seed in range(20):
@@ -64,22 +64,22 @@ def test_random_starts_are_where_the_card_says() -> None:
     assert max(along) <= LENGTH_M - 19.0
 
 
-def test_a_pose_is_kept_and_told_in_ros_axes() -> None:
+def test_a_pose_is_kept_and_reported_in_ros_axes() -> None:
     sim = powerline()
     point = point_on_line(150.0)
     pose = (point.x, point.y + 2.0, point.z - 1.0, 3.0, 0.0, 0.0)
     _, info = sim.reset(options={"pose": pose})
-    told = sim.telemetry()
+    telemetry = sim.telemetry()
     assert sim.flight.drone.position_m == pose[:3]
-    assert (told["x_m"], told["y_m"], told["z_m"]) == (pose[0], -pose[1], -pose[2])
-    assert told["speed_m_s"] == info["speed_m_s"] == 3.0
-    # East of a line that leads north is to its right; higher is positive.
-    assert told["lateral_offset_m"] < -1.9
-    assert told["vertical_offset_m"] == pytest.approx(1.0, abs=0.15)
-    assert told["line_distance_m"] == pytest.approx(math.sqrt(5.0), abs=0.1)
-    assert told["tilt_rad"] == 0.0
-    assert told["wire_distance_m"] > 6.0
-    assert told["height_m"] > 25.0
+    assert (telemetry["x_m"], telemetry["y_m"], telemetry["z_m"]) == (pose[0], -pose[1], -pose[2])
+    assert telemetry["speed_m_s"] == info["speed_m_s"] == 3.0
+    # East of a line toward the north is to its right; higher is positive.
+    assert telemetry["lateral_offset_m"] < -1.9
+    assert telemetry["vertical_offset_m"] == pytest.approx(1.0, abs=0.15)
+    assert telemetry["line_distance_m"] == pytest.approx(math.sqrt(5.0), abs=0.1)
+    assert telemetry["tilt_rad"] == 0.0
+    assert telemetry["wire_distance_m"] > 6.0
+    assert telemetry["height_m"] > 25.0
     sim.reset(options={"pose": pose[:3]})
     assert sim.telemetry()["speed_m_s"] == 0.0
 
@@ -129,7 +129,7 @@ def test_a_number_out_of_range_is_refused(kwargs: dict[str, Any], words: str) ->
         powerline(**kwargs)
 
 
-def test_ends_are_named_and_paid() -> None:
+def test_ends_have_names_and_rewards() -> None:
     sim = powerline()
     middle, near_end = point_on_line(150.0), point_on_line(LENGTH_M - 4.0)
     sim.reset(options={"pose": tuple(middle)})
@@ -143,8 +143,8 @@ def test_ends_are_named_and_paid() -> None:
     assert 5.0 < reward <= 6.0
 
 
-def test_progress_is_paid_once() -> None:
-    """Flying back and forth again earns nothing for what was flown before."""
+def test_progress_is_rewarded_once() -> None:
+    """Flying back and forth again has no reward for the same progress."""
     sim = powerline(plant="point")
     point = point_on_line(150.0)
     sim.reset(options={"pose": tuple(point)})
@@ -155,7 +155,7 @@ def test_progress_is_paid_once() -> None:
 
 
 @pytest.mark.parametrize("camera", ["down", "front"])
-def test_what_the_camera_sees_is_what_is_observed(camera: str) -> None:
+def test_the_camera_image_is_observed(camera: str) -> None:
     sim = powerline(observation="depth", camera=camera)
     seen, _ = sim.reset(seed=4)
     assert seen["depth"].shape == (84, 84, 1)
@@ -169,7 +169,7 @@ def test_what_the_camera_sees_is_what_is_observed(camera: str) -> None:
 
 
 def test_the_classic_image_has_the_published_code() -> None:
-    """255 / max(1, d), rounded down; nothing is 0."""
+    """255 / max(1, d), rounded down; 0 without a surface."""
     meters = np.array([0.3, 1.0, 2.0, 6.0, 300.0, np.inf])
     assert encode_nearness(meters).tolist() == [255, 255, 127, 42, 0, 0]
     sim = powerline(rules="classic", observation="depth")
@@ -196,7 +196,7 @@ def test_wind_is_drawn_for_each_episode_and_gusts_for_each_step() -> None:
 
 
 def test_a_hover_holds_its_place_in_wind() -> None:
-    """Steady wind of 5 m/s at most: after 10 s, it has stopped less than 1 m away."""
+    """Steady wind of 5 m/s at most: after 10 s, it hovers less than 1 m away."""
     sim = powerline(wind_m_s=5.0)
     start = point_on_line(300.0)
     for seed in range(5):

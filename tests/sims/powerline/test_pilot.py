@@ -1,4 +1,4 @@
-"""The scripted flyer of the powerline sim."""
+"""The pilot of the powerline sim."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def test_it_finishes_from_anywhere(kwargs: dict[str, Any]) -> None:
     assert np.mean([distance_m for _, _, distance_m in flights]) < 0.4
 
 
-def test_the_whole_line_is_worth_about_237() -> None:
+def test_the_return_of_the_whole_line_is_about_237() -> None:
     returns = [fly_through(seed, start="line")[0] for seed in range(5)]
     assert 230.0 < np.mean(returns) < 243.0
 
 
-def test_corners_are_slow_and_the_end_is_not() -> None:
+def test_corners_are_flown_slowly_and_the_end_is_not() -> None:
     speeds = [corner_speed(leg) for leg in range(4)]
     angles = [np.arccos(TANGENTS[leg] @ TANGENTS[leg + 1]) for leg in range(3)]
     assert np.argmin(speeds[:3]) == np.argmax(angles)
@@ -49,7 +49,7 @@ def test_corners_are_slow_and_the_end_is_not() -> None:
     assert speeds[3] == 5.0
 
 
-def test_on_the_line_it_wants_to_fly_along_it() -> None:
+def test_on_the_line_the_wanted_velocity_is_along_it() -> None:
     wanted = wanted_velocity(point_on_line(300.0))
     np.testing.assert_allclose(np.array(wanted), 5.0 * TANGENTS[2], atol=1e-6)
 

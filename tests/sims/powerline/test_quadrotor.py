@@ -45,7 +45,7 @@ def resting() -> Drone:
 
 
 def speed_along(axis: int, command_m_s: float, after_s: float, wind: Vector = ZERO) -> float:
-    """Fly from a hover at a command along one axis; give the velocity along it."""
+    """Fly from a hover at a command along one axis; return the velocities along it."""
     command = Vector(*[command_m_s * part for part in BASIS[axis]])
     return fly(QUAD, resting(), command, wind, after_s).velocity_m_s[axis]
 
@@ -53,7 +53,7 @@ def speed_along(axis: int, command_m_s: float, after_s: float, wind: Vector = ZE
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("command_m_s", [-8.0, -2.0, -0.5, 0.5, 2.0, 5.0, 8.0])
 def test_it_settles_at_the_commanded_velocity(axis: int, command_m_s: float) -> None:
-    """Within 2 % after 4 s, and for good; at 8 m/s it overshoots by less."""
+    """Within 2 % from 4 s on; at 8 m/s it overshoots by less."""
     for after_s in (4.0, 6.0, 10.0, 20.0):
         assert speed_along(axis, command_m_s, after_s) == pytest.approx(command_m_s, rel=0.02)
 
@@ -103,7 +103,7 @@ def test_a_small_step_follows_the_closed_form(axis: int) -> None:
 
 
 def test_a_step_by_numbers() -> None:
-    """2 m/s forward: half after about a third of a second, no overshoot beyond 1 %."""
+    """2 m/s forward: half of it after about 0.33 s, and an overshoot of at most 1 %."""
     speeds = [speed_along(0, 2.0, 0.1 * k) for k in range(60)]
     assert 0.9 < speeds[3] < 1.2
     assert max(speeds) < 2.02
@@ -140,7 +140,7 @@ def test_falling_without_thrust_ends_at_the_speed_where_drag_holds() -> None:
 
 
 def test_a_free_spin_keeps_its_momentum_and_energy() -> None:
-    """Without torque, angular momentum in the world and energy stay, to 1 % over 2 s."""
+    """Without torque, angular momentum in the world and energy are constant, to 1 % over 2 s."""
     spin = Vector(3.0, -1.0, 2.0)
     drone = resting()._replace(thrusts_n=NO_THRUST, rates_rad_s=spin)
     before = rotate(drone.attitude, angular_momentum(drone.rates_rad_s))
@@ -155,7 +155,7 @@ def test_a_free_spin_keeps_its_momentum_and_energy() -> None:
 
 
 def energy_j(drone: Drone) -> float:
-    """Return kinetic energy, of flying and turning, and that of height."""
+    """Return the sum of translational, rotational and potential energy."""
     rates = drone.rates_rad_s
     moving = 0.5 * MASS_KG * dot(drone.velocity_m_s, drone.velocity_m_s)
     turning = 0.5 * dot(rates, angular_momentum(rates))

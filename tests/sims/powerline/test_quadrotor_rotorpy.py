@@ -1,4 +1,4 @@
-"""Our quadrotor against rotorpy's rigid body, which others wrote and SciPy integrates.
+"""Our quadrotor against rotorpy's rigid body, an independent implementation that uses SciPy.
 
 Equal: mass, inertia, arms, the rotors' torque per thrust, and drag, which is added to theirs as
 they have no linear one. Theirs has x forward, y left and z up: a half turn about x from ours.
@@ -40,7 +40,7 @@ THRUST_PER_SPEED2 = 1e-6
 
 
 def their_body() -> Any:
-    """Make a rotorpy multirotor of our drone's parameters."""
+    """Return a rotorpy multirotor with our drone's parameters."""
     need(importlib.util.find_spec("rotorpy") is not None, "pip install rotorpy")
     from rotorpy.vehicles.multirotor import Multirotor
 
@@ -71,7 +71,7 @@ def their_body() -> Any:
 
 
 def to_theirs(drone: Drone, wind: Vector) -> dict[str, Floats]:
-    """Return a drone as a state of rotorpy's."""
+    """Return the state of a drone in rotorpy's format."""
     w, x, y, z = drone.attitude
     return {
         "x": HALF_TURN * drone.position_m,
@@ -84,7 +84,7 @@ def to_theirs(drone: Drone, wind: Vector) -> dict[str, Floats]:
 
 
 def moved_by_theirs(body: Any, drone: Drone, command: Vector, wind: Vector) -> Drone:
-    """Let our controllers and rotors work for 2 ms, and rotorpy's body move under them."""
+    """Advance by 2 ms with our controllers and rotors, and rotorpy's body."""
     ours = advance(drone, command, wind)
     state = to_theirs(drone, wind) | {"rotor_speeds": to_theirs(ours, wind)["rotor_speeds"]}
     after = body.step(state, {"cmd_motor_speeds": state["rotor_speeds"]}, TIME_STEP_S)
@@ -106,8 +106,8 @@ def moved_by_theirs(body: Any, drone: Drone, command: Vector, wind: Vector) -> D
     ],
     ids=["step", "hover in wind", "step in wind"],
 )
-def test_their_body_under_our_controllers_flies_as_ours(command: Vector, wind: Vector) -> None:
-    """2 cm/s and 1 degree apart at most all along the response, and at the end 2 % off at most."""
+def test_rotorpys_body_with_our_controllers_flies_equally(command: Vector, wind: Vector) -> None:
+    """At most 2 cm/s and 1 degree apart during the response, and at most 2 % at its end."""
     body, ours = their_body(), cruising(ZERO, ZERO)
     theirs = ours
     for _ in range(30):
@@ -121,8 +121,8 @@ def test_their_body_under_our_controllers_flies_as_ours(command: Vector, wind: V
     assert error_m_s < 0.02 * scale_m_s
 
 
-def test_unequal_rotors_turn_their_body_as_ours() -> None:
-    """A tenth of a second of one constant, lopsided set of thrusts after the other."""
+def test_unequal_rotors_turn_rotorpys_body_equally() -> None:
+    """A tenth of a second for each of several constant, asymmetric sets of thrusts."""
     random = np.random.default_rng(2)
     body = their_body()
     for _ in range(5):

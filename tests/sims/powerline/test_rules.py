@@ -48,7 +48,7 @@ UP, NOTHING = 5, 6
 
 
 def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
-    """Fly one drone for a decision; give it, and how its flight ended."""
+    """Fly one drone for a decision; return it and its end."""
     row, ends = np.zeros((1, FLIGHT_SIZE)), np.zeros(1, dtype=np.int64)
     store_flight(flight, row[0])
     decide_all(plant, row, np.array([action]), ends)
@@ -56,7 +56,7 @@ def decide(plant: int, flight: Flight, action: int) -> tuple[Flight, int]:
 
 
 def shifted(along_m: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Vector:
-    """A place, from a point of the line."""
+    """Return a place relative to a point of the line."""
     point = point_on_line(along_m)
     return Vector(point.x + x, point.y + y, point.z + z)
 
@@ -83,13 +83,13 @@ def observed(flight: Flight) -> list[float]:
         (6, (1.0, -0.5, -1.0)),
     ],
 )
-def test_actions_change_the_command_by_half_a_metre_per_second(
+def test_actions_change_the_command_by_half_a_meter_per_second(
     action: int, expected: tuple[float, float, float]
 ) -> None:
     assert commanded(Vector(1.0, -0.5, -1.0), action) == expected
 
 
-def test_a_command_beyond_8_m_s_is_not_taken() -> None:
+def test_a_command_beyond_8_m_s_is_ignored() -> None:
     fast = Vector(8.0, 0.0, 0.0)
     assert commanded(fast, 0) == commanded(fast, 1) == fast
     assert commanded(fast, 3) == (7.5, 0.0, 0.0)
@@ -116,7 +116,7 @@ def test_ends_by_hand(position: Vector, end: int) -> None:
     assert end_of(position, nearest_on_line(position)) == end
 
 
-def test_masts_arms_and_the_ground_are_hard() -> None:
+def test_masts_arms_and_the_ground_cause_collisions() -> None:
     tower = towers()[2]
     assert collides(Vector(tower.x_m + 1.1, tower.y_m, tower.foot_z_m - 10.0))
     assert not collides(Vector(tower.x_m + 1.3, tower.y_m, tower.foot_z_m - 10.0))
@@ -128,7 +128,7 @@ def test_masts_arms_and_the_ground_are_hard() -> None:
 
 
 def moved(along_m: float, to_m: float, z: float = 0.0) -> tuple[Flight, Flight]:
-    """The flight before and after progress along the line."""
+    """Return the flight before and after progress along the line."""
     before = hovering(shifted(along_m))
     after = hovering(shifted(to_m, z=z))
     return before, after._replace(furthest_m=max(along_m, nearest_on_line(shifted(to_m)).along_m))
@@ -154,7 +154,7 @@ def test_rewards_by_hand(along_m: float, to_m: float, z: float, end: int, expect
 
 
 def test_distance_costs_an_exponential() -> None:
-    """The third leg falls or rises gently: 4 m above, the distance is 4 m times its cosine."""
+    """The third leg is inclined: 4 m above it, the distance is 4 m times its cosine."""
     before, after = moved(300.0, 302.5, z=-4.0)
     cosine = math.hypot(*TANGENTS[2, :2])
     assert reward_of(before.furthest_m, after, FLYING) == pytest.approx(math.exp(-cosine), abs=1e-6)
@@ -189,7 +189,7 @@ def test_observations_stay_inside_their_limits() -> None:
 
 
 @pytest.mark.parametrize("plant", [QUAD, POINT])
-def test_an_action_moves_the_drone_its_way(plant: int) -> None:
+def test_an_action_moves_the_drone_in_its_direction(plant: int) -> None:
     start = hovering(shifted(150.0))
     for action, axis, sign in ((0, 0, 1), (1, 1, 1), (2, 2, 1), (3, 0, -1), (4, 1, -1), (5, 2, -1)):
         after, end = decide(plant, start, action)
@@ -199,7 +199,7 @@ def test_an_action_moves_the_drone_its_way(plant: int) -> None:
         assert np.sign(moved_m[axis]) == sign
 
 
-def test_no_change_coasts() -> None:
+def test_no_change_keeps_the_command() -> None:
     start = begin(shifted(150.0), Vector(3.0, 0.0, 0.0), ZERO)
     after, _ = decide(POINT, start, NOTHING)
     assert after.drone.velocity_m_s == (3.0, 0.0, 0.0)
@@ -207,15 +207,15 @@ def test_no_change_coasts() -> None:
 
 
 def test_a_flight_ends_within_its_decision() -> None:
-    """At 8 m/s up from 6.5 m above, 7 m are passed after 0.1 s and not 0.5 s later."""
+    """At 8 m/s up from 6.5 m above, 7 m are exceeded after 0.1 s, within the decision."""
     start = begin(shifted(150.0, z=-6.5), Vector(0.0, 0.0, -8.0), ZERO)
     after, end = decide(POINT, start, UP)
     assert end == OFF_LINE
     assert after.drone.position_m.z == pytest.approx(start.drone.position_m.z - 0.8)
 
 
-def test_gusts_keep_their_strength_and_forget() -> None:
-    """Standard deviation 1.5 m/s for ever; correlation e^-1/4 from one decision to the next."""
+def test_gusts_are_stationary_and_decorrelate() -> None:
+    """Standard deviation 1.5 m/s at all times; correlation e^-1/4 from one decision to the next."""
     noise = np.random.default_rng(0).standard_normal((20000, 3))
     gusts = [ZERO]
     for row in noise:
@@ -226,7 +226,7 @@ def test_gusts_keep_their_strength_and_forget() -> None:
     assert correlation == pytest.approx(math.exp(-0.25), abs=0.02)
 
 
-def test_wind_pushes_a_quadrotor_and_no_point() -> None:
+def test_wind_moves_a_quadrotor_but_no_point() -> None:
     flight = hovering(shifted(150.0))._replace(wind_m_s=Vector(0.0, 6.0, 0.0))
     assert decide(QUAD, flight, NOTHING)[0].drone.velocity_m_s.y > 0.2
     assert decide(POINT, flight, NOTHING)[0].drone.velocity_m_s == ZERO

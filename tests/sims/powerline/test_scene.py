@@ -1,4 +1,4 @@
-"""What the powerline sim shows: to a 3D viewer, and from above."""
+"""The scene and the top view of the powerline sim."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def flying(**kwargs: Any) -> PowerlineEnv:
 
 
 def rotated(frame: Frame, vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Turn a vector of a frame into its parent: v + 2 u x (u x v + w v)."""
+    """Transform a vector of a frame to its parent: v + 2 u x (u x v + w v)."""
     axis, w = np.array(frame.rotation[:3]), frame.rotation[3]
     cross = np.cross(axis, vector) + w * np.array(vector)
     turned: NDArray[np.float64] = np.array(vector) + 2 * np.cross(axis, cross)
@@ -62,7 +62,7 @@ def test_the_moving_shapes_keep_their_names_and_stay_few() -> None:
     assert sum(len(shape.points) for shape in sim.scene()) < 80
 
 
-def test_the_world_is_shown_with_z_up() -> None:
+def test_the_scene_has_z_up() -> None:
     shapes = {shape.name: shape for shape in flying().static_scene()}
     np.testing.assert_array_equal(shapes["route"].points, to_ros(POINTS_M))
     assert shapes["conductors"].points[:, 2].min() > 10.0
@@ -73,8 +73,8 @@ def test_the_world_is_shown_with_z_up() -> None:
         assert tower[:, 2].max() == pytest.approx(point[2] - 7.0)
 
 
-def test_the_drones_frame_is_where_it_is_and_leans_as_it_does() -> None:
-    """Accelerating east, to the right, the body's upward axis leans to -y."""
+def test_the_drones_frame_has_its_position_and_tilt() -> None:
+    """When it accelerates east, to the right, the body's upward axis tilts to -y."""
     sim = flying()
     sim.step(EAST)
     level, body = sim.frames()
@@ -118,14 +118,14 @@ def image_at(along_m: float) -> NDArray[np.uint8]:
 
 
 def near(image: NDArray[np.uint8], color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a color, but for rounding."""
+    """Return which pixels have a color, up to rounding."""
     wanted = np.round(255 * np.array(color[:3]))
     return np.asarray(np.all(np.abs(image - wanted) <= 3, axis=-1))
 
 
 @pytest.mark.parametrize("along_m", [5.0, 60.0, 300.0, 600.0])
-def test_a_image_has_the_drone_in_its_middle_and_in_the_strip(along_m: float) -> None:
-    """Where the line is low as well as where it is high: hills never cover the drone."""
+def test_the_drone_is_in_the_middle_and_in_the_strip(along_m: float) -> None:
+    """Both where the line is low and where it is high, hills never cover the drone."""
     image = image_at(along_m)
     assert image.shape == (600, 600, 3)
     rows, columns = np.nonzero(near(image, PAINT))
@@ -137,7 +137,7 @@ def test_a_image_has_the_drone_in_its_middle_and_in_the_strip(along_m: float) ->
 
 
 def test_north_is_right_and_west_is_up() -> None:
-    """The last leg leads north-east: from lower right to upper left is across it."""
+    """The last leg is toward north-east: from lower right to upper left is across it."""
     route = near(image_at(500.0)[:430], ROUTE)
     rows, columns = np.nonzero(route)
     assert np.corrcoef(rows, columns)[0, 1] > 0.9

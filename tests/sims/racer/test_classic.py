@@ -26,7 +26,7 @@ def classic(**kwargs: Any) -> RacerEnv:
 
 
 def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
-    """Classic lengths of the rays of a car that heads to the right."""
+    """Return the classic ray lengths of a car that faces right."""
     lengths = np.zeros(RAYS)
     measure(track.walls_px, car_in(track, x_px, y_px), True, lengths)
     return dict(zip(RAY_NAMES, lengths.tolist(), strict=True))
@@ -37,15 +37,15 @@ def lengths_of(track: Track, x_px: float, y_px: float) -> dict[str, float]:
     [
         (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (50.0, 150.0, 0, 0, BACK, 0, DRIVING),
-        # The gate at 300 is seen from 281, 19 pixels away; not from 279 nor from 280.
+        # The gate at 300 is passed from 281, 19 pixels away, but not from 279 or 280.
         (275.0, 150.5, 0, 4, BACK, 1, DRIVING),
         (275.0, 150.5, 0, 2, BACK, 0, DRIVING),
         (275.0, 150.0, 0, 3, BACK, 0, DRIVING),
         (281.0, 150.5, 0, 0, NONE, 1, DRIVING),
-        # Over it from 295 to 305: it is behind by then. Seen from the wrong side it counts.
+        # Crossed from 295 to 305, it is behind the car. Facing it from the other side counts.
         (295.0, 150.5, 0, 10, NONE, 0, DRIVING),
         (310.0, 150.5, 180, 0, NONE, 1, DRIVING),
-        # Past it sideways, with no look at it.
+        # Near it, but facing sideways.
         (290.0, 150.5, 90, 0, NONE, 0, DRIVING),
         # The gate at 600 is not the next one.
         (590.0, 150.5, 0, 0, NONE, 0, DRIVING),
@@ -96,7 +96,7 @@ def test_fault_forward_drives_backward() -> None:
 
 
 def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
-    """From (500.5, 130.5): the corners are at 515.5, and what they see is floored to 515."""
+    """From (500.5, 130.5): the corners are at 515.5, and the hits are rounded down to 515."""
     seen = lengths_of(corridor(), 500.5, 130.5)
     assert seen["left_corner_sideways"] == pytest.approx(math.hypot(14.5, 69.5))
     assert seen["right_corner_sideways"] == pytest.approx(math.hypot(14.5, 30.5))
@@ -105,7 +105,7 @@ def test_fault_corner_rays_cross_the_nose_and_start_at_the_center() -> None:
 
 
 def test_fault_hits_are_floored_to_pixels() -> None:
-    """In the middle between walls at 100.5 and 199.5, one seems nearer than the other."""
+    """In the middle between walls at 100.5 and 199.5, the observed distances differ."""
     seen = lengths_of(corridor(100.5, 199.5), 500.5, 150.0)
     assert seen["left_90"] == pytest.approx(math.hypot(50.0, 0.5))
     assert seen["right_90"] == pytest.approx(math.hypot(49.0, 0.5))
@@ -134,8 +134,8 @@ def test_fault_a_joint_of_walls_costs_twice() -> None:
     assert outcome_of(track, before, after, False)[0] == -1
 
 
-def test_fault_a_gate_driven_over_without_a_look_is_lost() -> None:
-    """From 295 to 305 in one step: the gate at 300 is behind before it was looked at."""
+def test_fault_a_gate_crossed_unseen_is_lost() -> None:
+    """From 295 to 305 in one step: the car never faces the gate at 300 from nearby."""
     track = corridor()
     car = car_in(track, 295.0, 150.5, 0, 10)
     over = drive(track, car, NONE, True, False)
@@ -144,7 +144,7 @@ def test_fault_a_gate_driven_over_without_a_look_is_lost() -> None:
     assert drive(track, car, NONE, False, False).gates == 1.0
 
 
-def test_fault_every_episode_starts_alike() -> None:
+def test_fault_every_episode_starts_equally() -> None:
     sim = classic()
     starts = {sim.reset(seed=seed)[0].tobytes() for seed in range(5)}
     assert len(starts) == 1

@@ -25,7 +25,7 @@ def sides(track: Track) -> tuple[Floats, Floats]:
 
 
 def area(corners: Floats) -> float:
-    """Signed area of a polygon (K, 2)."""
+    """Return the signed area of a polygon (K, 2)."""
     x, y = corners[:, 0], corners[:, 1]
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
 
@@ -42,7 +42,7 @@ def test_two_closed_walls_on_the_image(seed: int | None) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_gates_reach_from_wall_to_wall(seed: int | None) -> None:
+def test_gates_extend_from_wall_to_wall(seed: int | None) -> None:
     track = make_track(seed)
     assert track.gates_px.shape == (GATES, 4)
     widths = np.hypot(*(track.gates_px[:, 2:] - track.gates_px[:, :2]).T)
@@ -53,7 +53,7 @@ def test_gates_reach_from_wall_to_wall(seed: int | None) -> None:
     assert steps == pytest.approx(track.path.length_m / GATES, rel=0.25)
 
 
-def test_the_track_that_all_know() -> None:
+def test_the_default_track() -> None:
     track = make_track()
     assert track.start_px == (50.0, 300.0, np.pi / 2)
     assert track.path.length_m == pytest.approx(249.3, abs=0.1)
@@ -70,7 +70,7 @@ def test_all_are_driven_counter_clockwise(seed: int | None) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_asphalt_covers_what_is_between_the_walls(seed: int | None) -> None:
-    """Triangles that all turn the same way and have the whole area neither overlap nor gape."""
+    """Triangles of one orientation with the whole area have neither overlaps nor gaps."""
     track = make_track(seed)
     left, right = sides(track)
     areas = [area(triangle) for triangle in asphalt(track).reshape(-1, 3, 2)]
@@ -88,5 +88,5 @@ def test_seeds_make_different_tracks_and_the_same_again() -> None:
     assert first.gates_px.tobytes() == again.gates_px.tobytes()
 
 
-def test_the_maps_axes_are_those_of_the_image_turned_up() -> None:
+def test_the_maps_y_axis_points_up_in_the_image() -> None:
     assert to_map(np.array([[0.0, 600.0], [1000.0, 0.0]])).tolist() == [[0, 0], [100, 60]]

@@ -1,4 +1,4 @@
-"""The racer sim as a Gymnasium environment."""
+"""The Gymnasium environment of the racer sim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mcaprl.sims.racer.env import RacerEnv
 
 
 def racer(**kwargs: Any) -> RacerEnv:
-    """The sim itself, without wrappers."""
+    """Return the sim without wrappers."""
     sim = make_sim("racer", **kwargs).unwrapped
     assert isinstance(sim, RacerEnv)
     return sim
@@ -24,7 +24,7 @@ def test_random_starts_are_where_the_card_says() -> None:
     sim = racer()
     for seed in range(200):
         _, info = sim.reset(seed=seed)
-        # The path that offsets are measured from cuts the spline's bends a little.
+        # The path is a polyline, so offsets differ slightly from those of the spline.
         assert abs(info["lateral_offset_m"]) <= 1.2 + 0.05
         assert abs(info["heading_error_rad"]) <= 0.2 + 0.12
         assert 0.0 <= info["speed_m_s"] <= 6.0
@@ -114,7 +114,7 @@ def test_a_car_at_rest_is_truncated_after_100_steps() -> None:
     assert (reward, terminated, truncated, info["reason"]) == (0.0, False, True, "no_gate")
 
 
-def test_gates_are_counted_and_paid() -> None:
+def test_gates_are_counted_and_rewarded() -> None:
     """Straight down from the start: gates about 6.6 m apart, the first one half of that ahead."""
     sim = racer()
     sim.reset(options={"pose": (5.0, 30.0, -math.pi / 2, 10.0)})
@@ -128,7 +128,7 @@ def test_gates_are_counted_and_paid() -> None:
     assert info["progress_m"] == pytest.approx(12.0, abs=0.3)
 
 
-def test_drift_bends_the_cars_way() -> None:
+def test_drift_bends_the_trajectory() -> None:
     ends = []
     for drift in (False, True):
         sim = racer(drift=drift)

@@ -1,4 +1,4 @@
-"""The scripted driver of the racer sim."""
+"""The pilot of the racer sim."""
 
 from __future__ import annotations
 

@@ -36,13 +36,13 @@ FORWARD_LEFT, FORWARD_RIGHT = 7, 8
     [
         (50.0, 150.0, 0, 0, NONE, 0, DRIVING),
         (50.0, 150.0, 0, 0, FORWARD, 0, DRIVING),
-        # Over the gate at 300: from 295 to 301, and from 290 onto it.
+        # Crossing the gate at 300: from 295 to 301, and from 290 onto it.
         (295.0, 150.0, 0, 4, FORWARD, 1, DRIVING),
         (290.0, 150.0, 0, 8, FORWARD, 1, DRIVING),
-        # Before it: from 289 to 299; a look from near does not count.
+        # Before it: from 289 to 299; facing it nearby does not count.
         (289.0, 150.0, 0, 8, FORWARD, 0, DRIVING),
         (285.0, 150.0, 0, 0, NONE, 0, DRIVING),
-        # Over the gate at 600, which is not the next one.
+        # Crossing the gate at 600, which is not the next one.
         (595.0, 150.0, 0, 10, NONE, 0, DRIVING),
         # The left side is 7 pixels from the middle: 101 and 99 for a wall at 100.
         (500.0, 108.0, 0, 0, NONE, 0, DRIVING),
@@ -90,7 +90,7 @@ def test_time_runs_out(idle: float, steps: float, x_px: float, reward: float, en
     assert outcome_of(track, before, after, False) == (reward, end)
 
 
-def test_a_crash_comes_before_running_out_of_time() -> None:
+def test_a_crash_has_priority_over_the_time_limit() -> None:
     track = corridor()
     before = car_in(track, 500.0, 106.0)._replace(idle_steps=99)
     assert outcome_of(track, before, drive(track, before, NONE, False, False), False) == (-1, CRASH)
@@ -142,7 +142,7 @@ def test_rays_by_hand() -> None:
     np.testing.assert_allclose(lengths, expected)
 
 
-def test_left_and_right_rays_are_told_apart() -> None:
+def test_left_and_right_rays_differ() -> None:
     track = corridor()
     lengths = np.zeros(RAYS)
     measure(track.walls_px, car_in(track, 500.0, 130.0), False, lengths)
@@ -164,7 +164,7 @@ def test_observation_by_hand() -> None:
     assert OBSERVATION_NAMES[5] == "right_90"
 
 
-def test_no_ray_slips_out_through_a_joint_of_walls() -> None:
+def test_no_ray_passes_through_a_joint_of_walls() -> None:
     track = make_track()
     x_px, y_px = 50.0, 300.0
     away = track.walls_px[:, :2] - (x_px, y_px)

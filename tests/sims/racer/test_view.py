@@ -1,4 +1,4 @@
-"""What the racer sim shows: its scene, and its images from above."""
+"""The scene and the top view of the racer sim."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def image_after(actions: list[int]) -> Image:
-    """Return the image of a car that did this from the start line."""
+    """Return the image of a car after actions from the start line."""
     env = gym.make(ENV_ID, render_mode="rgb_array")
     env.reset(options={"pose": START})
     for action in actions:
@@ -40,12 +40,12 @@ def image_after(actions: list[int]) -> Image:
 
 
 def near(image: Image, color: Color) -> NDArray[np.bool_]:
-    """Say which pixels have a color, but for rounding."""
+    """Return which pixels have a color, up to rounding."""
     wanted = np.round(255 * np.array(color[:3]))
     return np.asarray(np.all(np.abs(image - wanted) <= 2, axis=-1))
 
 
-def test_the_image_is_the_rules_own() -> None:
+def test_the_image_has_the_pixels_of_the_rules() -> None:
     """Pixels of the rules are those of the image: the car at (50, 300), the infield at 300."""
     image = image_after([])
     assert image.shape == (600, 1000, 3)

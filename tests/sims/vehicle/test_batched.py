@@ -1,4 +1,4 @@
-"""The batched sims against the single ones, bit for bit, and against Gymnasium's own batching."""
+"""Batched sims against single ones, bit for bit, and against Gymnasium's batching."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ choices = st.lists(
 
 
 def check_same(ours: Any, theirs: Any, where: str) -> None:
-    """Equal to the last bit, types and shapes included; dicts and arrays of objects as well."""
+    """Check equality bit for bit with types and shapes, also of dicts and arrays of objects."""
     if isinstance(theirs, dict):
         assert set(ours) == set(theirs), where
         for key in theirs:
@@ -60,7 +60,7 @@ def actions_of(envs: Envs, chosen: list[int]) -> NDArray[np.int64]:
 
 
 def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, Any]) -> Envs:
-    """Gymnasium's batch of our single environments."""
+    """Return Gymnasium's batch of our single environments."""
 
     def make() -> gym.Env[Any, Any]:
         return make_sim(name, max_episode_steps=steps, **kwargs)
@@ -76,7 +76,7 @@ def one_by_one(name: str, count: int, mode: str, steps: int, kwargs: dict[str, A
 def test_a_batch_does_what_single_sims_do(
     name: str, kwargs: dict[str, Any], mode: str, seed: int, chosen: list[list[int]]
 ) -> None:
-    """Time limits of 6 steps and failures end many episodes; the next ones are compared, too."""
+    """Time limits of 6 steps and failures end many episodes; the next ones are compared too."""
     ours = make_sims(name, COUNT, autoreset_mode=mode, max_episode_steps=6, **kwargs)
     theirs = one_by_one(name, COUNT, mode, 6, kwargs)
     assert ours.single_observation_space == theirs.single_observation_space
@@ -95,7 +95,7 @@ def test_a_batch_does_what_single_sims_do(
 
 @every_batch
 def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, Any]) -> None:
-    """Vehicle i is the single sim of seed + i, whatever its neighbors do."""
+    """Vehicle i equals the single sim of seed + i, whatever the other vehicles do."""
     batch = make_sims(name, COUNT, **kwargs)
     batch.action_space.seed(0)
     seen, _ = batch.reset(seed=40)
@@ -117,7 +117,7 @@ def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, 
 
 
 def part(observations: Any, i: int) -> Any:
-    """What one vehicle observes."""
+    """Return the observation of one vehicle."""
     if isinstance(observations, dict):
         return {key: values[i] for key, values in observations.items()}
     return observations[i]
@@ -137,7 +137,7 @@ def test_gymnasium_makes_batches(name: str) -> None:
     env.close()
 
 
-def test_what_is_given_is_the_callers_own() -> None:
+def test_results_are_copies() -> None:
     env = make_sims("lane", 2)
     given = [*env.reset(seed=0), *env.step(np.array([1, 1]))]
     kept = repr(given)
@@ -177,8 +177,8 @@ def test_each_drone_has_gusts_of_its_own() -> None:
     assert seen[1].tolist() != seen[2].tolist()
 
 
-def test_the_racer_s_own_time_limit_comes_before_the_registered_one() -> None:
-    """1,000 steps and 10,000: the pilot's actions of a single sim, in the first of two cars."""
+def test_the_racers_time_limit_precedes_the_registered_one() -> None:
+    """1,000 and 10,000 steps of the first of two cars, with the pilot's actions in a single sim."""
     single = make_sim("racer", start="line")
     pilot = make_pilot(single)
     observation, _ = single.reset(seed=3)
@@ -192,7 +192,7 @@ def test_the_racer_s_own_time_limit_comes_before_the_registered_one() -> None:
     assert infos["reason"][0] == "time_limit"
 
 
-def test_any_other_environment_is_batched_by_gymnasium() -> None:
+def test_other_environments_are_batched_by_gymnasium() -> None:
     env = make_sims("CartPole-v1", 2, autoreset_mode="SameStep")
     assert isinstance(env.unwrapped, SyncVectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP

@@ -1,4 +1,4 @@
-"""What happens on a machine where the sims were never compiled, or cannot be kept compiled."""
+"""Compilation on first use, and its cache."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESULT = "-2.2831853071795862\n"
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A copy of the sims that was never compiled."""
+    """Return a copy of the sims that was never compiled."""
     package = tmp_path / "fresh" / "mcaprl"
     shutil.copytree(ROOT / "sims", package / "sims", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "mcaprl" / "errors.py", package)
@@ -28,7 +28,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def run(package: Path, user_cache: Path) -> list[str]:
-    """Compile in another process; give the lines on its stderr."""
+    """Compile in another process; return the lines on its stderr."""
     kept = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     places = {"PYTHONPATH": str(package.parent), "XDG_CACHE_HOME": str(user_cache)}
     done = subprocess.run(
@@ -43,22 +43,20 @@ def run(package: Path, user_cache: Path) -> list[str]:
     return done.stderr.splitlines()
 
 
-def test_compiling_is_announced_once_and_kept(package: Path, tmp_path: Path) -> None:
+def test_compilation_is_announced_once_and_cached(package: Path, tmp_path: Path) -> None:
     assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
     assert run(package, tmp_path) == []
     assert list((package / CACHE).glob("paths.wrap_angle*.nbi"))
 
 
-def test_where_the_package_cannot_be_written_the_user_s_folder_keeps_it(
-    package: Path, tmp_path: Path
-) -> None:
-    # A file in the folder's place keeps even root from writing there.
+def test_without_a_writable_package_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
+    # A file in place of the folder prevents even root from writing there.
     (package / CACHE).touch()
     assert run(package, tmp_path) == ["compiling the sim for this machine, once"]
     assert run(package, tmp_path) == []
 
 
-def test_where_nothing_can_be_written_it_works_all_the_same(package: Path, tmp_path: Path) -> None:
+def test_without_a_writable_cache_each_process_compiles(package: Path, tmp_path: Path) -> None:
     (package / CACHE).touch()
     nowhere = tmp_path / "file"
     nowhere.touch()

@@ -1,4 +1,4 @@
-"""Numbers that are drawn ahead are those that the generators give."""
+"""Numbers that are drawn ahead equal those of the generators."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_each_generator_gives_its_numbers_in_their_order(
             assert _some(draws, chosen) == expected
 
 
-def test_another_generator_begins_anew() -> None:
+def test_another_generator_starts_over() -> None:
     draws = Draws(1, 2)
     draws.belong_to(0, np.random.default_rng(1))
     _some(draws, np.array([0]))

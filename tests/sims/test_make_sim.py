@@ -1,4 +1,4 @@
-"""Making a sim by name."""
+"""Making of a sim by its name."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_short_names_and_ids_make_the_same_sim(name: str) -> None:
     assert env.spec.max_episode_steps == 400
 
 
-def test_any_gymnasium_environment_will_do() -> None:
+def test_any_gymnasium_environment_can_be_made() -> None:
     env = make_sim("CartPole-v1", max_episode_steps=7)
     assert env.spec is not None
     assert env.spec.max_episode_steps == 7
@@ -34,7 +34,7 @@ def test_any_gymnasium_environment_will_do() -> None:
         ("mcaprl/LaneKeeping-v7", "did you mean mcaprl/LaneKeeping-v0"),
     ],
 )
-def test_an_unknown_name_brings_the_nearest(name: str, words: str) -> None:
+def test_an_unknown_name_suggests_the_nearest(name: str, words: str) -> None:
     with pytest.raises(UnknownNameError, match=words):
         make_sim(name)
 
@@ -48,9 +48,7 @@ def test_an_unknown_name_brings_the_nearest(name: str, words: str) -> None:
         ("one:two:three", {}, "cannot make sim 'one:two:three'"),
     ],
 )
-def test_what_a_sim_refuses_is_one_clear_line(
-    name: str, kwargs: dict[str, Any], words: str
-) -> None:
+def test_a_sims_refusal_is_one_line(name: str, kwargs: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words) as caught:
         make_sim(name, **kwargs)
     assert "\n" not in str(caught.value)
