@@ -89,8 +89,8 @@ class Agent:
             if record is not None:
                 recorder = recorded(batch, record, algo=task.algo, seed=seed, resume=resume)
             self._watched = live.watch(recorder or batch) if live is not None else None
-            acted_in = self._watched or recorder or batch
-            env = stack.enter_context(closing(BatchedVecEnv(acted_in)))
+            recorded_env = self._watched or recorder or batch
+            env = stack.enter_context(closing(BatchedVecEnv(recorded_env)))
             self._evaluated = FirstEpisodes(task.batch(task.config.eval_episodes), env_id)
             eval_env = stack.enter_context(closing(BatchedVecEnv(self._evaluated)))
             self._eval_env = _stacked(eval_env, task.config.frame_stack)

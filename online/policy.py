@@ -120,8 +120,8 @@ class OnlinePolicy:
             seen, now = (
                 next(iter(p.values()), ()) for p in (memory.frames, parts_of(observations))
             )
-            goes_on = len(seen) == len(now)
-            observations = memory.see(observations) if goes_on else memory.begin(observations)
+            continues = len(seen) == len(now)
+            observations = memory.see(observations) if continues else memory.begin(observations)
         return self.network.predict(observations, deterministic=deterministic)
 
     def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:

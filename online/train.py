@@ -105,8 +105,8 @@ def train(
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
-        shown = terminal_progress("steps", "score")
-        with nullcontext(progress) if progress else shown as report:
+        bar = terminal_progress("steps", "score")
+        with nullcontext(progress) if progress else bar as report:
             summaries = [
                 run.train_seed(number, selection, fresh, report, resume) for number in numbers
             ]

@@ -78,7 +78,7 @@ def test_good_log_has_no_problems(log_path: Path, good: bytes) -> None:
 def test_a_flipped_bit_is_found(
     tmp_path_factory: pytest.TempPathFactory, good: bytes, data: st.DataObject
 ) -> None:
-    """`check` reports a flipped bit anywhere; reading returns the same data or raises our errors."""
+    """`check` reports each flipped bit; reading returns the same data or raises our errors."""
     where = data.draw(st.integers(0, 8 * len(good) - 1))
     broken = bytearray(good)
     broken[where // 8] ^= 1 << where % 8
