@@ -13,6 +13,7 @@ from mcaprl.cli.options import sim_options
 from mcaprl.cli.show import print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
+from mcaprl.sims.evaluation.statistics import interquartile_mean
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
             score.policy,
             f"{score.mean_return:.2f}",
             _interval(score.interval),
-            f"{score.middle_mean:.2f}",
+            f"{float(interquartile_mean(score.returns)):.2f}",
             _score(score.normalized_score),
             "" if score.success_rate is None else f"{score.success_rate:.0%}",
             ", ".join(f"{count} {reason}" for reason, count in score.ends.items()),
