@@ -1,17 +1,18 @@
-"""`mcaprl replay --video` and `--contact-sheet`: an episode as a film or as stills."""
+"""Images of an episode: a video, or a contact sheet."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
-import click
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.cli.show import progress
+from mcaprl.api.environments import check_episode, sim_of
 from mcaprl.errors import LogError, UsageError
+from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import open_logs
@@ -28,42 +29,78 @@ from mcaprl.recorder.viewer.video import (
     write_video,
 )
 
-Pictures = Iterator[NDArray[np.uint8]]
+Images = Iterator[NDArray[np.uint8]]
 STILLS = 12
 
 
-def make_film(
-    path: Path,
-    number: int,
+@dataclass(frozen=True)
+class Rendering:
+    """Images that were written.
+
+    Attributes:
+        episode: Index of the episode.
+        frames: Number of images of the video; 0 without one.
+        stills: Number of images of the contact sheet; 0 without one.
+    """
+
+    episode: int
+    frames: int
+    stills: int
+
+
+def render(
+    file: str | Path,
     *,
-    sim: str | None,
-    speed: float,
-    video: Path | None,
-    sheet: Path | None,
-    overwrite: bool,
-) -> None:
-    """Draw one episode of a log, from its scene or, without one, as the sim draws itself."""
-    for out, kinds in ((video, VIDEO_KINDS), (sheet, (".png",))):
+    episode: int = 0,
+    speed: float = 1.0,
+    video: str | Path | None = None,
+    contact_sheet: str | Path | None = None,
+    overwrite: bool = False,
+    sim: str | None = None,
+    progress: ProgressBar = no_progress,
+) -> Rendering:
+    """Draw one episode of a log, from its scene or, without one, as the sim renders itself.
+
+    Args:
+        file: Path of the log.
+        episode: Index of the episode.
+        speed: Simulated seconds per second of the video.
+        video: Video to write: .mp4 or .gif.
+        contact_sheet: Image to write, .png, with evenly spaced steps.
+        overwrite: Whether existing files are replaced.
+        sim: Short name or Gymnasium id that replaces the log's.
+        progress: Opens the progress bar.
+
+    Raises:
+        UsageError: The log has no such episode, or the sim renders no images.
+        LogError: The log has no scene, and the sim does not repeat the episode.
+        OutputExistsError: An output exists.
+        MissingExtraError: The packages of the `video` extra are not installed.
+    """
+    path = Path(file)
+    check_episode(open_logs(path, columns=[]), episode, path)
+    movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
+    for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):
         if out is not None:
             check_output(out, kinds, overwrite=overwrite)
     dataset = open_logs(path)
-    episode = dataset.episodes[number]
-    if video is not None:
-        step_ns = float(np.median(np.diff(episode.log_time_ns)))
-        shown, pictures_per_s = shown_steps(episode.length, speed * 1e9 / step_ns)
-        with progress(f"drawing {video}", len(shown)) as advance:
-            pictures = _ticking(_pictures(path, dataset, episode, shown, sim), advance)
-            count = write_video(video, pictures, pictures_per_s)
-        click.echo(f"{video}: {count} pictures of episode {number}")
+    one = dataset.episodes[episode]
+    frames, stills = 0, list[int]()
+    if movie is not None:
+        step_ns = float(np.median(np.diff(one.log_time_ns)))
+        shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
+        with progress(f"drawing {movie}", len(shown)) as advance:
+            images = _counted(_images(path, dataset, one, shown, sim), advance)
+            frames = write_video(movie, images, images_per_s)
     if sheet is not None:
-        steps = evenly_spaced(episode.length, STILLS)
-        write_sheet(sheet, list(_pictures(path, dataset, episode, steps, sim)))
-        click.echo(f"{sheet}: {len(steps)} stills of episode {number}")
+        stills = evenly_spaced(one.length, STILLS)
+        write_sheet(sheet, list(_images(path, dataset, one, stills, sim)))
+    return Rendering(episode, frames, len(stills))
 
 
-def _pictures(
+def _images(
     path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], sim: str | None
-) -> Pictures:
+) -> Images:
     reader = McapReader(path)
     if reader.channel_of(SCENE) is not None:
         return _of_scene(reader, dataset, episode, steps)
@@ -72,7 +109,7 @@ def _pictures(
 
 def _of_scene(
     reader: McapReader, dataset: Dataset, episode: Episode, steps: Collection[int]
-) -> Pictures:
+) -> Images:
     from mcaprl.sims.drawing.chase_view import ChaseView
     from mcaprl.sims.drawing.scene import Frame, Shape
 
@@ -88,36 +125,34 @@ def _of_scene(
                 [Shape(**vars(seen)) for seen in moment.moving],
                 [Frame(**vars(seen)) for seen in moment.frames],
                 moment.follow,
-                caption(dataset, episode, moment.step),
+                _caption(dataset, episode, moment.step),
             )
 
 
 def _of_sim(
     path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], sim: str | None
-) -> Pictures:
-    """As the sim draws itself, stepped through the log."""
-    from mcaprl.cli.replay import sim_of
-
+) -> Images:
+    """Yield the sim's own images while it is stepped through the log."""
     found: list[NDArray[np.uint8]] = []
     with closing(sim_of(dataset, path, sim, render_mode="rgb_array")) as env:
 
         def draw(now: Episode, step: int) -> None:
             if now.index == episode.index and step in steps:
-                picture = env.render()
-                if not isinstance(picture, np.ndarray):
-                    raise UsageError(f"{path} has no scene, and {dataset.env_id} draws no pictures")
-                found.append(np.ascontiguousarray(picture, np.uint8))
+                image = env.render()
+                if not isinstance(image, np.ndarray):
+                    raise UsageError(f"{path} has no scene, and {dataset.env_id} renders no images")
+                found.append(np.ascontiguousarray(image, np.uint8))
 
         result = verify(dataset, env, only=episode.index, on_frame=draw)
     if result.difference is not None:
-        raise LogError(f"{path} has no scene, and the sim is another now: {result.difference}")
+        raise LogError(f"{path} has no scene, and the sim has changed: {result.difference}")
     if not found:
         raise LogError(f"{path} has no scene, and no seed of episode {episode.index}")
     yield from found
 
 
-def caption(dataset: Dataset, episode: Episode, step: int) -> list[str]:
-    """What stands in the corner of a picture."""
+def _caption(dataset: Dataset, episode: Episode, step: int) -> list[str]:
+    """Return the lines in the corner of an image."""
     since_s = (episode.log_time_ns[step] - episode.log_time_ns[0]) / 1e9
     first = f"episode {episode.index}   {since_s:.2f} s   step {step} of {episode.length}"
     total = float(episode.rewards[:step].sum())
@@ -128,7 +163,7 @@ def caption(dataset: Dataset, episode: Episode, step: int) -> list[str]:
     return [first, f"return {total:.2f}   {name}"]
 
 
-def _ticking(pictures: Pictures, advance: Callable[[], None]) -> Pictures:
-    for picture in pictures:
-        advance()
-        yield picture
+def _counted(images: Images, advance: Advance) -> Images:
+    for image in images:
+        advance(1)
+        yield image
