@@ -14,12 +14,11 @@ from mcaprl.api.environments import check_episode
 from mcaprl.files import write_json
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
 from mcaprl.recorder.viewer.player_server import LiveServer
 from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
-
-DEFAULT_PORT = 8765
 
 
 @dataclass(frozen=True)
