@@ -94,9 +94,11 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
         ]
         for summary in found
     ]
-    config = mcaprl.load_policy(out)
+    from mcaprl.online.task import read_config
+
+    config = read_config(out)
     print_table(
-        f"{config.algo} in {sim}: the best checkpoint of each seed on new episodes",
+        f"{config['algo']} in {config['sim']}: the best checkpoint of each seed on new episodes",
         ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )

@@ -1,1 +1,1 @@
-"""The functions that the commands call, each documented under its public name in `mcaprl`."""
+"""The functions of the public API, one module per command; `mcaprl` exports them."""

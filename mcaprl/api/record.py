@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.api.environments import all_options
+from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.record.wrapper import RecordMcap
