@@ -24,8 +24,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.workloads import vectors
-from mcaprl.offline.algorithms.cql import CQL, CQLConfig
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline import CQL, CQLConfig, TransitionBuffer
 
 ROWS, BATCH, WIDTHS = 1_000_000, 256, (19, 256, 256, 9)
 RESULTS = Path(__file__).with_name("gpu.json")

@@ -19,10 +19,9 @@ import gymnasium as gym
 import numpy as np
 from matplotlib.figure import Figure
 
-from mcaprl.api.policies import SCRIPTED
+from mcaprl.api import SCRIPTED
 from mcaprl.cli import cli
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.sims import make_pilot, make_sim
 
 DOCS = Path(__file__).parent
 IMAGES = DOCS / "images"

@@ -22,12 +22,10 @@ import numpy as np
 import mcaprl
 from mcaprl.errors import PolicyError
 from mcaprl.figures import COLORS, INK, new_figure, save_png
-from mcaprl.offline.training.curves import read_curve
-from mcaprl.online.curve import CurvePoint
-from mcaprl.online.curve import read_curve as read_online_curve
-from mcaprl.online.evaluation import SELECTION_SEED, measure_scale
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.offline import read_curve
+from mcaprl.online import SELECTION_SEED, CurvePoint, measure_scale
+from mcaprl.online import read_curve as read_online_curve
+from mcaprl.sims import evaluate, make_sim
 
 SIM = "powerline"
 EPISODES = 10

@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mcaprl.online.curve_picture import VALUES, curve_picture, read_run
+from mcaprl.figures import save_png
+from mcaprl.online import VALUES, curve_figure, read_run
 
 
 def main() -> None:
@@ -20,7 +21,7 @@ def main() -> None:
     parser.add_argument("--value", choices=VALUES, help="value to plot; default: the score")
     arguments = parser.parse_args()
     runs = [read_run(folder) for folder in arguments.runs]
-    curve_picture(arguments.out, runs, arguments.title, arguments.value)
+    save_png(curve_figure(runs, arguments.title, arguments.value), arguments.out)
     print(arguments.out)
 
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mcaprl.api.layout import layout
     from mcaprl.api.policies import load_policy
     from mcaprl.api.record import record
+    from mcaprl.api.recover import recover
     from mcaprl.api.render import render
     from mcaprl.api.replay import replay
     from mcaprl.api.train import train
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from mcaprl.api.verify import verify
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
-    from mcaprl.recorder.repair.recover import recover_log as recover
 
 __all__ = [
     "Dataset",
@@ -66,19 +66,18 @@ __all__ = [
     "verify",
 ]
 
-# The functions load the log writer or an engine.
+# Imported on first use, because they load the log writer or an engine.
 _COMMANDS = (
-    "annotate check estimate evaluate export info layout record render replay train train_online"
-    " verify"
+    "annotate check estimate evaluate export info layout record recover render replay train"
+    " train_online verify"
 )
 __getattr__ = lazy_attributes(
     __name__,
-    {name: f"mcaprl.api.{name}" for name in _COMMANDS.split()}
+    {f"mcaprl.api.{name}": [name] for name in _COMMANDS.split()}
     | {
-        "RecordMcap": "mcaprl.recorder.record.wrapper",
-        "RecordVecMcap": "mcaprl.recorder.record.vector_wrapper",
-        "load_policy": "mcaprl.api.policies",
-        "recover": "mcaprl.recorder.repair.recover:recover_log",
+        "mcaprl.recorder.record.wrapper": ["RecordMcap"],
+        "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
+        "mcaprl.api.policies": ["load_policy"],
     },
 )
 

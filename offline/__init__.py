@@ -15,7 +15,45 @@ Raises:
 from importlib.util import find_spec
 
 from mcaprl.errors import MissingExtraError
+from mcaprl.lazy import lazy_attributes
 
 for _package in ("torch", "safetensors", "tensorboard"):
     if find_spec(_package) is None:
         raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[offline]'")
+
+__all__ = [
+    "ALGORITHMS",
+    "CQL",
+    "ESTIMATORS",
+    "BootstrapConfig",
+    "CQLConfig",
+    "DQNConfig",
+    "EpisodeTable",
+    "FQEConfig",
+    "OffPolicyEvaluator",
+    "Scores",
+    "TransitionBuffer",
+    "rank_correlation",
+    "read_curve",
+    "regret_at_1",
+    "train",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.offline.algorithms.config": ("BootstrapConfig",),
+        "mcaprl.offline.algorithms.cql": ("CQL", "CQLConfig"),
+        "mcaprl.offline.algorithms.dqn": ("DQNConfig",),
+        "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
+        "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
+        "mcaprl.offline.estimate.fqe": ("FQEConfig",),
+        "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
+        "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
+        "mcaprl.offline.estimate.ranking": ("rank_correlation", "regret_at_1"),
+        "mcaprl.offline.policy": ("Scores",),
+        "mcaprl.offline.training.curves": ("read_curve",),
+        "mcaprl.offline.training.train": ("train",),
+    },
+)

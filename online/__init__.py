@@ -14,7 +14,42 @@ Raises:
 from importlib.util import find_spec
 
 from mcaprl.errors import MissingExtraError
+from mcaprl.lazy import lazy_attributes
 
 for _package in ("stable_baselines3", "tensorboard"):
     if find_spec(_package) is None:
         raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[online]'")
+
+__all__ = [
+    "SELECTION_SEED",
+    "SIM_SETTINGS",
+    "VALUES",
+    "Agent",
+    "CurvePoint",
+    "LiveTraining",
+    "OnlinePolicy",
+    "Scale",
+    "Task",
+    "curve_figure",
+    "describe_run",
+    "measure_scale",
+    "read_curve",
+    "read_policy",
+    "read_run",
+    "save_policy",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.online.agent": ("Agent",),
+        "mcaprl.online.curve": ("CurvePoint", "read_curve"),
+        "mcaprl.online.curve_picture": ("VALUES", "curve_figure", "read_run"),
+        "mcaprl.online.evaluation": ("SELECTION_SEED", "Scale", "measure_scale"),
+        "mcaprl.online.live": ("LiveTraining",),
+        "mcaprl.online.policy": ("OnlinePolicy", "describe_run", "read_policy", "save_policy"),
+        "mcaprl.online.sim_settings": ("SIM_SETTINGS",),
+        "mcaprl.online.task": ("Task",),
+    },
+)

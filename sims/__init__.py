@@ -16,6 +16,7 @@ from typing import Any, Final
 import gymnasium as gym
 
 from mcaprl.errors import UnknownNameError, UsageError, import_extra
+from mcaprl.lazy import lazy_attributes
 
 SIMS: Final[dict[str, str]] = {
     "lane": "mcaprl/LaneKeeping-v0",
@@ -121,4 +122,30 @@ def _errors_of(name: str, kwargs: dict[str, Any]) -> Iterator[None]:
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 
-__all__ = ["SIMS", "make_sim", "make_sims"]
+__all__ = [
+    "SIMS",
+    "EpsilonGreedy",
+    "LaneKeepingEnv",
+    "Policy",
+    "PolicyScore",
+    "encode_depth",
+    "episode_seed",
+    "evaluate",
+    "make_pilot",
+    "make_sim",
+    "make_sims",
+    "normalize",
+    "rollout",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.sims.drawing.depth": ("encode_depth",),
+        "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "evaluate", "normalize"),
+        "mcaprl.sims.evaluation.pilots": ("make_pilot",),
+        "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
+        "mcaprl.sims.lane.env": ("LaneKeepingEnv",),
+    },
+)

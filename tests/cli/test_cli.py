@@ -112,7 +112,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert run(ask) == 0
     assert "do not choose by this order" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
-    assert "pilot has no network to ask about a log" in line
+    assert "pilot has no network to evaluate on a log" in line
 
 
 def test_one_is_no_plural(capsys: pytest.CaptureFixture[str]) -> None:
