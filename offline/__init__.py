@@ -1,15 +1,14 @@
-"""Offline learning from logs: DQN, Double DQN, CQL and behavior cloning for discrete actions.
+"""Offline learning from logs: DQN, Double DQN, CQL, BC, BCQ and IQL for discrete actions.
 
-Importing this package loads no torch; its modules do.
+Importing this package loads no torch; a name of it does when it is first used.
 
-    from mcaprl.offline.training.train import train
-    from mcaprl import load_policy
+    import mcaprl
 
-    train(dataset, "cql", Path("runs/lane"))
-    policy = load_policy("runs/lane")
+    mcaprl.train("lane.mcap", "runs/lane", algo="cql")
+    policy = mcaprl.load_policy("runs/lane")
 
 Raises:
-    MissingExtraError: the packages of the `offline` extra are not installed.
+    MissingExtraError: The packages of the `offline` extra are not installed.
 """
 
 from importlib.util import find_spec

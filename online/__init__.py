@@ -1,14 +1,13 @@
-"""Online learning that records what it does: SB3's DQN and Double DQN, PPO and A2C.
+"""Online learning that records each step: DQN, Double DQN, PPO and A2C of Stable-Baselines3.
 
-Importing this package loads no torch; its modules do.
+Importing this package loads no torch; a name of it does when it is first used.
 
-    from mcaprl.online.task import Task
-    from mcaprl.online.train import train
+    import mcaprl
 
-    train(Task.for_sim("lane", "double-dqn"), "runs/lane", seeds=4)
+    mcaprl.train_online("lane", "runs/lane", algo="double-dqn", seeds=4)
 
 Raises:
-    MissingExtraError: the packages of the `online` extra are not installed.
+    MissingExtraError: The packages of the `online` extra are not installed.
 """
 
 from importlib.util import find_spec
