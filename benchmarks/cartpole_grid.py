@@ -28,10 +28,7 @@ import mcaprl
 from benchmarks.cartpole_data import NAMES, make_logs
 from benchmarks.page import write_section
 from mcaprl.files import write_json
-from mcaprl.offline.algorithms.config import BootstrapConfig
-from mcaprl.offline.algorithms.registry import ALGORITHMS
-from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.policy import Scores
+from mcaprl.offline import ALGORITHMS, BootstrapConfig, Scores, TransitionBuffer
 
 UPDATES, EVALUATED_AT, EPISODES = 5000, (4000, 4500, 5000), 10
 SHARED: dict[str, Any] = {

@@ -13,15 +13,13 @@ from benchmarks.workloads import vectors
 _READ = """
 import json, sys, time, tracemalloc
 import mcaprl
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.recover import recover_log
 path, best = sys.argv[1], {}
 tasks = {
     "seconds": lambda: mcaprl.open(path),
-    "check": lambda: check_log(path),
-    "recover": lambda: recover_log(path, path + ".recovered.mcap", overwrite=True),
+    "check": lambda: mcaprl.check(path),
+    "recover": lambda: mcaprl.recover(path, path + ".recovered.mcap", overwrite=True),
 }
-assert check_log(path) == []
+assert mcaprl.check(path).ok
 for _ in range(5):
     for name, run in tasks.items():
         start = time.process_time()

@@ -37,8 +37,7 @@ from benchmarks import rivals
 from benchmarks.page import write_section
 from benchmarks.workloads import EPISODE_STEPS, vectors
 from mcaprl.files import write_json
-from mcaprl.offline.algorithms.registry import ALGORITHMS
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline import ALGORITHMS, TransitionBuffer
 
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
 LOG_ROWS, LOG_SHARE, LOG_UPDATES = 1_000_000, 0.1, 8_000

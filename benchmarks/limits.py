@@ -7,11 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import ChunkHeader, chunk_header
-from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import map_file
-from mcaprl.recorder.format.topics import STEP_TOPIC
+from mcaprl.recorder import STEP_TOPIC, ChunkHeader, McapReader, chunk_header, crc32, map_file
 
 PLAIN = "plain zstd of the same chunks"
 LEAST_WORK = "mapped file, decompressed, CRCs checked"

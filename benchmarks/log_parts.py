@@ -19,9 +19,7 @@ from benchmarks.workloads import (
     run_env,
     vectors,
 )
-from mcaprl.recorder.format.schema import message_dtype
-from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder import STEP_TOPIC, message_dtype
 
 DEPTH = rivals.DEPTH
 
@@ -47,7 +45,7 @@ def _short_episodes(folder: Path) -> Table:
         [
             Side(OURS, lambda: mcaprl.open(path)),
             Side(PLAIN, limits.plain(path)),
-            Side("checking it", lambda: check_log(path)),
+            Side("checking it", lambda: mcaprl.check(path)),
             Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(path)),
         ],
     )
@@ -100,7 +98,7 @@ def _interleaved(folder: Path, data: mcaprl.Dataset) -> Table:
             Side(PLAIN, limits.plain(path)),
             Side(LEAST_WORK, limits.least(path)),
             Side("memcpy of the columns", lambda: [c.copy() for c in columns.values()]),
-            Side("checking it", lambda: check_log(path)),
+            Side("checking it", lambda: mcaprl.check(path)),
             Side("mcap + mcap-ros2-support", lambda: rivals.read_mcap(small), SLOWEST_SHARE),
             Side("rosbags", lambda: rivals.read_rosbags(small), SLOWEST_SHARE),
         ],

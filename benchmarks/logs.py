@@ -12,9 +12,7 @@ from benchmarks import limits, log_parts, rivals
 from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
 from benchmarks.workloads import EPISODE_STEPS, Constant, run_env, vectors
-from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.recorder.repair.check import check_log
-from mcaprl.recorder.repair.recover import recover_log
+from mcaprl.recorder import STEP_TOPIC
 
 
 def tables(folder: Path, transitions: int) -> list[Table]:
@@ -204,8 +202,8 @@ def _threads(log: Path) -> Table:
             Side(OURS, lambda: mcaprl.open(log)),
             Side(f"{OURS}, 2 threads", lambda: mcaprl.open(log, threads=2)),
             Side(f"{OURS}, 4 threads", lambda: mcaprl.open(log, threads=4)),
-            Side("check", lambda: check_log(log)),
-            Side("check, 2 threads", lambda: check_log(log, threads=2)),
+            Side("check", lambda: mcaprl.check(log)),
+            Side("check, 2 threads", lambda: mcaprl.check(log, threads=2)),
         ],
         clock=time.perf_counter,
         unit=f"wall-clock time on {os.cpu_count()} cores, ours with one thread = 1",
@@ -218,10 +216,10 @@ def _checking(folder: Path, log: Path) -> Table:
     return compare(
         "Checking and recovering the log of vectors",
         [
-            Side(OURS, lambda: check_log(log)),
+            Side(OURS, lambda: mcaprl.check(log)),
             Side("reading it into columns", lambda: mcaprl.open(log)),
             Side(PLAIN, limits.plain(log)),
-            Side("recovering it", lambda: recover_log(log, out, overwrite=True)),
+            Side("recovering it", lambda: mcaprl.recover(log, out, overwrite=True)),
         ],
         goal="a check takes as long as reading",
         rounds=3,

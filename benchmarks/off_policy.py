@@ -26,9 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 import mcaprl
-from mcaprl.offline.estimate.fqe import FQEConfig
-from mcaprl.offline.estimate.importance import ESTIMATORS, EpisodeTable
-from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+from mcaprl.offline import ESTIMATORS, EpisodeTable, FQEConfig, OffPolicyEvaluator
 from tests.support import two_state_task as task
 
 SCOPE_RL_NAMES: Final = {

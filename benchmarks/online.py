@@ -18,11 +18,7 @@ from pathlib import Path
 
 import torch
 
-from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
-from mcaprl.online.live import LiveTraining
-from mcaprl.online.presets import SIM_SETTINGS
-from mcaprl.online.task import Task
+from mcaprl.online import SIM_SETTINGS, Agent, LiveTraining, Scale, Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import SIMS
 

@@ -28,16 +28,10 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.files import write_json
-from mcaprl.offline.estimate.fqe import FQEConfig
-from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
-from mcaprl.offline.estimate.ranking import rank_correlation, regret_at_1
-from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
-from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
-from mcaprl.online.task import Task
+from mcaprl.offline import FQEConfig, OffPolicyEvaluator, rank_correlation, regret_at_1
+from mcaprl.online import Agent, OnlinePolicy, Scale, Task, describe_run, read_policy, save_policy
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import make_sims
-from mcaprl.sims.evaluation.rollout import episode_seed
+from mcaprl.sims import episode_seed, make_sims
 
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8

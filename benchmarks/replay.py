@@ -17,10 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import mcaprl
-from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
+from mcaprl.recorder import McapReader, Player, Track
+from mcaprl.sims import make_pilot, make_sim
 
 STEPS, EPISODE = 1_000_000, 1_000
 HOUR_S, STEPS_PER_S = 3600, 4

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from benchmarks.workloads import ACTION, EPISODE_STEPS, OBSERVATION, Constant, run_env
-from mcaprl.recorder.format.schema import message_dtype, step_schema
+from mcaprl.recorder import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)
 Fields = dict[str, tuple[str, ...]]

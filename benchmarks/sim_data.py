@@ -26,14 +26,9 @@ import gymnasium as gym
 import numpy as np
 
 import mcaprl
-from mcaprl.api.policies import load_policies
-from mcaprl.online.task import Task
-from mcaprl.online.train import train as train_online
+from mcaprl.api import load_policies
 from mcaprl.progress import TrainingProgress
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.pilots import make_pilot
-from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
-from mcaprl.sims.lane.env import LaneKeepingEnv
+from mcaprl.sims import EpsilonGreedy, LaneKeepingEnv, make_pilot, make_sim, rollout
 
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
@@ -99,9 +94,7 @@ def _learn_online(sim: str, out: Path, log: Path) -> None:
     part = log.with_suffix(".part.mcap")
     part.unlink(missing_ok=True)
     with contextlib.suppress(_HalfwayError):
-        train_online(
-            Task.for_sim(sim, eval_interval=2_000), out, record=part, progress=stop_halfway
-        )
+        mcaprl.train_online(sim, out, record=part, progress=stop_halfway, eval_interval=2_000)
     part.rename(log)
 
 

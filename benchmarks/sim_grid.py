@@ -25,16 +25,10 @@ import torch
 import mcaprl
 from benchmarks.page import write_section
 from benchmarks.sim_data import NAMES, make_logs
-from mcaprl.api.policies import load_policies
+from mcaprl.api import load_policies
 from mcaprl.files import write_json
-from mcaprl.offline.algorithms.config import BootstrapConfig
-from mcaprl.offline.algorithms.dqn import DQNConfig
-from mcaprl.offline.algorithms.registry import ALGORITHMS
-from mcaprl.offline.training.train import train
-from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.evaluation.evaluate import PolicyScore, evaluate, normalize
-from mcaprl.sims.evaluation.pilots import make_pilot
-from mcaprl.sims.evaluation.rollout import Policy
+from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, train
+from mcaprl.sims import Policy, PolicyScore, evaluate, make_pilot, make_sim, make_sims, normalize
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
 ALGOS: dict[str, tuple[str, dict[str, Any]]] = {

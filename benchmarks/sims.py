@@ -13,8 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from benchmarks.measure import Side, Table, compare
-from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.drawing.depth import encode_depth
+from mcaprl.sims import encode_depth, make_sim, make_sims
 
 CARS, DRONES, RACERS = 1024, 64, 256
 QUADROTOR_STEPS = 5

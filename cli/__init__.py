@@ -1,7 +1,8 @@
 """The command line: parse, call, print. `mcaprl --help` lists the commands.
 
 Every command exits 0 on success, 1 on failure, 2 on wrong usage. A user's mistake is one line on
-stderr. Commands import what they need when they run, so that `mcaprl info` needs no torch.
+stderr. Each command calls the function of the public API that has its name; engines are imported
+when a command runs, so that `mcaprl info` needs no torch.
 """
 
 from __future__ import annotations
@@ -53,10 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the program and exit.
 
     Args:
-        arguments: without the program's name; default: the process's own.
+        arguments: Command line without the name of the program; None for that of the process.
     """
-    # A terminated recording closes its file on the way out, as an interrupted one does; so does
-    # one whose terminal is closed, unless nohup asked for the contrary.
+    # A terminated recording closes its file, as an interrupted one does; so does one whose terminal
+    # is closed, unless it was started with nohup.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the program and return its exit code; errors of the user's are told on stderr."""
+    """Run the program and return its exit code; report the user's errors on stderr."""
     try:
         code = cli.main(arguments, prog_name="mcaprl", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -92,5 +93,5 @@ def _fail(message: str, code: int) -> int:
 
 
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """One line, without the place in our code that means nothing to a user."""
+    """Print a warning on one line, without its place in the source."""
     click.echo(f"mcaprl: warning: {' '.join(str(message).split())}", err=True)

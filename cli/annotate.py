@@ -1,34 +1,28 @@
-"""`mcaprl annotate`: what policies think of logged steps, or what there was to see, in a copy."""
+"""`mcaprl annotate`: values of policies, or the scene of the sim, in a copy of a log."""
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import click
 
-from mcaprl.api.policies import policy_names, trained_policies
-from mcaprl.cli.replay import sim_of
-from mcaprl.cli.show import counted, progress
-from mcaprl.errors import UsageError
-from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.open import open_logs
-from mcaprl.recorder.viewer.annotate import AnnotatedCopy, values_topics
+import mcaprl
+from mcaprl.progress import terminal_bar
+from mcaprl.texts import counted
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option("--policy", "policies", multiple=True, help="A trained run; may be given repeatedly.")
+@click.option("--policy", multiple=True, help="Path of a trained run; may be given repeatedly.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: the run's]")
-@click.option("--scene", is_flag=True, help="Step the sim again and add what there was to see.")
+@click.option("--scene", is_flag=True, help="Scene of the sim, which is stepped again.")
 @click.option("--camera", is_flag=True, help="With --scene: metric depth images, too.")
-@click.option("--sim", help="With --scene: step this sim instead of the one that the log names.")
+@click.option("--sim", help="With --scene: sim to step instead of the one that the log names.")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
-@click.option("--overwrite", is_flag=True, help="Replace a file that is there.")
+@click.option("--overwrite", is_flag=True, help="Replacement of an existing file.")
 def annotate(
     file: Path,
-    policies: tuple[str, ...],
+    policy: tuple[str, ...],
     gamma: float | None,
     scene: bool,
     camera: bool,
@@ -36,31 +30,20 @@ def annotate(
     out: Path,
     overwrite: bool,
 ) -> None:
-    """Copy FILE and add to each step what a policy thinks of it, or what there was to see."""
-    if not policies and not scene:
-        raise UsageError("annotate needs --policy POLICY, --scene, or both")
-    dataset = open_logs(file)
-    topics = values_topics(list(policy_names(policies).values()))
-    with AnnotatedCopy(file, out, overwrite=overwrite) as copy:
-        for name, topic in zip(dict.fromkeys(policies), topics.values(), strict=True):
-            copy.add_values(topic, _values(dataset, name, gamma))
-            click.echo(f"{out}: {topic} has what {name} thinks of {len(dataset)} steps")
-        if scene:
-            with closing(sim_of(dataset, file, sim)) as env:
-                found = copy.add_scene(dataset, env, camera=camera)
-            episodes, steps = counted(found.episodes, "episode"), counted(found.steps, "step")
-            click.echo(f"{out}: the scene of {episodes}, {steps}")
-
-
-def _values(dataset: Dataset, name: str, gamma: float | None) -> list[tuple[Any, Any]]:
-    """Each episode with what the first policy of a run thinks of it."""
-    from mcaprl.offline.estimate.values import gamma_of_run, value_columns
-
-    policy: Any = trained_policies(name, dataset)[0]
-    discount = gamma_of_run(Path(name)) if gamma is None else gamma
-    found = []
-    with progress(f"asking {name}", len(dataset.episodes)) as advance:
-        for episode in dataset.episodes:
-            found.append((episode, value_columns(policy, episode, dataset.action_space, discount)))
-            advance()
-    return found
+    """Copy FILE and add a policy's values or the scene of the sim to each step."""
+    found = mcaprl.annotate(
+        file,
+        out,
+        policy=policy,
+        gamma=gamma,
+        scene=scene,
+        camera=camera,
+        sim=sim,
+        overwrite=overwrite,
+        progress=terminal_bar,
+    )
+    for name, topic in found.topics.items():
+        click.echo(f"{out}: {topic} has the values of {name} for {found.steps} steps")
+    if found.scene is not None:
+        episodes, steps = found.scene.episodes, found.scene.steps
+        click.echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")

@@ -1,54 +1,46 @@
-"""`mcaprl replay`: look at logged episodes again, and check that the simulator still makes them."""
+"""`mcaprl replay`: logged episodes in Foxglove or as a video, and the same steps in the sim."""
 
 from __future__ import annotations
 
-import tempfile
-import threading
-from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
-import gymnasium as gym
 
-from mcaprl.cli.show import counted, print_problems, progress
+import mcaprl
+from mcaprl.cli.show import print_address, print_problems
 from mcaprl.errors import UsageError
-from mcaprl.files import write_json
-from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.open import find_logs, open_logs
-from mcaprl.recorder.format.reading import McapReader
-from mcaprl.recorder.viewer.log_layout import attached_layout
-from mcaprl.recorder.viewer.playback import Player, Track
-from mcaprl.recorder.viewer.player_server import LiveServer
-from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
-from mcaprl.recorder.viewer.verify import verify
-from mcaprl.sims import make_sim
+from mcaprl.progress import terminal_bar
+from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.texts import counted
+
+if TYPE_CHECKING:
+    from mcaprl.api.replay import LiveAddress
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--episode", type=click.IntRange(0), help="This one only, counted from 0.")
+@click.option("--episode", type=click.IntRange(0), help="Index of the only episode, from 0.")
 @click.option(
     "--speed",
     default=1.0,
     show_default=True,
     type=click.FloatRange(0, min_open=True),
-    help="Simulated seconds in a second.",
+    help="Simulated seconds per second.",
 )
-@click.option("--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--loop", is_flag=True, help="New start at the end.")
 @click.option(
     "--port",
     default=8765,
     show_default=True,
     type=click.IntRange(0, 65535),
-    help="Of 127.0.0.1, to listen on; 0 takes any that is free.",
+    help="Port of 127.0.0.1; 0 for any free one.",
 )
-@click.option("--verify", "verifies", is_flag=True, help="Step the sim again and compare.")
-@click.option("--video", type=click.Path(path_type=Path), help="Film to write: .mp4 or .gif.")
+@click.option("--verify", "verifies", is_flag=True, help="Comparison with the steps of the sim.")
+@click.option("--video", type=click.Path(path_type=Path), help="Video to write: .mp4 or .gif.")
 @click.option("--contact-sheet", type=click.Path(path_type=Path), help="Stills to write: .png.")
-@click.option("--overwrite", is_flag=True, help="Replace a picture that is there.")
-@click.option("--sim", help="Step this sim instead of the one that the log names.")
+@click.option("--overwrite", is_flag=True, help="Replacement of an existing video or image.")
+@click.option("--sim", help="Sim to step instead of the one that the log names.")
 def replay(
     files: tuple[str, ...],
     episode: int | None,
@@ -61,103 +53,45 @@ def replay(
     contact_sheet: Path | None,
     overwrite: bool,
 ) -> int:
-    """Play FILE... to Foxglove; or check it with --verify; or film an episode with --video.
+    """Play FILE... to Foxglove; check it with --verify; or draw an episode with --video.
 
-    Several files play side by side: all start at the same time, each below a word of its own.
+    Several files play side by side: all start at the same time, each with its own topic prefix.
     """
-    paths = find_logs(files)
     if verifies:
-        same = [_verify(path, episode, sim) for path in paths]
+        same = [_verify(path, episode, sim) for path in find_logs(files)]
         return int(not all(same))
     if video or contact_sheet:
-        from mcaprl.cli.video import make_film
-
+        paths = find_logs(files)
         if len(paths) > 1:
-            raise UsageError("a film shows one file; give each a film of its own")
-        check_episode(open_logs(paths[0], columns=[]), episode, paths[0])
-        make_film(
+            raise UsageError("a video shows one file: give each file its own")
+        drawn = mcaprl.render(
             paths[0],
-            episode or 0,
+            episode=episode or 0,
             sim=sim,
             speed=speed,
             video=video,
-            sheet=contact_sheet,
+            contact_sheet=contact_sheet,
             overwrite=overwrite,
+            progress=terminal_bar,
         )
+        if video:
+            click.echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
+        if contact_sheet:
+            click.echo(f"{contact_sheet}: {drawn.stills} stills of episode {drawn.episode}")
         return 0
-    _play(paths, episode, speed=speed, loops=loop, port=port)
+    mcaprl.replay(files, episode=episode, speed=speed, loop=loop, port=port, on_open=_print_open)
+    click.echo("ended")
     return 0
 
 
-def sim_of(
-    dataset: Dataset, path: Path, sim: str | None = None, **others: Any
-) -> gym.Env[Any, Any]:
-    """Make the environment that a log was recorded in.
-
-    Args:
-        dataset: the log.
-        path: of it.
-        sim: short name or id, where the log's own is not the right one.
-        **others: arguments beside the log's.
-
-    Raises:
-        UsageError: the log names none, or it cannot be made.
-    """
-    name = sim or dataset.env_id
-    if not name:
-        raise UsageError(f"{path} does not tell which environment it is of: pass --sim")
-    return make_sim(name, **{**dataset.env_kwargs, **others})
-
-
-def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
-    """Make sure that a log has the episode asked for."""
-    last = len(dataset.episodes) - 1
-    if episode is not None and episode > last:
-        raise UsageError(f"--episode {episode}: {path} has episodes 0 to {last}")
-
-
-def _play(
-    paths: Sequence[Path], episode: int | None, *, speed: float, loops: bool, port: int
-) -> None:
-    """Serve until Ctrl-C."""
-    datasets = [open_logs(path, columns=[]) for path in paths]
-    windows = []
-    for path, dataset in zip(paths, datasets, strict=True):
-        check_episode(dataset, episode, path)
-        chosen = dataset.episodes if episode is None else dataset.episodes[episode : episode + 1]
-        windows.append((int(chosen[0].log_time_ns[0]), int(chosen[-1].log_time_ns[-1])))
-    readers = [McapReader(path) for path in paths]
-    tracks = [Track(*pair) for pair in zip(readers, windows, strict=True)]
-    player = Player(tracks, speed=speed, loops=loops)
-    starts = [int(e.log_time_ns[0]) for e in datasets[0].episodes] if episode is None else []
-    prefixes = prefixes_of(paths)
-    layout = side_by_side([attached_layout(reader) for reader in readers], prefixes)
-    server = LiveServer(
-        player,
-        prefixes=prefixes,
-        episode_starts_ns=starts,
-        name=", ".join(path.name for path in paths),
-        port=port,
-    )
-    with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
-        layout_path = Path(folder) / "foxglove-layout.json"
-        write_json(layout_path, layout)
-        click.echo(f"open {server.app_url}")
-        click.echo(f"or connect any viewer of the Foxglove protocol to {server.url}")
-        click.echo(f"layout to import: {layout_path}")
-        click.echo("Ctrl-C ends it")
-        try:
-            server.run(threading.Event())
-        except KeyboardInterrupt:
-            click.echo("ended")
+def _print_open(address: LiveAddress) -> None:
+    print_address(address)
+    click.echo("Ctrl-C ends it")
 
 
 def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
-    """Compare one file with the sim and tell what was found; whether all is the same."""
-    dataset = open_logs(path)
-    check_episode(dataset, episode, path)
-    with closing(sim_of(dataset, path, sim)) as env, progress("stepping", len(dataset)) as advance:
-        found = verify(dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1)))
+    """Compare one file with the sim, and print the result; return whether all is the same."""
+    found = mcaprl.verify(path, episode=episode, sim=sim, progress=terminal_bar)
     print_problems(found.problems(str(path)))
     if found.difference is None and found.episodes:
         click.echo(

@@ -1,8 +1,8 @@
-"""Options from the settings of algorithms: each field is one, and its doc line the help."""
+"""Options from the settings of algorithms: one per field, with its doc line as the help."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import click
@@ -10,18 +10,38 @@ import click
 from mcaprl.settings import Settings, field_help, flag
 
 
-def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
-    """An option for each field of several algorithms' settings; the first that has it explains it.
+class SettingsCommand(click.Command):
+    """Command with an option for each setting of the algorithms, which are loaded when needed."""
 
-    What is not given on the command line is None, so that the algorithm's own default holds.
+    def __init__(
+        self, *arguments: Any, configs: Callable[[], Iterable[Settings]], **others: Any
+    ) -> None:
+        """Create the command.
+
+        Args:
+            *arguments: Arguments of `click.Command`.
+            configs: Loads the algorithms, and returns their default settings.
+            **others: Arguments of `click.Command`.
+        """
+        super().__init__(*arguments, **others)
+        self._configs = configs
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the options of the command and of the algorithms."""
+        return [*super().get_params(ctx), *setting_options(self._configs())]
+
+
+def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
+    """Return an option for each field of several algorithms' settings.
+
+    The first algorithm that has a field describes it. An omitted option is None, so that the
+    algorithm's own default is used.
     """
     options: dict[str, click.Option] = {}
     for config in configs:
         for name, line in field_help(type(config)).items():
-            default = getattr(config, name)
-            if name in options:
-                continue
-            options[name] = _option(name, line, default)
+            if name not in options:
+                options[name] = _option(name, line, getattr(config, name))
     return list(options.values())
 
 
@@ -47,7 +67,7 @@ class _Widths(click.ParamType[tuple[int, ...]]):
         try:
             return tuple(int(part) for part in str(value).split(","))
         except ValueError:
-            self.fail(f"{value!r} is no list of widths such as 256,256", param, ctx)
+            self.fail(f"{value!r} is not a list of widths such as 256,256", param, ctx)
 
 
 def _shown(default: Any) -> str:

@@ -22,10 +22,9 @@ import numpy as np
 import mcaprl
 from mcaprl.errors import PolicyError
 from mcaprl.figures import COLORS, INK, new_figure, save_png
-from mcaprl.online.evaluation import SELECTION_SEED, measure_scale
+from mcaprl.online import SELECTION_SEED, measure_scale
 from mcaprl.runs import Curve, read_curve
-from mcaprl.sims import make_sim
-from mcaprl.sims.evaluation.evaluate import evaluate
+from mcaprl.sims import evaluate, make_sim
 
 SIM = "powerline"
 EPISODES = 10

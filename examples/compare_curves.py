@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mcaprl.online.curves import VALUES, draw_curves, read_run
+from mcaprl.online import VALUES, draw_curves, read_run
 
 
 def main() -> None:

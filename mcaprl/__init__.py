@@ -1,33 +1,44 @@
 """The robot's log is the dataset: record, learn from and replay MCAP files.
 
-    env = mcaprl.RecordMcap(gym.make("mcaprl/LaneKeeping-v0"), "lane.mcap")   # records what it does
+    env = mcaprl.RecordMcap(gym.make("mcaprl/LaneKeeping-v0"), "lane.mcap")   # records each step
     data = mcaprl.open("lane.mcap")                                           # arrays and episodes
+    mcaprl.train(data, "runs/cql")                                            # a policy from them
     policy = mcaprl.load_policy("runs/cql")                                   # a trained policy
 
-Importing this package loads neither torch nor numba; what needs them imports them when called.
+Each command of the program has a function of its name here (`train-offline` is `train`; `evaluate
+--data` is `estimate`; `replay` is also `verify` and `render`). Importing this package loads neither
+torch nor numba; a function imports what it needs when it is called.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
 from mcaprl.errors import McaprlError
+from mcaprl.lazy import lazy_attributes
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import open_logs as open
+from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
+    from mcaprl.api.annotate import annotate
+    from mcaprl.api.check import check
+    from mcaprl.api.estimate import estimate
+    from mcaprl.api.evaluate import evaluate
+    from mcaprl.api.export import export
+    from mcaprl.api.info import info
+    from mcaprl.api.layout import layout
     from mcaprl.api.policies import load_policy
+    from mcaprl.api.record import record
+    from mcaprl.api.recover import recover
+    from mcaprl.api.render import render
+    from mcaprl.api.replay import replay
+    from mcaprl.api.train import train
+    from mcaprl.api.train_online import train_online
+    from mcaprl.api.verify import verify
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
-
-# Imported on first use, because they load torch or the writer.
-_LAZY = {
-    "RecordMcap": "mcaprl.recorder.record.wrapper",
-    "RecordVecMcap": "mcaprl.recorder.record.vector_wrapper",
-    "load_policy": "mcaprl.api.policies",
-}
 
 __all__ = [
     "Dataset",
@@ -36,15 +47,41 @@ __all__ = [
     "RecordMcap",
     "RecordVecMcap",
     "__version__",
+    "annotate",
+    "check",
+    "estimate",
+    "evaluate",
+    "export",
+    "info",
+    "layout",
     "load_policy",
+    "make_sim",
     "open",
+    "record",
+    "recover",
+    "render",
+    "replay",
+    "train",
+    "train_online",
+    "verify",
 ]
 
+# Imported on first use, because they load the log writer or an engine.
+_COMMANDS = (
+    "annotate check estimate evaluate export info layout record recover render replay train"
+    " train_online verify"
+)
+__getattr__ = lazy_attributes(
+    __name__,
+    {f"mcaprl.api.{name}": [name] for name in _COMMANDS.split()}
+    | {
+        "mcaprl.recorder.record.wrapper": ["RecordMcap"],
+        "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
+        "mcaprl.api.policies": ["load_policy"],
+    },
+)
 
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use."""
-    if name not in _LAZY:
-        raise AttributeError(f"module 'mcaprl' has no attribute '{name}'")
-    value = getattr(import_module(_LAZY[name]), name)
-    globals()[name] = value
-    return value
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return __all__

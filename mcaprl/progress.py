@@ -1,26 +1,62 @@
-"""Progress of training: values for a callback, and progress bars in a terminal."""
+"""Progress of long work: reported to the caller, or shown in a terminal."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+Advance = Callable[[int], None]
+"""Called with the amount of work that was done."""
+ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
+"""Opens a progress bar: called with a description and the total; yields an `Advance`."""
+
+
+@contextmanager
+def no_progress(description: str, total: int | None) -> Iterator[Advance]:
+    """Show nothing."""
+    yield lambda amount: None
+
+
+@contextmanager
+def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
+    """Show a progress bar on stderr if that is a terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda amount: None
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda amount: bar.advance(task, amount)
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """State of a run, reported after all files of that state are written.
+    """Progress of one seed, reported after the files of that moment are written.
 
     Attributes:
         seed: Seed of the run.
-        done: Number of updates or steps so far.
-        total: Number of updates or steps of the whole run.
-        terms: Measured values by name, such as the loss.
+        done: Number of updates or steps done.
+        total: Number of all updates or steps.
+        terms: Measured values, such as the loss.
     """
 
     seed: int
@@ -30,16 +66,16 @@ class TrainingProgress:
 
 
 ProgressCallback = Callable[[TrainingProgress], None]
-"""Callback that is called from time to time; an exception that it raises stops the training."""
+"""Called repeatedly during training; an exception that it raises stops the training."""
 
 
 @contextmanager
 def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
-    """Show a bar for each seed with speed, one term and time left, if stderr is a terminal.
+    """Show a bar per seed with rate, one term and remaining time, if stderr is a terminal.
 
     Args:
-        unit: Unit of `done` and `total`, such as `updates`.
-        term: Name of the term to show, such as `loss`.
+        unit: Unit of the total, such as `updates`.
+        term: Name of the term that is shown, such as `loss`.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -57,7 +93,7 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
 
 
 class _SeedBars:
-    """Progress bars; a bar is added when a seed first reports."""
+    """Bars of all seeds; the first report of a seed adds its bar."""
 
     def __init__(self, bars: Progress, term: str) -> None:
         self._bars = bars

@@ -1,21 +1,56 @@
-"""Offline learning from logs: DQN, Double DQN, CQL and behavior cloning for discrete actions.
+"""Offline learning from logs: DQN, Double DQN, CQL, BC, BCQ and IQL for discrete actions.
 
-Importing this package loads no torch; its modules do.
+Importing this package loads no torch; a name of it does when it is first used.
 
-    from mcaprl.offline.training.train import train
-    from mcaprl import load_policy
+    import mcaprl
 
-    train(dataset, "cql", Path("runs/lane"))
-    policy = load_policy("runs/lane")
+    mcaprl.train("lane.mcap", "runs/lane", algo="cql")
+    policy = mcaprl.load_policy("runs/lane")
 
 Raises:
-    MissingExtraError: the packages of the `offline` extra are not installed.
+    MissingExtraError: The packages of the `offline` extra are not installed.
 """
 
 from importlib.util import find_spec
 
 from mcaprl.errors import MissingExtraError
+from mcaprl.lazy import lazy_attributes
 
 for _package in ("torch", "safetensors", "tensorboard"):
     if find_spec(_package) is None:
         raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[offline]'")
+
+__all__ = [
+    "ALGORITHMS",
+    "CQL",
+    "ESTIMATORS",
+    "BootstrapConfig",
+    "CQLConfig",
+    "DQNConfig",
+    "EpisodeTable",
+    "FQEConfig",
+    "OffPolicyEvaluator",
+    "Scores",
+    "TransitionBuffer",
+    "rank_correlation",
+    "regret_at_1",
+    "train",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.offline.algorithms.config": ("BootstrapConfig",),
+        "mcaprl.offline.algorithms.cql": ("CQL", "CQLConfig"),
+        "mcaprl.offline.algorithms.dqn": ("DQNConfig",),
+        "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
+        "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
+        "mcaprl.offline.estimate.fqe": ("FQEConfig",),
+        "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
+        "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
+        "mcaprl.offline.estimate.ranking": ("rank_correlation", "regret_at_1"),
+        "mcaprl.offline.policy": ("Scores",),
+        "mcaprl.offline.training.train": ("train",),
+    },
+)

@@ -1,11 +1,10 @@
 """Online learning with recording: DQN, Double DQN, PPO and A2C of Stable-Baselines3.
 
-Importing this package loads no torch; its modules do.
+Importing this package loads no torch; a name of it does when it is first used.
 
-    from mcaprl.online.task import Task
-    from mcaprl.online.train import train
+    import mcaprl
 
-    train(Task.for_sim("lane", "double-dqn"), "runs/lane", seeds=4)
+    mcaprl.train_online("lane", "runs/lane", algo="double-dqn", seeds=4)
 
 Raises:
     MissingExtraError: The packages of the `online` extra are not installed.
@@ -14,7 +13,41 @@ Raises:
 from importlib.util import find_spec
 
 from mcaprl.errors import MissingExtraError
+from mcaprl.lazy import lazy_attributes
 
 for _package in ("stable_baselines3", "tensorboard"):
     if find_spec(_package) is None:
         raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[online]'")
+
+__all__ = [
+    "SELECTION_SEED",
+    "SIM_SETTINGS",
+    "VALUES",
+    "Agent",
+    "CurvePoint",
+    "LiveTraining",
+    "OnlinePolicy",
+    "Scale",
+    "Task",
+    "curve_figure",
+    "describe_run",
+    "draw_curves",
+    "measure_scale",
+    "read_policy",
+    "read_run",
+    "save_policy",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.online.agent": ("Agent",),
+        "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
+        "mcaprl.online.evaluation": ("SELECTION_SEED", "Scale", "measure_scale"),
+        "mcaprl.online.live": ("LiveTraining",),
+        "mcaprl.online.policy": ("OnlinePolicy", "describe_run", "read_policy", "save_policy"),
+        "mcaprl.online.presets": ("SIM_SETTINGS",),
+        "mcaprl.online.task": ("Task",),
+    },
+)

@@ -10,3 +10,32 @@
 `chunks`, `message_rows`, `schema` and `messages` are the codec of both directions, `spaces` and
 `metadata` say what is in a log, `scene` and `layout` what a viewer makes of it.
 """
+
+from mcaprl.lazy import lazy_attributes
+
+__all__ = [
+    "STEP_TOPIC",
+    "ChunkHeader",
+    "McapReader",
+    "Player",
+    "Track",
+    "chunk_header",
+    "crc32",
+    "map_file",
+    "message_dtype",
+    "step_schema",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.recorder.columns.checksum": ("crc32",),
+        "mcaprl.recorder.columns.chunks": ("ChunkHeader", "chunk_header"),
+        "mcaprl.recorder.columns.reader": ("McapReader",),
+        "mcaprl.recorder.columns.records": ("map_file",),
+        "mcaprl.recorder.format.schema": ("message_dtype", "step_schema"),
+        "mcaprl.recorder.format.topics": ("STEP_TOPIC",),
+        "mcaprl.recorder.viewer.playback": ("Player", "Track"),
+    },
+)

@@ -16,6 +16,7 @@ from typing import Any, Final
 import gymnasium as gym
 
 from mcaprl.errors import UnknownNameError, UsageError, import_extra
+from mcaprl.lazy import lazy_attributes
 from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
 
@@ -93,4 +94,31 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
         raise UsageError(f"cannot make sim '{name}' with {given}: {reason}") from error
 
 
-__all__ = ["SIMS", "SimSpec", "make_sim", "make_sims"]
+__all__ = [
+    "SIMS",
+    "EpsilonGreedy",
+    "LaneKeepingEnv",
+    "Policy",
+    "PolicyScore",
+    "SimSpec",
+    "encode_depth",
+    "episode_seed",
+    "evaluate",
+    "make_pilot",
+    "make_sim",
+    "make_sims",
+    "normalize",
+    "rollout",
+]
+
+# Imported on first use.
+__getattr__ = lazy_attributes(
+    __name__,
+    {
+        "mcaprl.sims.drawing.depth": ("encode_depth",),
+        "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "evaluate", "normalize"),
+        "mcaprl.sims.evaluation.pilots": ("make_pilot",),
+        "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
+        "mcaprl.sims.lane.env": ("LaneKeepingEnv",),
+    },
+)

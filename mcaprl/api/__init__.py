@@ -1,1 +1,7 @@
-"""The functions that the commands call, each documented under its public name in `mcaprl`."""
+"""The functions of the public API, one module per command; `mcaprl` exports them."""
+
+from mcaprl.lazy import lazy_attributes
+
+__all__ = ["SCRIPTED", "load_policies"]
+
+__getattr__ = lazy_attributes(__name__, {"mcaprl.api.policies": __all__})

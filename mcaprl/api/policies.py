@@ -16,6 +16,17 @@ from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
 from mcaprl.sims.evaluation.rollout import Policy, check_fit
 
 SCRIPTED = ("pilot", "random")
+Names = str | Path | Sequence[str | Path]
+"""A policy, `pilot`, `random` or a path, or several of them."""
+
+
+def as_names(policies: Names) -> list[str]:
+    """Return the names of one or more policies.
+
+    >>> as_names("random"), as_names(["pilot", Path("runs/cql")])
+    (['random'], ['pilot', 'runs/cql'])
+    """
+    return [str(policies)] if isinstance(policies, str | Path) else list(map(str, policies))
 
 
 class TrainedPolicy(Policy, Protocol):

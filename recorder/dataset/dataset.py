@@ -395,3 +395,7 @@ class Dataset:
 
     def _name(self) -> str:
         return str(self.sources[0]) if self.sources else repr(self)
+
+
+# The public path, for reprs and pickles.
+Dataset.__module__ = "mcaprl"

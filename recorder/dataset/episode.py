@@ -82,6 +82,10 @@ class Episode:
         )
 
 
+# The public path, for reprs and pickles.
+Episode.__module__ = "mcaprl"
+
+
 def shapes(array: Any) -> str:
     """Format the shape and dtype of an array, or of each array in nested dicts."""
     if isinstance(array, dict):

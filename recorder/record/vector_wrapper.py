@@ -331,6 +331,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         recording.advance(summary)
 
 
+# The public path, for reprs and pickles.
+RecordVecMcap.__module__ = "mcaprl"
+
+
 def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
     declared = env.metadata.get("autoreset_mode")
     try:

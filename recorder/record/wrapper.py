@@ -256,3 +256,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
         self._recording.advance(summary)
+
+
+# The public path, for reprs and pickles.
+RecordMcap.__module__ = "mcaprl"

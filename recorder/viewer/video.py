@@ -76,7 +76,9 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
             imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    with imageio.imopen(path, "w", plugin="pyav", extension=kind) as video:
+    # The name of the temporary file does not show its format.
+    options = {"extension": kind, "plugin": "pyav", "container": kind.removeprefix(".")}
+    with imageio.imopen(path, "w", **options) as video:
         video.init_video_stream("libx264", fps=float(fps))
         for image in images:
             video.write_frame(image)

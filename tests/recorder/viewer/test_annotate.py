@@ -250,7 +250,10 @@ def test_commands(
     assert "/rl/values/bc disagreement" in printed
     for wrong, why in (
         (["annotate", str(plain), "--out", "b.mcap"], "needs --policy POLICY, --scene, or both"),
-        (["annotate", str(plain), "--policy", "pilot", "--out", "b.mcap"], "no network to ask"),
+        (
+            ["annotate", str(plain), "--policy", "pilot", "--out", "b.mcap"],
+            "no network to evaluate",
+        ),
         (["annotate", "a.mcap", "--scene", "--out", "b.mcap"], "has /scene already"),
         (["annotate", str(plain), "--policy", "dqn", "--out", "b.mcap"], "unknown policy 'dqn'"),
         (both, "a.mcap exists"),

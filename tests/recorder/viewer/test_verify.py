@@ -13,10 +13,10 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.cli import run
-from mcaprl.cli.show import counted
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.viewer.verify import Verification, verify
 from mcaprl.sims import SIMS, make_sim
+from mcaprl.texts import counted
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv
 
 WALK_LENGTH = 9

@@ -1,4 +1,4 @@
-"""How the policies on a command line were learnt: the curves of their runs, for pages."""
+"""Learning curves of runs, as figures of a page."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from mcaprl.page import Figure
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Figures for those POLICYs that are the folder of a run, or of one of its seeds.
+    """Return figures of those policies that are a run folder or the folder of a seed.
 
-    Runs that learned online are compared in one figure; one that learned offline has one for each
-    term of its loss.
+    Online runs are compared in one figure; an offline run has one figure for each term of its loss.
     """
     folders = dict.fromkeys(
         found for name in names if (found := _run_folder(Path(name))) is not None
@@ -36,7 +35,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
 
 
 def _run_folder(path: Path) -> Path | None:
-    """The run that a path is, or whose seed it is or lies in."""
+    """Return the run folder of a run, of a seed, or of a file of a seed."""
     of_seed = [seed.parent for seed in (path, path.parent) if seed.name.startswith("seed-")]
     for folder in (path, *of_seed):
         if any(any(folder.glob(f"seed-*/{name}")) for name in ("curve.csv", "metrics.csv")):

@@ -1,0 +1,129 @@
+"""Off-policy evaluation: values of policies, estimated from logs alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from mcaprl.api.data import Data, named, opened
+from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
+from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.recorder.dataset.calibration import Calibration, calibration
+
+if TYPE_CHECKING:
+    from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates, StochasticPolicy
+    from mcaprl.recorder.dataset.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class LogEstimates:
+    """Values of policies, estimated from logs.
+
+    Attributes:
+        data: Names of the logs.
+        episodes: Number of episodes.
+        gamma: Discount of all values.
+        epsilon: Probability of a random action of the evaluated policies.
+        behavior_return: Mean discounted return of the logged episodes.
+        behavior_interval: 95 % interval of that mean.
+        behavior_calibration: Number of actions that `behavior_prob` implies; None if unknown.
+        coverage: Mean probability of the logged actions under each policy.
+        estimates: Estimate of each policy by each estimator.
+        ranking: Order of the policies, best first; None for one policy.
+    """
+
+    data: str
+    episodes: int
+    gamma: float
+    epsilon: float
+    behavior_return: float
+    behavior_interval: tuple[float, float]
+    behavior_calibration: Calibration | None
+    coverage: dict[str, float]
+    estimates: tuple[Estimate, ...]
+    ranking: dict[str, Any] | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `evaluate --data --json` prints."""
+        calibrated = self.behavior_calibration
+        return {
+            **vars(self),
+            "behavior_interval": list(self.behavior_interval),
+            "behavior_calibration": calibrated
+            and {**calibrated.to_json(), "text": str(calibrated)},
+            "estimates": [estimate.to_json() for estimate in self.estimates],
+        }
+
+
+def estimate(
+    policies: Names,
+    data: Data,
+    *,
+    gamma: float = 0.97,
+    epsilon: float = 0.0,
+    updates: int = 10_000,
+    seed: int = 1_000_000,
+    threads: int = 1,
+    progress: ProgressBar = no_progress,
+) -> LogEstimates:
+    """Estimate the discounted returns of policies from logs, with each estimator.
+
+    Args:
+        policies: `random` or the path of a trained run, or several of them; each seed of a run is
+            one policy.
+        data: Dataset, file, folder or glob of logs, or several of them.
+        gamma: Discount of the returns.
+        epsilon: Probability of a random action instead of the policy's.
+        updates: Number of gradient steps of the model that FQE, DR and WDR use.
+        seed: Seed of the model and of the resampling.
+        threads: Number of threads that read the logs.
+        progress: Opens the progress bar.
+
+    Raises:
+        UsageError: A policy has no action probabilities.
+        UnknownNameError: There is no such policy.
+        PolicyError: A policy was trained on other spaces than the logs'.
+        LogError: The logs cannot be read.
+    """
+    from mcaprl.offline.estimate.fqe import FQEConfig
+    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+    from mcaprl.offline.estimate.ranking import ranking
+
+    dataset = opened(data, threads=threads)
+    found = _policies(as_names(policies), dataset)
+    config = replace(FQEConfig(), gamma=gamma, updates=updates)
+    evaluator = OffPolicyEvaluator(dataset, config, seed)
+    results: list[PolicyEstimates] = []
+    with progress("learning values", len(found) * evaluator.updates_of_model) as advance:
+        for name, policy in found.items():
+            results.append(
+                evaluator.evaluate(policy, name, epsilon=epsilon, on_update=lambda: advance(1))
+            )
+    estimates = [one for result in results for one in result.estimates]
+    return LogEstimates(
+        named(data),
+        len(dataset.episodes),
+        gamma,
+        epsilon,
+        evaluator.behavior_return,
+        evaluator.behavior_interval,
+        calibration(dataset.behavior_probs, dataset.action_space),
+        {result.policy: result.coverage for result in results},
+        tuple(estimates),
+        ranking(estimates) if len(found) > 1 else None,
+    )
+
+
+def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
+    """Return the policies by the names that tables show; each fits the log."""
+    shown = policy_names(names)
+    found: dict[str, StochasticPolicy | None] = {}
+    for name in dict.fromkeys(names):
+        if name == "random":
+            found[name] = None
+            continue
+        loaded = trained_policies(name, dataset)
+        for policy in loaded:
+            found[policy.name if len(loaded) > 1 else shown[name]] = policy
+    return found

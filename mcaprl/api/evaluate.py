@@ -1,0 +1,252 @@
+"""Evaluation: policies act in a sim, and their returns are compared."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from mcaprl.api.curves import learning_curves
+from mcaprl.api.environments import all_options
+from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
+from mcaprl.errors import ReportError, UsageError, import_extra
+from mcaprl.files import write_json
+from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.sims import make_sim, make_sims
+from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
+from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.statistics import bootstrap_interval
+
+RESULT_NAME = "evaluation.json"
+
+
+@dataclass(frozen=True)
+class LoggedReturns:
+    """Returns of the episodes in logs.
+
+    Attributes:
+        data: File, folder or glob.
+        episodes: Number of episodes.
+        mean_return: Mean of the returns.
+        interval: 95 % interval of that mean.
+        normalized_score: Mean return on the scale where random is 0 and the pilot is 1; None
+            without a pilot.
+    """
+
+    data: str
+    episodes: int
+    mean_return: float
+    interval: tuple[float, float]
+    normalized_score: float | None = None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Returns of policies in a sim.
+
+    Attributes:
+        sim: Short name or Gymnasium id.
+        seed: Seed of the episodes.
+        behavior: Returns of the logs that the policies are compared with; None if there are none.
+        policies: Score of each policy, and of random and the pilot.
+        improvements: Comparison of each pair of policies.
+    """
+
+    sim: str
+    seed: int
+    behavior: LoggedReturns | None
+    policies: tuple[PolicyScore, ...]
+    improvements: tuple[Improvement, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `evaluate --json` prints."""
+        return {
+            "sim": self.sim,
+            "seed": self.seed,
+            "behavior": self.behavior and asdict(self.behavior),
+            "policies": [score.to_json() for score in self.policies],
+            "improvements": [improvement.to_json() for improvement in self.improvements],
+        }
+
+
+def evaluate(
+    policies: Names,
+    sim: str,
+    *,
+    episodes: int = 30,
+    seed: int = 1_000_000,
+    observation: str | None = None,
+    rules: str | None = None,
+    sim_options: Mapping[str, Any] | None = None,
+    behavior: str | None = None,
+    record: str | Path | None = None,
+    report: str | Path | None = None,
+    overwrite: bool = False,
+    progress: ProgressBar = no_progress,
+) -> Evaluation:
+    """Run policies greedily through the same episodes of a sim.
+
+    Random actions and the sim's pilot are always evaluated, too.
+
+    Args:
+        policies: `pilot`, `random` or the path of a trained policy, or several of them; of a run
+            with several seeds each is evaluated.
+        sim: Short name of a sim, or a Gymnasium id.
+        episodes: Number of episodes for each policy and training seed.
+        seed: Seed of the episodes.
+        observation: Observation that the sim returns, such as `depth`.
+        rules: Rules of the sim, such as `classic`.
+        sim_options: Other arguments of the environment.
+        behavior: Logs of the sim that the policies are compared with.
+        record: Log to write of the episodes of `policies`.
+        report: Folder for a page, images and JSON.
+        overwrite: Whether an existing log is replaced.
+        progress: Opens the progress bar.
+
+    Raises:
+        UsageError: `behavior` is of another sim, or would be overwritten.
+        UnknownNameError: There is no such sim or policy.
+        PolicyError: A policy has other spaces than the sim.
+        OutputExistsError: `record` exists.
+        MissingExtraError: The packages of the sim, the policies or the report are not installed.
+        ReportError: The report cannot be written.
+    """
+    names, options = as_names(policies), all_options(observation, rules, sim_options)
+    log, folder = (None if path is None else Path(path) for path in (record, report))
+    env = make_sim(sim, **options)
+    with closing(env):
+        # Arguments are checked first, because the episodes may take minutes.
+        logged = None if behavior is None else _behavior(behavior, env, log)
+        if folder is not None:
+            import_extra("matplotlib", "report")
+            import_extra("jinja2", "report")
+            write_json(folder / RESULT_NAME, {}, ReportError)
+        world = list(getattr(env.unwrapped, "static_scene", list)())
+        envs = None
+        if env.spec is not None and env.spec.vector_entry_point and log is None:
+            envs = make_sims(sim, episodes, **options)
+        runs = _Runs(env, envs, names, episodes, seed)
+        scores = runs.scores(log, overwrite, progress)
+    if logged is not None:
+        logged = replace(logged, normalized_score=_normalized(logged.mean_return, scores))
+    result = Evaluation(sim, seed, logged, tuple(scores), tuple(improvements(scores)))
+    if folder is not None:
+        recorded = None if log is None else (log, len(set(names)))
+        _write_report(folder, result, world, recorded, names)
+    return result
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Policies to run in one environment, or in a batch of it where that is possible."""
+
+    env: gym.Env[Any, Any]
+    envs: gym.vector.VectorEnv[Any, Any, Any] | None
+    names: Sequence[str]
+    episodes: int
+    seed: int
+
+    def scores(
+        self, record: Path | None, overwrite: bool, progress: ProgressBar
+    ) -> list[PolicyScore]:
+        """Evaluate the policies and then the scale; only the former are recorded."""
+        found = {name: policies_of(name, self.env) for name in dict.fromkeys(self.names)}
+        for name in SCRIPTED:
+            if name not in found and (scripted := _scripted(name, self.env)) is not None:
+                found[name] = scripted
+        shown = policy_names(list(found))
+        scores = {}
+        with ExitStack() as stack:
+            total = sum(map(len, found.values())) * self.episodes
+            advance = stack.enter_context(progress("evaluating", total))
+            recorder = None
+            if record is not None:
+                recorder = RecordMcap(
+                    self.env, record, seed=self.seed, overwrite=overwrite, epsilon=0.0
+                )
+                stack.enter_context(closing(recorder))
+            for name, policies in found.items():
+                recorded = recorder if name in self.names else None
+                scores[name] = evaluate_policy(
+                    recorded or self.env,
+                    policies,
+                    name=shown[name],
+                    episodes=self.episodes,
+                    seed=self.seed,
+                    envs=None if name in SCRIPTED else self.envs,
+                    on_policy=partial(_set_policy, recorded),
+                    on_episode=lambda result: advance(1),
+                )
+        pilot = scores.get("pilot")
+        return [normalize(score, scores["random"], pilot) for score in scores.values()]
+
+
+def _set_policy(recorder: RecordMcap | None, name: str) -> None:
+    if recorder is not None:
+        recorder.policy = name
+
+
+def _scripted(name: str, env: gym.Env[Any, Any]) -> Any:
+    """Return a scripted policy; None if the sim has none."""
+    try:
+        return policies_of(name, env)
+    except UsageError:
+        return None
+
+
+def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
+    """Return the returns in logs.
+
+    Raises:
+        UsageError: The logs are of another environment, or would be overwritten.
+    """
+    if record is not None and record.resolve() in [path.resolve() for path in find_logs(data)]:
+        raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")
+    dataset = open_logs(data)
+    env_id = env.spec.id if env.spec else ""
+    if dataset.env_id != env_id:
+        raise UsageError(f"--behavior {data} is of {dataset.env_id or 'unknown'}, not of {env_id}")
+    returns = dataset.statistics.returns
+    interval = bootstrap_interval(returns[None])
+    return LoggedReturns(data, len(returns), float(returns.mean()), interval)
+
+
+def _normalized(mean_return: float, scores: Sequence[PolicyScore]) -> float | None:
+    """Return a mean return on the scale where random is 0 and the pilot is 1."""
+    random = next((s.mean_return for s in scores if s.policy == "random"), math.nan)
+    pilot = next((s.mean_return for s in scores if s.policy == "pilot"), math.nan)
+    score = (mean_return - random) / (pilot - random or math.nan)
+    return None if math.isnan(score) else score
+
+
+def _write_report(
+    folder: Path,
+    result: Evaluation,
+    world: list[Any],
+    recorded: tuple[Path, int] | None,
+    names: Sequence[str],
+) -> None:
+    from mcaprl.sims.evaluation.report import evaluation_page
+
+    write_json(folder / RESULT_NAME, result.to_json(), ReportError)
+    logged = result.behavior
+    band = None if logged is None else (logged.mean_return, *logged.interval)
+    curves = learning_curves([name for name in names if name not in SCRIPTED])
+    evaluation_page(
+        folder,
+        result.sim,
+        list(result.policies),
+        list(result.improvements),
+        world,
+        band,
+        recorded,
+        curves,
+    )

@@ -1,0 +1,178 @@
+"""Contents of logs: facts, problems, and steps to look at."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mcaprl.api.data import Paths
+from mcaprl.errors import ReportError, import_extra
+from mcaprl.files import write_json
+from mcaprl.problem import Problem
+from mcaprl.recorder.dataset.calibration import Calibration, calibration
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.lint import lint
+from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.viewer.surprises import Surprise, moments_of
+from mcaprl.texts import size
+
+_LONGEST_SPACE = 90
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """Facts about one or more logs.
+
+    Attributes:
+        sources: Paths of the logs.
+        env_id: Gymnasium id of the environment; empty if unknown.
+        episodes: Number of episodes.
+        steps: Number of steps.
+        mean_return: Mean of the episodes' returns.
+        return_range: Smallest and largest return.
+        mean_length: Mean number of steps of an episode.
+        duration_s: Simulated time in seconds.
+        observations: Observation space.
+        actions: Action space.
+        action_counts: Number of times each action was taken, by its name.
+        behavior_prob: Number of actions that `behavior_prob` implies; None if unknown.
+        policies: Names of the policies that acted.
+        ends: Number of episodes by the reason of their end.
+        size_bytes: Size of all files.
+        storage: Place of the columns: memory or files.
+        problems: Defects of the logs, and warnings of the reader.
+        findings: Defects and notes from `lint`.
+        moments: Steps with the most surprising annotations.
+    """
+
+    sources: tuple[Path, ...]
+    env_id: str
+    episodes: int
+    steps: int
+    mean_return: float
+    return_range: tuple[float, float]
+    mean_length: float
+    duration_s: float
+    observations: str
+    actions: str
+    action_counts: dict[str, int]
+    behavior_prob: Calibration | None
+    policies: list[str]
+    ends: dict[str, int]
+    size_bytes: int
+    storage: str
+    problems: list[str]
+    findings: list[Problem] = field(repr=False)
+    moments: list[Surprise] = field(repr=False)
+
+    @property
+    def title(self) -> str:
+        """Path of the first log, and the number of the others."""
+        more = f" and {len(self.sources) - 1} more" if len(self.sources) > 1 else ""
+        return f"{self.sources[0]}{more}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `info --json` prints."""
+        found = self.behavior_prob
+        facts = vars(self) | {
+            "return_range": list(self.return_range),
+            "behavior_prob": found and {**found.to_json(), "text": str(found)},
+            "findings": [asdict(finding) for finding in self.findings],
+            "moments": [asdict(moment) for moment in self.moments],
+        }
+        return {name: value for name, value in facts.items() if name != "sources"}
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the facts as names and texts."""
+        low, high = self.return_range
+        found = self.behavior_prob
+        return [
+            ("environment", self.env_id or "unknown"),
+            ("files", f"{len(self.sources)}, {size(self.size_bytes)}"),
+            ("episodes", str(self.episodes)),
+            ("steps", f"{self.steps}, {self.mean_length:.1f} an episode"),
+            ("simulated time", f"{self.duration_s:.1f} s"),
+            ("mean return", f"{self.mean_return:.3f} (from {low:.3f} to {high:.3f})"),
+            ("observations", _short(self.observations)),
+            ("kept in", self.storage),
+            ("actions", _short(self.actions)),
+            ("taken", _counts(self.action_counts) or "-"),
+            ("behavior_prob", "unknown" if found is None else f"implies {found}"),
+            ("policies", ", ".join(self.policies) or "unknown"),
+            ("ends", _counts(self.ends)),
+        ]
+
+
+def info(data: Paths, *, report: str | Path | None = None, threads: int = 1) -> LogInfo:
+    """Read logs, and return facts about them and problems in them.
+
+    Args:
+        data: File, folder or glob of logs, or several of them.
+        report: Folder for a page, an image and JSON.
+        threads: Number of threads that decompress chunks.
+
+    Raises:
+        LogError: A log cannot be read.
+        MissingExtraError: The packages of the report are not installed.
+        ReportError: The report cannot be written.
+    """
+    paths = find_logs(data)
+    if report is not None:
+        import_extra("matplotlib", "report")
+        import_extra("jinja2", "report")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        dataset = open_logs(paths, threads=threads)
+    found = _describe(dataset, paths, [str(warning.message) for warning in caught])
+    if report is not None:
+        _write_report(Path(report), dataset, found)
+    return found
+
+
+def _describe(dataset: Dataset, paths: Sequence[Path], warned: Sequence[str]) -> LogInfo:
+    statistics, findings = dataset.statistics, lint(dataset)
+    return LogInfo(
+        sources=tuple(paths),
+        env_id=dataset.env_id,
+        episodes=statistics.episodes,
+        steps=statistics.steps,
+        mean_return=statistics.mean_return,
+        return_range=(float(statistics.returns.min()), float(statistics.returns.max())),
+        mean_length=float(statistics.lengths.mean()),
+        duration_s=statistics.duration_s,
+        observations=str(dataset.observation_space),
+        actions=str(dataset.action_space),
+        action_counts={
+            dataset.action_names.get(action, str(action)): count
+            for action, count in statistics.action_counts.items()
+        },
+        behavior_prob=calibration(dataset.behavior_probs, dataset.action_space),
+        policies=sorted({episode.policy for episode in dataset.episodes if episode.policy}),
+        ends=dict(statistics.ends),
+        size_bytes=sum(path.stat().st_size for path in paths),
+        storage=dataset.storage,
+        problems=[*warned, *(str(one) for one in findings if one.severity == "problem")],
+        findings=findings,
+        moments=[moment for path in paths for moment in moments_of(path)],
+    )
+
+
+def _write_report(folder: Path, dataset: Dataset, found: LogInfo) -> None:
+    from mcaprl.recorder.viewer.report import dataset_page, dataset_picture
+
+    write_json(folder / "dataset.json", found.to_json(), ReportError)
+    dataset_picture(folder / "dataset.png", dataset, found.title)
+    dataset_page(folder / "index.html", dataset, found.title, found.rows(), found.findings)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def _short(text: str) -> str:
+    """Return a space on one line, without most bounds of a large Box."""
+    line = " ".join(text.split())
+    return line if len(line) <= _LONGEST_SPACE else f"{line[:40]} ... {line[-40:]}"

@@ -1,0 +1,286 @@
+"""Recording: a policy acts in a sim, and the log stores each step."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import multiprocessing
+import signal
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mcaprl.api.environments import all_options
+from mcaprl.api.policies import policies_of, policy_names
+from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.progress import ProgressBar, no_progress
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes that were recorded.
+
+    Attributes:
+        out: File or folder that was written.
+        episodes: Number of episodes.
+        steps: Number of steps.
+        mean_return: Mean of the episodes' returns.
+        return_std: Standard deviation of the episodes' returns.
+        size_bytes: Size of all files of `out`, earlier episodes included.
+        results: Result of each episode.
+    """
+
+    out: Path
+    episodes: int
+    steps: int
+    mean_return: float
+    return_std: float
+    size_bytes: int
+    results: tuple[EpisodeResult, ...] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class _Request:
+    """One file to record; its fields are the arguments of `record`.
+
+    Attributes:
+        first_episode: Number of the first episode, which determines its seed.
+    """
+
+    sim: str
+    out: Path
+    policy: str
+    epsilon: float
+    episodes: int | None
+    steps: int | None
+    seed: int
+    sim_options: Mapping[str, Any]
+    scene: bool
+    camera: bool
+    compression: str
+    overwrite: bool
+    append: bool
+    rotate_mb: float | None
+    first_episode: int = 0
+
+
+def record(
+    sim: str,
+    out: str | Path,
+    *,
+    policy: str | Path = "pilot",
+    epsilon: float = 0.0,
+    episodes: int | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    envs: int = 1,
+    observation: str | None = None,
+    rules: str | None = None,
+    sim_options: Mapping[str, Any] | None = None,
+    scene: bool = True,
+    camera: bool = False,
+    compression: str = "zstd",
+    overwrite: bool = False,
+    append: bool = False,
+    rotate_mb: float | None = None,
+    progress: ProgressBar = no_progress,
+) -> Recording:
+    """Record episodes of a sim into an MCAP file; each finished episode is on disk at once.
+
+    Args:
+        sim: Short name of a sim, or a Gymnasium id.
+        out: File to write; with several processes, a folder with one file per process.
+        policy: `pilot`, `random`, or the path of a trained policy.
+        epsilon: Probability of a random action instead of the policy's.
+        episodes: Number of episodes; exclusive with `steps`.
+        steps: Number of steps; exclusive with `episodes`.
+        seed: Seed of the recording.
+        envs: Number of processes. A script that asks for more than one needs the usual
+            `if __name__ == "__main__"`, since each process imports it.
+        observation: Observation that the sim returns, such as `depth`.
+        rules: Rules of the sim, such as `classic`.
+        sim_options: Other arguments of the environment.
+        scene: Whether the topics that only viewers show are recorded.
+        camera: Whether metric depth images are recorded.
+        compression: Compression of chunks: `zstd`, `lz4` or `none`.
+        overwrite: Whether existing logs are replaced.
+        append: Whether the episodes are added to an existing file.
+        rotate_mb: Size in MB after which another file is begun; None for one file.
+        progress: Opens the progress bar.
+
+    Raises:
+        UsageError: The arguments contradict each other.
+        UnknownNameError: There is no such sim or policy.
+        OutputExistsError: `out` exists and may not be replaced.
+        LogError: The log cannot be written.
+    """
+    request = _Request(
+        sim=sim,
+        out=Path(out),
+        policy=str(policy),
+        epsilon=epsilon,
+        episodes=episodes,
+        steps=steps,
+        seed=seed,
+        sim_options=all_options(observation, rules, sim_options),
+        scene=scene,
+        camera=camera,
+        compression=compression,
+        overwrite=overwrite,
+        append=append,
+        rotate_mb=rotate_mb,
+    )
+    _check_request(request, envs)
+    with progress(f"recording {sim}", episodes or steps) as advance:
+
+        def on_episode(result: EpisodeResult) -> None:
+            advance(1 if episodes else result.length)
+
+        if envs == 1:
+            results = _record_file(request, on_episode)
+        else:
+            results = _record_shards(request, envs, on_episode)
+    returns = np.array([result.total_reward for result in results])
+    return Recording(
+        request.out,
+        len(results),
+        sum(result.length for result in results),
+        float(returns.mean()),
+        float(returns.std()),
+        sum(path.stat().st_size for path in _files(request.out)),
+        tuple(results),
+    )
+
+
+def _check_request(request: _Request, envs: int) -> None:
+    if (request.episodes is None) == (request.steps is None):
+        raise UsageError("record needs --episodes N or --steps N, one of the two")
+    if not 0 <= request.epsilon <= 1:
+        raise UsageError(f"--epsilon {request.epsilon}: give a probability from 0 to 1")
+    if min(envs, request.episodes or 1, request.steps or 1) < 1:
+        raise UsageError("record needs at least one episode or step, and one process")
+    if envs > 1 and request.append:
+        raise UsageError("--append needs one file, and --envs writes several: leave out one")
+    if envs > 1 and request.out.suffix == ".mcap":
+        raise UsageError(
+            f"--envs {envs} writes one file per process into a folder; {request.out} is the name of"
+            " a file"
+        )
+
+
+def _files(out: Path) -> list[Path]:
+    """Return what was written: a file, its parts, or the shards in a folder."""
+    if out.is_file():
+        return [out]
+    return sorted(out.glob("*.mcap") if out.is_dir() else out.parent.glob(f"{out.stem}-*.mcap"))
+
+
+def _record_file(
+    request: _Request, on_episode: Callable[[EpisodeResult], None] | None = None
+) -> list[EpisodeResult]:
+    """Record one file in this process."""
+    megabytes = request.rotate_mb
+    env = make_sim(request.sim, **request.sim_options)
+    with closing(env):
+        policy = policies_of(request.policy, env)[0]
+        behavior = EpsilonGreedy(policy, request.epsilon, env.action_space)
+        recorder = RecordMcap(
+            env,
+            request.out,
+            policy=policy_names([request.policy])[request.policy],
+            epsilon=behavior.epsilon,
+            seed=request.seed,
+            compression=request.compression,
+            overwrite=request.overwrite,
+            append=request.append,
+            max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
+            scene=request.scene,
+            camera=request.camera,
+        )
+
+        def set_probability(probability: float) -> None:
+            recorder.behavior_prob = probability
+
+        with closing(recorder):
+            return rollout(
+                recorder,
+                behavior,
+                seed=request.seed,
+                episodes=request.episodes,
+                steps=request.steps,
+                # Appended episodes have the seeds that they would have had in one recording.
+                first_episode=request.first_episode + recorder.episodes,
+                on_action=set_probability,
+                on_episode=on_episode,
+            )
+
+
+def _record_shards(
+    whole: _Request, processes: int, on_episode: Callable[[EpisodeResult], None]
+) -> list[EpisodeResult]:
+    """Record the episodes of one recording in parallel, as files of a folder.
+
+    Raises:
+        OutputExistsError: The folder contains logs that may not be replaced.
+    """
+    # A wrong request fails before anything is written.
+    with closing(make_sim(whole.sim, **whole.sim_options)) as env:
+        policies_of(whole.policy, env)
+    _clear(whole.out, overwrite=whole.overwrite)
+    shards = [
+        replace(
+            whole,
+            out=whole.out / f"shard-{number:02d}.mcap",
+            episodes=None if whole.episodes is None else end - start,
+            steps=None if whole.steps is None else end - start,
+            # If steps are counted, the number of episodes of the other shards is unknown.
+            first_episode=start if whole.episodes is not None else number << 20,
+        )
+        for number, (start, end) in enumerate(
+            _shares(whole.episodes or whole.steps or 0, processes)
+        )
+        if end > start
+    ]
+    context = multiprocessing.get_context("spawn")
+    results = []
+    with ProcessPoolExecutor(len(shards), context, initializer=_end_as_interrupted) as pool:
+        for shard_results in pool.map(_record_file, shards):
+            results += shard_results
+            for result in shard_results:
+                on_episode(result)
+    return results
+
+
+def _clear(folder: Path, *, overwrite: bool) -> None:
+    """Delete the shards of an earlier recording, and nothing else."""
+    old = sorted(folder.glob("*.mcap")) if folder.is_dir() else []
+    foreign = [path.name for path in old if not path.name.startswith("shard-")]
+    if foreign:
+        raise OutputExistsError(f"{folder} has other logs ({foreign[0]}): choose another folder")
+    if (old and not overwrite) or folder.is_file():
+        raise OutputExistsError(f"{folder} exists: choose another folder, or pass --overwrite")
+    for path in old:
+        path.unlink()
+
+
+def _end_as_interrupted() -> None:
+    """Let SIGTERM end a shard as Ctrl-C does: with its file closed."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def _shares(total: int, parts: int) -> list[tuple[int, int]]:
+    """Split a count into half-open ranges whose lengths differ by at most one.
+
+    >>> _shares(5, 2)
+    [(0, 2), (2, 5)]
+    """
+    edges = [total * part // parts for part in range(parts + 1)]
+    return list(itertools.pairwise(edges))

@@ -1,0 +1,165 @@
+"""The public face: names, paths, and a function for each command."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pickle
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+import mcaprl
+from mcaprl.cli import cli
+from tests.support.paths import GOLDEN
+
+ROOT = Path(__file__).parent.parent.parent
+PACKAGES = ("api", "offline", "online", "recorder", "sims")
+CLASSES = ("Dataset", "Episode", "RecordMcap", "RecordVecMcap")
+FUNCTIONS = {
+    "train-offline": ("train",),
+    "train-online": ("train_online",),
+    "evaluate": ("evaluate", "estimate"),
+    "replay": ("replay", "verify", "render"),
+}
+"""Functions of the commands that have more than one, or one of another name."""
+ONLY_OPTIONS = {
+    "help": "click adds it",
+    "json": "a function returns a dataclass, whose to_json the command prints",
+    "info --strict": "an exit code",
+    "replay --verify": "it selects the function verify",
+    "record --no-scene": "scene=False",
+    "train-online --from": "`from` is a keyword of Python: sources",
+}
+"""Options that are not arguments, and why."""
+
+
+def _functions(command: str) -> list[str]:
+    return list(FUNCTIONS.get(command, (command,)))
+
+
+def _options() -> Iterator[tuple[str, click.Option, bool]]:
+    """Yield each option of each command, and whether it is a setting of an algorithm."""
+    with click.Context(cli, info_name="mcaprl", **cli.context_settings) as top:
+        for name, command in cli.commands.items():
+            with click.Context(command, info_name=name, parent=top) as context:
+                for parameter in command.get_params(context):
+                    if isinstance(parameter, click.Option):
+                        is_own = parameter in command.params or parameter.name == "help"
+                        yield name, parameter, not is_own
+
+
+@pytest.mark.parametrize("command", cli.commands)
+def test_each_command_has_a_documented_function(command: str) -> None:
+    for name in _functions(command):
+        assert name in mcaprl.__all__
+        documentation = inspect.getdoc(getattr(mcaprl, name)) or ""
+        for argument in inspect.signature(getattr(mcaprl, name)).parameters:
+            assert re.search(rf"^    \**{argument}: ", documentation, re.MULTILINE), argument
+
+
+def test_each_option_is_an_argument() -> None:
+    used = set()
+    for command, option, is_setting in _options():
+        (flag, *_) = sorted(option.opts, key=len, reverse=True)
+        name = flag.lstrip("-")
+        signatures = [inspect.signature(getattr(mcaprl, one)) for one in _functions(command)]
+        arguments = {one for signature in signatures for one in signature.parameters}
+        excuse = {name, f"{command} {flag}"} & set(ONLY_OPTIONS)
+        used |= excuse
+        argument = "settings" if is_setting else name.replace("-", "_")
+        assert argument in arguments or excuse, f"{command} {flag}"
+    # The context adds --help.
+    assert used == set(ONLY_OPTIONS), "a reason without its option"
+
+
+def test_dir_lists_the_public_names() -> None:
+    code = "import mcaprl, mcaprl.cli; print(dir(mcaprl) == sorted(mcaprl.__all__))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
+@pytest.mark.parametrize("name", mcaprl.__all__)
+def test_public_names_are_in_the_api_page(name: str) -> None:
+    if name != "__version__":
+        assert inspect.getdoc(getattr(mcaprl, name))
+    assert f"\n## mcaprl.{name}\n" in (ROOT / "docs" / "api.md").read_text()
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_classes_show_their_public_path(name: str) -> None:
+    found = getattr(mcaprl, name)
+    assert repr(found) == f"<class 'mcaprl.{name}'>"
+    assert pickle.loads(pickle.dumps(found)) is found
+
+
+def test_datasets_are_pickled_by_the_public_path() -> None:
+    data = mcaprl.open(GOLDEN / "discrete.mcap")
+    content = pickle.dumps(data)
+    assert b"mcaprl.recorder.dataset.dataset" not in content
+    assert (pickle.loads(content).rewards == data.rewards).all()
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_names_of_a_package_are_not_those_of_its_modules(name: str) -> None:
+    """An imported module would replace a lazy name that is equal to its own."""
+    package = importlib.import_module(f"mcaprl.{name}")
+    modules = {path.stem for path in Path(package.__path__[0]).iterdir()}
+    for public in package.__all__:
+        assert public not in modules
+        assert getattr(package, public) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = package.nothing
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "docs", "examples"])
+def test_imports_are_at_most_one_level_deep(folder: str) -> None:
+    sources = {path: path.read_text() for path in (ROOT / folder).rglob("*.py")}
+    for page in (ROOT / folder).rglob("*.md"):
+        blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+        sources[page] = "\n".join(blocks)
+    for path, source in sources.items():
+        for module in _imported(source):
+            assert module.count(".") <= 1, f"{path} imports {module}"
+
+
+def _imported(source: str) -> Iterator[str]:
+    """Yield the modules of ours that Python code imports, in strings of code as well."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (one.name for one in node.names if one.name.startswith("mcaprl"))
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mcaprl"):
+            yield str(node.module)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield from re.findall(r"^(?:from|import) (mcaprl[\w.]*)", node.value, re.MULTILINE)
+
+
+def test_functions_print_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recording = mcaprl.record("CartPole-v1", "a.mcap", policy="random", episodes=4, seed=1)
+    assert (recording.episodes, len(recording.results)) == (4, 4)
+    data = mcaprl.open("a.mcap")
+    assert recording.steps == len(data)
+    assert mcaprl.info("a.mcap").episodes == 4
+    assert mcaprl.check(["a.mcap", "b.mcap"]).missing[0].file == "b.mcap"
+    assert mcaprl.check("a.mcap").ok
+    assert mcaprl.recover("a.mcap", "c.mcap").episodes == 4
+    assert mcaprl.verify("a.mcap").difference is None
+    (run,) = mcaprl.train(data, "run", algo="bc", updates=5, batch_size=8, hidden=(4,))
+    assert run.steps == 5
+    found = mcaprl.estimate(["random", "run"], data, updates=3)
+    assert set(found.coverage) == {"random", "run"}
+    assert found.ranking is not None
+    scores = mcaprl.evaluate("run", "CartPole-v1", episodes=2).policies
+    assert [score.policy for score in scores] == ["run", "random"]
+    assert mcaprl.annotate("a.mcap", "d.mcap", policy="run").steps == len(data)
+    assert mcaprl.layout("a.mcap") == mcaprl.layout("a.mcap", "layout.json")
+    assert capfd.readouterr() == ("", "")
