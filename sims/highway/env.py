@@ -295,9 +295,11 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
             -float(getattr(vehicle, "yaw_rate", 0.0)) / 2.0,
         ]
         for ahead_m in LOOKAHEADS_M:
-            forward_m, left_m = self._car.sees(self.course.point(self._place.along_m + ahead_m))
+            forward_m, left_m = self._car.to_body_frame(
+                self.course.point(self._place.along_m + ahead_m)
+            )
             seen += [forward_m / ahead_m, left_m / ahead_m]
-        near = [self._car.sees((car.x_m, car.y_m)) for car in self.others]
+        near = [self._car.to_body_frame((car.x_m, car.y_m)) for car in self.others]
         nearest = min(near, key=lambda at: math.hypot(*at), default=(math.inf, 0.0))
         is_near = math.hypot(*nearest) < SEEN_AHEAD_M
         seen += [part / SEEN_AHEAD_M for part in nearest] if is_near else [1.0, 0.0]

@@ -29,7 +29,7 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
         """
         car, course = self.sim.car, self._free_course()
         along_m = course.nearest(car.x_m, car.y_m).along_m
-        forward_m, left_m = car.sees(course.point(along_m + PURSUIT_M))
+        forward_m, left_m = car.to_body_frame(course.point(along_m + PURSUIT_M))
         # In highway-env, the wheelbase equals the car's length.
         slip_sine = car.length_m * left_m / (forward_m**2 + left_m**2)
         wanted_rad = math.atan(2.0 * math.tan(math.asin(min(max(slip_sine, -1.0), 1.0))))

@@ -49,7 +49,7 @@ class Car(NamedTuple):
     length_m: float
     width_m: float
 
-    def sees(self, point_m: tuple[float, float]) -> tuple[float, float]:
+    def to_body_frame(self, point_m: tuple[float, float]) -> tuple[float, float]:
         """Transform a point of the map into this car's frame: (forward, left), meters."""
         dx_m, dy_m = point_m[0] - self.x_m, point_m[1] - self.y_m
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)

@@ -96,7 +96,7 @@ class LaneFleet(Fleet):
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""
-        self._draws.belong_to(i, random)
+        self._draws.use_generator(i, random)
         if options:
             car, row = car_from(options), self._cars[i]
             store_car(car, row)

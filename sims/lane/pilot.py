@@ -64,7 +64,7 @@ def pursue(car: Car) -> int:
 
 
 @compiled
-def worth(car: Car, substeps: int = SUBSTEPS) -> float:
+def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
     """Return the value of pursuit: the number of survived decisions, plus 0.1 of the reward."""
     total = 0.0
     for survived in range(HORIZON):
@@ -84,7 +84,7 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
         car: State of the car.
         substeps: Number of substeps of 0.05 s in a decision.
     """
-    if worth(car, substeps) >= HORIZON:
+    if pursuit_value(car, substeps) >= HORIZON:
         return pursue(car)
     best, most = BRAKE, -math.inf
     for first in range(len(STEERING)):
@@ -93,7 +93,7 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
             continue
         for second in range(len(STEERING)):
             after = drive(middle, second, substeps)
-            value = worth(after, substeps) if end_of(after) == DRIVING else -1.0
+            value = pursuit_value(after, substeps) if end_of(after) == DRIVING else -1.0
             if value > most:
                 best, most = first, value
     return best

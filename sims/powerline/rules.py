@@ -149,7 +149,7 @@ def commanded(command_m_s: Vector, action: int) -> Vector:
 
 
 @compiled
-def blown(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
+def next_gust(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
     """Return the gust of the next decision: on each axis an Ornstein-Uhlenbeck process.
 
     g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has the stationary standard deviation s.
@@ -284,7 +284,7 @@ def step_flights(
     """
     if gust_m_s > 0.0:
         for i in range(len(flights)):
-            blow(flights[i], gust_m_s, noise[i])
+            store_next_gust(flights[i], gust_m_s, noise[i])
     befores_m = flights[:, FURTHEST].copy()
     decide_all(plant, flights, actions, ends)
     for i in range(len(flights)):
@@ -294,9 +294,11 @@ def step_flights(
 
 
 @compiled
-def blow(row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]) -> None:
-    """Advance the gust in a flight's row; see `blown`."""
-    gust = blown(vector_at(row, GUST), strength_m_s, noise)
+def store_next_gust(
+    row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]
+) -> None:
+    """Advance the gust in a flight's row; see `next_gust`."""
+    gust = next_gust(vector_at(row, GUST), strength_m_s, noise)
     for k in range(3):
         row[GUST + k] = gust[k]
 

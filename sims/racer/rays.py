@@ -59,7 +59,7 @@ def crossing(
 
 
 @compiled
-def aim(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
+def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
     """Write a car's rays (4, 18): x and y of the start, and the vector to the end 1000 pixels away.
 
     The left corner's sideways ray points to the left; in the classic rules, across the car's nose.
@@ -91,7 +91,7 @@ def cast(
 
     Args:
         walls: (W, 4) walls.
-        rays: (4, R) rays as written by `aim`.
+        rays: (4, R) rays as written by `write_rays`.
         shares: (R,) output: hit as a share of the ray's length; 1 without a hit.
     """
     x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
@@ -142,7 +142,7 @@ def measure(
 ) -> None:
     """Write the lengths (18,) of the car's rays; classic lengths are all from the car's center."""
     rays = np.empty((4, RAYS))
-    aim(car, classic, rays)
+    write_rays(car, classic, rays)
     if classic:
         for ray in range(RAYS):
             lengths_px[ray] = floored_ray_length(walls, car, rays, ray)
@@ -155,7 +155,7 @@ def measure(
 def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
     """Return the rays as lines (18, start and end, x and y) to the walls, pixels."""
     rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
-    aim(car, False, rays)
+    write_rays(car, False, rays)
     cast(walls, rays, shares)
     starts = rays[:2].T
     return np.stack([starts, starts + shares[:, np.newaxis] * rays[2:].T], axis=1)

@@ -46,7 +46,7 @@ class Draws:
         self.used = np.full(count, _AHEAD)
         self._generators: list[Any] = [None] * count
 
-    def belong_to(self, i: int, generator: np.random.Generator) -> None:
+    def use_generator(self, i: int, generator: np.random.Generator) -> None:
         """Use a generator for vehicle i from now on; numbers drawn from another are dropped."""
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD

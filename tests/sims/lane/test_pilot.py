@@ -9,7 +9,7 @@ from mcaprl.errors import UnknownNameError
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.pilots import make_pilot
 from mcaprl.sims.geometry.bicycle import moving
-from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, worth
+from mcaprl.sims.lane.pilot import HORIZON, choose, pursue, pursuit_value
 from mcaprl.sims.lane.rules import DRIVING, drive, end_of, located
 
 
@@ -42,7 +42,7 @@ def test_it_laps_the_course_from_the_start_line() -> None:
 def test_it_searches_where_pursuit_would_fail() -> None:
     """8 m before a corner at 11.4 m/s it is too late to brake first and turn then."""
     car = located(moving(122.4, 1.0, 0.0, 11.4), 0.0, 122.4, 0.0)
-    assert worth(car) < HORIZON
+    assert pursuit_value(car) < HORIZON
     assert choose(car) != pursue(car)
     for _ in range(HORIZON):
         car = drive(car, choose(car))

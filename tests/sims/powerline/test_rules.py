@@ -31,12 +31,12 @@ from mcaprl.sims.powerline.rules import (
     OFF_LINE,
     Flight,
     begin,
-    blown,
     collides,
     commanded,
     decide_all,
     end_of,
     flight_at,
+    next_gust,
     observe,
     reward_of,
     step_flights,
@@ -219,7 +219,7 @@ def test_gusts_are_stationary_and_decorrelate() -> None:
     noise = np.random.default_rng(0).standard_normal((20000, 3))
     gusts = [ZERO]
     for row in noise:
-        gusts.append(blown(gusts[-1], 1.5, row))
+        gusts.append(next_gust(gusts[-1], 1.5, row))
     series = np.array(gusts[100:])
     np.testing.assert_allclose(series.std(axis=0), 1.5, rtol=0.05)
     correlation = np.corrcoef(series[:-1, 0], series[1:, 0])[0, 1]
@@ -249,7 +249,7 @@ def test_many_drones_fly_as_one_does(starts: list[tuple[float, int]], gust_m_s: 
     observations = np.zeros((len(rows), 18), dtype=np.float32)
     step_flights(QUAD, rows, actions, gust_m_s, noise, rewards, ends, observations)
     for i, flight in enumerate(flights):
-        before = flight._replace(gust_m_s=blown(flight.gust_m_s, gust_m_s, noise[i]))
+        before = flight._replace(gust_m_s=next_gust(flight.gust_m_s, gust_m_s, noise[i]))
         after, end = decide(QUAD, before, actions[i])
         assert flight_at(rows[i]) == after
         assert ends[i] == end

@@ -20,7 +20,7 @@ def test_each_generator_gives_its_numbers_in_their_order(
 ) -> None:
     draws, references = Draws(COUNT, 3), [np.random.default_rng(i) for i in range(COUNT)]
     for i in range(COUNT):
-        draws.belong_to(i, np.random.default_rng(i))
+        draws.use_generator(i, np.random.default_rng(i))
     for who in asked:
         if isinstance(who, int):
             assert _one(draws, who) == references[who].random(3).tolist()
@@ -32,9 +32,9 @@ def test_each_generator_gives_its_numbers_in_their_order(
 
 def test_another_generator_starts_over() -> None:
     draws = Draws(1, 2)
-    draws.belong_to(0, np.random.default_rng(1))
+    draws.use_generator(0, np.random.default_rng(1))
     _some(draws, np.array([0]))
-    draws.belong_to(0, np.random.default_rng(2))
+    draws.use_generator(0, np.random.default_rng(2))
     assert _one(draws, 0) == np.random.default_rng(2).random(2).tolist()
 
 
