@@ -100,8 +100,8 @@ class Policy:
     env_id: str
     env_kwargs: dict[str, Any]
     frame_stack: int
-    encoder: ObservationEncoder
-    scores: Scores
+    encoder: ObservationEncoder = field(repr=False)
+    scores: Scores = field(repr=False)
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:

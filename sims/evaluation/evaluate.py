@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -44,7 +44,7 @@ class PolicyScore:
     """
 
     policy: str
-    results: tuple[tuple[EpisodeResult, ...], ...]
+    results: tuple[tuple[EpisodeResult, ...], ...] = field(repr=False)
     mean_return: float
     interval: tuple[float, float]
     normalized_score: float | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -46,7 +46,7 @@ class EpisodeResult:
     total_reward: float
     length: int
     reason: str
-    positions: NDArray[np.float64]
+    positions: NDArray[np.float64] = field(repr=False)
 
 
 class EpsilonGreedy:
