@@ -82,7 +82,7 @@ def load_policy(path: str | Path) -> TrainedPolicy:
     """Load a trained policy; nothing in its files is unpickled or executed.
 
     Args:
-        path: Run folder of `train-offline` or `train-online`, which stands for its first seed; the
+        path: Run folder of `train-offline` or `train-online`, which means its first seed; the
             folder of one seed (`RUN/seed-2`); or a `.zip` file of Stable-Baselines3.
 
     Raises:
