@@ -211,7 +211,7 @@ def test_a_file_without_a_finished_episode_is_skipped(tmp_path: Path) -> None:
     """A killed recorder leaves such a file; the other files are read."""
     cartpole_log(tmp_path / "a.mcap", 2)
     cartpole_log(tmp_path / "b.mcap", 0)
-    with pytest.warns(UserWarning, match=r"b\.mcap has no finished episode: left out"):
+    with pytest.warns(UserWarning, match=r"b\.mcap has no finished episode: skipped"):
         assert len(mcaprl.open(tmp_path).episodes) == 2
     (tmp_path / "a.mcap").unlink()
     with pytest.raises(NoStepsError, match="no finished episode"):
