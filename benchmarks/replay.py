@@ -75,7 +75,7 @@ def _row(path: Path) -> str:
     random = np.random.default_rng(1)
     for share in random.random(JUMPS):
         player.seek(player.start_ns + int(share * (player.end_ns - player.start_ns)))
-        player.picture()
+        player.current_messages()
         player.playing = True
         player.advance(1.0)
     largest = max(chunk.uncompressed_size for chunk in reader.chunks)

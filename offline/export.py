@@ -1,9 +1,9 @@
-"""A trained policy as one ONNX file for a robot: observations in, actions out, nothing else needed.
+"""Export of a trained policy as one self-contained ONNX file, for example for a robot.
 
-Inputs are the parts of the observation as the environment gives them, named as in `/rl/step`
-(`observation`, `camera`, ...), with a batch axis before; a policy that stacks k frames takes
+Inputs are the parts of the observation as the environment returns them, named as in `/rl/step`
+(`observation`, `camera`, ...), with a leading batch axis; a policy that stacks k frames accepts
 (B, k, *shape), oldest first. Outputs are `action` (B,) int64, values of the action space, and
-`scores` (B, A), of which it takes the largest. Normalisation is inside.
+`scores` (B, A), of which the action has the largest. The file includes the normalization.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mcaprl.offline.policy import Policy
 
 
 class ExportedPolicy(nn.Module):
-    """A policy as a module of plain tensors, for exporters."""
+    """Policy as a module with plain tensors as inputs and outputs, for exporters."""
 
     def __init__(self, policy: Policy) -> None:
-        """Take over a policy's networks and normalisation."""
+        """Create the module from the networks and the normalization of a policy."""
         super().__init__()
         self.scores = policy.scores
         self.encoder = policy.encoder
@@ -40,11 +40,11 @@ class ExportedPolicy(nn.Module):
 
     @property
     def input_names(self) -> list[str]:
-        """A name for each argument of `forward`."""
+        """Names of the arguments of `forward`."""
         return [leaf.name for leaf in self.encoder.leaves]
 
     def examples(self, batch_size: int, seed: int = 0) -> tuple[Tensor, ...]:
-        """Arguments for `forward` from random observations."""
+        """Create arguments of `forward` from random observations."""
         space = self.encoder.space
         space.seed(seed)
         stack = (self.frame_stack,) if self.frame_stack > 1 else ()
@@ -68,7 +68,7 @@ class ExportedPolicy(nn.Module):
         return scores.argmax(1) + self.first_action, scores
 
     def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
-        """What `ObservationEncoder.encode` does, in torch."""
+        """Encode observations as `ObservationEncoder.encode` does, in torch."""
         encoder, rows = self.encoder, inputs[0].shape[0]
         n_images = len(encoder.images)
         shaped = zip(inputs[:n_images], encoder.image_inputs, strict=True)
@@ -116,7 +116,7 @@ def export_onnx(policy: object, path: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporter talks of packages that it could use and of its own future."""
+    """Suppress the exporter's notices about optional packages and future versions."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -128,7 +128,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
-    """(B, width) of a part of the space: one-hot codes of counters, else the numbers themselves."""
+    """Encode one part of the space as (B, width): discrete values one-hot, others unchanged."""
     flat = values.reshape(values.shape[0], -1)
     if isinstance(space, spaces.Discrete):
         counts, starts = [int(space.n)], [int(space.start)]

@@ -1,10 +1,11 @@
 """Trained policies: saved as safetensors and JSON, loaded without running any code from a file.
 
-`policy.json` says which networks to build and how to act by them; `policy.safetensors` has their
-weights and the normalisation of observations. What the best action is taken of:
+`policy.json` describes the networks and how actions are selected; `policy.safetensors` contains
+the weights and the normalization of observations. The policy selects the action with the largest
+score. The kinds of scores (`acts_by`) and their algorithms:
 
     q_values            values Q(s, a)                                    dqn, double-dqn, cql
-    logits              odds of actions                                   bc, iql
+    logits              unnormalized log-probabilities of actions         bc, iql
     filtered_q_values   Q(s, a) of actions likely under the logits        bcq
 """
 
@@ -51,22 +52,22 @@ _BROKEN_FILE_ERRORS = (
 
 
 class Scores(nn.Module):
-    """From observations to a number for each action, of which the policy takes the largest."""
+    """Module that maps observations to a score per action; the policy selects the largest."""
 
     def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
-        """Take the networks `q` or `logits`, or both."""
+        """Create the module from the networks `q` or `logits`, or both."""
         super().__init__()
         self.networks = nn.ModuleDict(networks)
         self.acts_by = acts_by
         self.threshold = threshold
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
-        """(B, A) values or logits, minus infinity for actions that are not allowed."""
+        """Return values or logits (B, A), minus infinity for actions that are not allowed."""
         outputs = mean_values(self.networks[name](observations))
         return allowed_only(outputs, observations.mask)
 
     def forward(self, observations: Observations) -> Tensor:
-        """(B, A) what is acted by."""
+        """Return the scores (B, A) of all actions."""
         if self.acts_by == "logits":
             return self.outputs("logits", observations)
         values = self.outputs("q", observations)
@@ -79,18 +80,18 @@ class Scores(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A trained policy; NumPy in, NumPy out. B is the number of observations, A of actions.
+    """Trained policy with NumPy inputs and outputs, for B observations and A actions.
 
     Attributes:
-        name: folder of the run and of the seed.
-        algo: that trained it.
-        observation_space: of one observation.
-        action_space: of one action.
-        env_id: of the environment whose log it learned from; empty if unknown.
-        env_kwargs: arguments to make that environment.
-        frame_stack: how many successive observations it looks at; see `act`.
-        encoder: makes tensors of observations.
-        scores: what it acts by.
+        name: Folders of the run and the seed, as `run/seed`.
+        algo: Name of the algorithm that trained the policy.
+        observation_space: Space of one observation.
+        action_space: Space of one action.
+        env_id: ID of the environment in the training log; empty if unknown.
+        env_kwargs: Keyword arguments of that environment.
+        frame_stack: Number of successive observations in one network input; see `act`.
+        encoder: Encoder of observations as tensors.
+        scores: Module that computes the scores of actions.
     """
 
     name: str
@@ -105,17 +106,18 @@ class Policy:
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
-        """Forget what was seen: the next observations are the first of their episodes."""
+        """Drop the stored observations: the next ones are the first of their episodes."""
         self._seen.clear()
 
     def act(self, observations: Any) -> NDArray[np.int64]:
-        """The best actions (B,), values of `action_space`; of equal ones the first.
+        """Return the best actions (B,), values of `action_space`; the first of equal ones.
 
-        A policy with `frame_stack` k > 1 remembers the observations of its last k calls since
-        `begin`; given (B, k, *shape), oldest first, it takes those and remembers nothing.
+        A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`
+        and stacks them. It also accepts full stacks (B, k, *shape), oldest first, and then neither
+        uses nor changes what is stored.
 
         Raises:
-            PolicyError: the observations have another shape than (B, *shape).
+            PolicyError: The observations do not have the expected shape.
         """
         if self.frame_stack > 1 and not self._is_stack(observations):
             best = self._greedy(self._remember(self._encode(observations)))
@@ -124,15 +126,16 @@ class Policy:
         return best + self.action_space.start
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """The values (B, A) of all actions, in the order of the action space.
+        """Return the Q-values (B, A) of all actions, in the order of the action space.
 
-        Those of actions that an action mask forbids are minus infinity.
+        Values of actions that the action mask excludes are minus infinity.
 
         Args:
-            observations: (B, *shape), or (B, k, *shape) where k frames are stacked.
+            observations: Observations (B, *shape), or (B, k, *shape) if k frames are stacked.
 
         Raises:
-            PolicyError: the policy has none, or the observations have another shape.
+            PolicyError: The policy has no Q-values, or the observations do not have the expected
+                shape.
         """
         if "q" not in self.scores.networks:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
@@ -142,16 +145,17 @@ class Policy:
             )
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """The probabilities (B, A) of all actions.
+        """Return the probabilities (B, A) of all actions.
 
-        Those of behavior cloning estimate the policy in the log, those of IQL are its policy's. A
-        policy that acts by Q-values is greedy: the action of `act` has 1.
+        For behavior cloning they estimate the policy that recorded the log; for IQL they are those
+        of the trained policy. A policy with Q-values is greedy: the action of `act` has
+        probability 1.
 
         Args:
-            observations: (B, *shape), or (B, k, *shape) where k frames are stacked.
+            observations: Observations (B, *shape), or (B, k, *shape) if k frames are stacked.
 
         Raises:
-            PolicyError: the observations have another shape.
+            PolicyError: The observations do not have the expected shape.
         """
         with torch.inference_mode():
             scores = self.scores(self._whole(observations))
@@ -171,7 +175,7 @@ class Policy:
             return False
 
     def _whole(self, observations: Any) -> Observations:
-        """All that the networks look at, with nothing remembered."""
+        """Encode complete network inputs, without stored observations."""
         if self.frame_stack == 1:
             return self._encode(observations)
         if not self._is_stack(observations):
@@ -182,7 +186,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _remember(self, now: Observations) -> Observations:
-        """The last observations in a row, this one last; the first stands for what was before."""
+        """Store these observations and return the stack that ends with them, padded with the first."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
@@ -202,7 +206,7 @@ class Policy:
 def save_policy(
     folder: Path, learner: Learner, seed: int, env_id: str, env_kwargs: dict[str, Any]
 ) -> None:
-    """Write a seed's present policy into a folder."""
+    """Write the current policy of one seed to a folder."""
     buffer = learner.buffer
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     weights = {
@@ -290,17 +294,17 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """How a policy takes a picture; moves what is written of it out of the weights."""
+    """Return the normalization of one image leaf and remove its tensors from the weights."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()
     if shift.shape != image.shape:
-        raise ValueError(f"the mean picture is {shift.shape}, pictures are {image.shape}")
+        raise ValueError(f"the mean image is {shift.shape}, images are {image.shape}")
     return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
 
 
 def _flatten(observations: Any) -> Any:
-    """(B, k, *shape) to (B * k, *shape), in nested dicts too."""
+    """Reshape arrays (B, k, *shape) to (B * k, *shape), also in nested dicts."""
     if isinstance(observations, dict):
         return {key: _flatten(part) for key, part in observations.items()}
     return observations.reshape(-1, *observations.shape[2:])

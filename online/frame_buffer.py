@@ -28,7 +28,7 @@ class FrameReplayBuffer(BaseBuffer):
     """SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer` in half the memory.
 
     R rows of N environments; a row's step follows the step of the previous row. *shape is that of a
-    single frame. Overwritten frames before the oldest step are replaced by copies of its own frame.
+    single frame. Overwritten frames before the oldest step are replaced by copies of that frame.
 
     Attributes:
         frames: Observations (R, N, *shape) by key; the key of observations without keys is "".

@@ -1,4 +1,4 @@
-"""Batched Gymnasium environments behind the interface of Stable-Baselines3, in one process.
+"""Batched Gymnasium environments with the interface of Stable-Baselines3, in one process.
 
 SB3's `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` passes all actions to
 one `gymnasium.vector.VectorEnv` at once, which for the sims here is one compiled call.
@@ -21,7 +21,7 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 
 
 class BatchedVecEnv(VecEnv):
-    """A `gymnasium.vector.VectorEnv` behind SB3's interface.
+    """A `gymnasium.vector.VectorEnv` with SB3's interface.
 
     At an episode's end `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
     `TimeLimit.truncated`, and under `episode` those of SB3's `Monitor`; also `reason` and

@@ -41,7 +41,7 @@ def test_nearest_names_come_first() -> None:
 
 
 def test_a_missing_extra_names_the_install_command() -> None:
-    with pytest.raises(errors.MissingExtraError) as told:
+    with pytest.raises(errors.MissingExtraError) as reported:
         errors.import_extra("no_such_module.inner", "sims")
-    assert str(told.value) == "no_such_module is not installed: pip install 'mcaprl[sims]'"
+    assert str(reported.value) == "no_such_module is not installed: pip install 'mcaprl[sims]'"
     assert errors.import_extra("json", "sims").dumps([1]) == "[1]"

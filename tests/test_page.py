@@ -191,16 +191,16 @@ def test_equal_figures_are_equal_bytes() -> None:
 
 def test_tracks_are_the_positions_in_telemetry(tmp_path: Path) -> None:
     recorder = RecordMcap(make_sim("lane"), tmp_path / "lane.mcap")
-    told = []
+    reported = []
     for seed in range(2):
         recorder.reset(seed=seed)
-        told.append([recorder.unwrapped.telemetry()])  # type: ignore[attr-defined]
+        reported.append([recorder.unwrapped.telemetry()])  # type: ignore[attr-defined]
         for _ in range(3):
             recorder.step(1)
-            told[-1].append(recorder.unwrapped.telemetry())  # type: ignore[attr-defined]
+            reported[-1].append(recorder.unwrapped.telemetry())  # type: ignore[attr-defined]
     recorder.close()
     tracks = tracks_of(mcaprl.open(tmp_path / "lane.mcap"))
-    for track, places in zip(tracks, told, strict=True):
+    for track, places in zip(tracks, reported, strict=True):
         expected = [(place["x_m"], place["y_m"]) for place in places]
         # Telemetry has 16 significant bits.
         np.testing.assert_allclose(track, np.array(expected), rtol=2**-16)

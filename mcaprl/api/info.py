@@ -161,10 +161,10 @@ def _describe(dataset: Dataset, paths: Sequence[Path], warned: Sequence[str]) ->
 
 
 def _write_report(folder: Path, dataset: Dataset, found: LogInfo) -> None:
-    from mcaprl.recorder.viewer.report import dataset_page, dataset_picture
+    from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
 
     write_json(folder / "dataset.json", found.to_json(), ReportError)
-    dataset_picture(folder / "dataset.png", dataset, found.title)
+    dataset_figure(folder / "dataset.png", dataset, found.title)
     dataset_page(folder / "index.html", dataset, found.title, found.rows(), found.findings)
 
 

@@ -1,7 +1,7 @@
-"""Transitions as tensors, packed once and drawn from at random.
+"""Transitions as tensors, packed once and sampled at random.
 
-Each observation is stored once. Next observations, n-step returns and stacks of frames are a matter
-of indexes into these frames, worked out when the data are packed.
+Each observation is stored once, as a frame. Transitions contain indices of frames; these and the
+n-step returns are computed when the data are packed, stacks of frames when they are sampled.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
 
 @dataclass(frozen=True)
 class Packing:
-    """How transitions are made from a log.
+    """Construction of transitions from a log.
 
     Attributes:
-        frame_stack: observations in a row that are seen at once; before an episode's first one
-            that one is repeated.
-        normalize: bring what networks see to mean 0 and deviation 1.
-        gamma: discount within n-step returns, and of what is behind them.
-        n_steps: rewards that are added up; fewer at the end of an episode.
+        frame_stack: Number of successive observations in one network input; at the start of an
+            episode, its first observation is repeated.
+        normalize: Normalization of network inputs to mean 0 and standard deviation 1.
+        gamma: Discount factor, within n-step returns and of the value that follows them.
+        n_steps: Number of rewards in a return; fewer at the end of an episode.
     """
 
     frame_stack: int = 1
@@ -46,16 +46,17 @@ class Packing:
 
 @dataclass(frozen=True)
 class Batch:
-    """R transitions.
+    """Batch of R transitions.
 
     Attributes:
-        rows: (R,) int64, where they stand in the buffer.
-        observations: R of them.
-        actions: (R,) int64, counted from 0.
-        rewards: (R,) float32, sums of up to n discounted ones.
-        discounts: (R,) float32, gamma to the power of the steps between the two observations; 0
-            where the episode terminated (and not where it was truncated).
-        next_observations: like `observations`, n steps on.
+        rows: Indices of the transitions in the buffer, (R,) int64.
+        observations: Observations before the actions, R.
+        actions: Indices of the actions, (R,) int64, from 0.
+        rewards: Sums of up to n discounted rewards, (R,) float32.
+        discounts: Discounts of the next observations' values, (R,) float32: gamma to the power of
+            the number of steps in between; 0 where the episode terminated, but not where it was
+            truncated.
+        next_observations: Observations up to n steps later, R.
     """
 
     rows: Tensor
@@ -71,16 +72,17 @@ class TransitionBuffer:
     """All N transitions of a dataset, over F frames.
 
     Attributes:
-        encoder: that made the frames.
-        action_space: of the log.
-        packing: how transitions are made.
-        frames: each observation once.
-        starts: (F,) int64, the first frame of each frame's episode.
-        places: (2, N) int64, the frames of each transition's observation and next observation.
-        actions: (N,) int64, counted from 0.
-        returns: (2, N) float32, n-step rewards and discounts, see `Batch`.
-        drawable: (M,) int64, the rows whose weight is above 0; None if all are.
-        cumulative: (M,) float64, their cumulative weights; None if these are equal.
+        encoder: Encoder of the frames.
+        action_space: Action space of the log.
+        packing: Construction of transitions.
+        frames: Encoded observations, F, each stored once.
+        starts: Index of the first frame of each frame's episode, (F,) int64.
+        places: Frame indices of observations and next observations, (2, N) int64.
+        actions: Indices of the actions, (N,) int64, from 0.
+        returns: n-step rewards and discounts, (2, N) float32; see `Batch`.
+        drawable: Rows with a weight above 0, (M,) int64; None if all rows have one.
+        cumulative: Cumulative weights of the drawable rows, (M,) float64; None if the weights
+            are equal.
     """
 
     encoder: ObservationEncoder
@@ -106,17 +108,17 @@ class TransitionBuffer:
         """Pack a dataset.
 
         Args:
-            dataset: with discrete actions.
-            packing: default: single steps of single frames.
-            encoder: of other data, whose normalisation is to be used here; default: a new one.
-            weights: (E,) how often each transition of an episode is drawn, relative to others; 0
-                is never. Default: all alike.
+            dataset: Dataset with discrete actions.
+            packing: Construction of transitions; default: single steps of single frames.
+            encoder: Encoder of other data, with its normalization; default: a new encoder.
+            weights: Sampling weight of the transitions of each episode, (E,), 0 for never;
+                default: equal weights.
 
         Raises:
-            SpaceError: the actions are not discrete, or not in their space, or there is no network
-                for the observations.
-            TrainingError: there are no transitions, a number is NaN or infinite, or a logged
-                action was not allowed; or all weights are 0.
+            SpaceError: The actions are not discrete or not in their space, or the networks do not
+                support the observations.
+            TrainingError: There are no transitions, a number is NaN or infinite, a logged action
+                was not allowed, or all weights are 0.
         """
         packing = packing or Packing()
         action_space = discrete_actions(dataset.action_space)
@@ -145,24 +147,24 @@ class TransitionBuffer:
         return buffer if weights is None else buffer.drawn_by(np.repeat(weights, lengths))
 
     def __len__(self) -> int:
-        """The number of transitions."""
+        """Return the number of transitions."""
         return len(self.actions)
 
     @property
     def device(self) -> torch.device:
-        """Where the transitions are."""
+        """Device of the transitions."""
         return self.actions.device
 
     def to(self, device: torch.device) -> TransitionBuffer:
-        """The same transitions, all of them on another device.
+        """Copy all transitions to a device.
 
-        Rows are drawn on the CPU all the same, so that a seed draws the same ones everywhere.
+        Rows are still sampled on the CPU, so a seed samples the same rows on every device.
         """
         parts = {name: getattr(self, name).to(device) for name in _ON_DEVICE}
         return replace(self, **parts)
 
     def sample_rows(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw (count,) rows with replacement, by their weights, on the CPU."""
+        """Sample rows (count,) by their weights, with replacement, on the CPU."""
         if self.cumulative is None:
             total = len(self) if self.drawable is None else len(self.drawable)
             draws = torch.randint(total, (count,), generator=generator)
@@ -173,17 +175,17 @@ class TransitionBuffer:
         return draws if self.drawable is None else self.drawable.index_select(0, draws)
 
     def batch(self, rows: Tensor) -> Batch:
-        """The transitions of rows (R,)."""
+        """Return the transitions of these rows (R,)."""
         here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
         return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
 
     def drawn_by(self, weights: NDArray[np.float64]) -> TransitionBuffer:
-        """The same transitions, each drawn by its weight (N,); 0 is never.
+        """Return the same transitions with sampling weights (N,); 0 means never.
 
         Raises:
-            TrainingError: nothing would ever be drawn.
+            TrainingError: All weights are 0.
         """
         rows = np.flatnonzero(weights > 0)
         if not len(rows):
@@ -196,11 +198,11 @@ class TransitionBuffer:
         )
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Draw transitions."""
+        """Sample transitions by their weights, with replacement."""
         return self.batch(self.sample_rows(batch_size, generator).to(self.device))
 
     def observe(self, places: Tensor) -> Observations:
-        """What is seen at frames (R,): each frame, with those before it if frames are stacked."""
+        """Return the network inputs at frames (R,), stacked with earlier frames if configured."""
         count = self.packing.frame_stack
         if count == 1:
             return self.frames.rows(places)
@@ -211,12 +213,12 @@ class TransitionBuffer:
 
     @property
     def vector_width(self) -> int:
-        """Numbers in the vector that a network sees."""
+        """Length of the vector in a network input."""
         return self.encoder.width * self.packing.frame_stack
 
     @property
     def image_inputs(self) -> list[ImageInput]:
-        """How a network takes the pictures that it sees."""
+        """Normalization of each image in a network input."""
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
 
 
@@ -238,10 +240,10 @@ def choose_device(name: str) -> torch.device:
 
 
 def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
-    """The action space, if the algorithms here can learn with it.
+    """Return the action space if the offline algorithms support it.
 
     Raises:
-        SpaceError: it is not Discrete.
+        SpaceError: The space is not Discrete.
     """
     if not isinstance(space, spaces.Discrete):
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
@@ -249,10 +251,10 @@ def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
 
 
 def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Places and returns of `TransitionBuffer`: sums of rewards up to n steps or the episode's end.
+    """Compute `places` and `returns` of `TransitionBuffer`.
 
-    Truncation cuts an episode off from outside, so the sum is cut and what is behind it still
-    counts; termination ends the return.
+    Rewards are summed over n steps or up to the end of the episode. After a truncation, the value
+    of the last observation still counts; after a termination, the discount is 0.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)
@@ -275,7 +277,7 @@ def _starts(frame_counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
-    """One NaN would spoil every weight, so it is named here and not met again as a NaN loss."""
+    """Check that observations are finite and actions allowed, before one NaN spoils all weights."""
     rows = torch.from_numpy(dataset.frame_of_step)
     _check_finite("observations", frames.vector[rows])
     _check_finite("next_observations", frames.vector[rows + 1])

@@ -1,10 +1,11 @@
-"""From what an environment shows to what networks take: one vector, pictures, an action mask.
+"""Encoding of observations as network inputs: one vector, images and an action mask.
 
-Whatever is no picture (floats, flags, counters; at any depth of a Dict space) becomes one float32
-vector: a Discrete part as a one-hot code, uint8 numbers divided by 255. Pictures stay bytes.
+All parts that are not images (floats, flags, counters, at any depth of a Dict space) become one
+float32 vector: a Discrete part is one-hot encoded, uint8 values are divided by 255. Images stay
+uint8.
 
-The key `action_mask` at the top of a Dict space, with one flag per action, is no input: it says
-which actions are allowed, as in PettingZoo. Since it is part of the observation, it is in the log.
+The top-level key `action_mask` of a Dict space, with one flag per action, is not a network input:
+it marks the allowed actions, as in PettingZoo. It is part of the observation, so logs contain it.
 """
 
 from __future__ import annotations
@@ -21,27 +22,27 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE as SMALLEST_PICTURE
+from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE as SMALLEST_IMAGE
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 
 MIN_IMAGE_EDGE = 36
-"""The smallest image, in pixels, that the convolutions leave a pixel of."""
+"""Smallest height and width in pixels for which the output of the convolutions is not empty."""
 MASK_KEY = "action_mask"
 _MOST_IMAGES = 10_000
-"""Pictures that a mean is taken over at most, evenly spaced."""
+"""Largest number of images, evenly spaced, used to compute the mean and the scale."""
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
-"""Codes squared: less is rounding in pictures that are all alike."""
+"""Variance at or below which all images are considered equal up to rounding."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """B observations as networks take them.
+    """B observations as network inputs.
 
     Attributes:
-        vector: (B, V) float32; V is 0 where there are only pictures.
-        images: (B, height, width, channels) uint8 each.
-        mask: (B, A) bool, which actions are allowed; None if all always are.
+        vector: Vector inputs, (B, V) float32; V is 0 if there are only images.
+        images: Image inputs, (B, height, width, channels) uint8 each.
+        mask: Allowed actions, (B, A) bool; None if all actions are always allowed.
     """
 
     vector: Tensor
@@ -49,33 +50,33 @@ class Observations:
     mask: Tensor | None = None
 
     def __len__(self) -> int:
-        """B."""
+        """Return B, the number of observations."""
         return len(self.vector)
 
     def parts(self) -> list[Tensor]:
-        """All its tensors, the mask last."""
+        """Return all tensors, the mask last."""
         mask = [] if self.mask is None else [self.mask]
         return [self.vector, *self.images, *mask]
 
     def like(self, parts: Sequence[Tensor]) -> Observations:
-        """The same kind of observations from other tensors, in the order of `parts`."""
+        """Create observations with the same layout from other tensors, in the order of `parts`."""
         n_images = len(self.images)
         mask = None if self.mask is None else parts[-1]
         return Observations(parts[0], tuple(parts[1 : 1 + n_images]), mask)
 
     def rows(self, index: Tensor) -> Observations:
-        """Copy the rows of an index (R,)."""
+        """Copy the rows with these indices (R,)."""
         if not self.images and self.mask is None:
             return Observations(self.vector.index_select(0, index))
         return self.like([part.index_select(0, index) for part in self.parts()])
 
     def split(self, rows: int) -> list[Observations]:
-        """Views of `rows` observations each; the last may have fewer."""
+        """Split into views of `rows` observations each; the last may have fewer."""
         columns = [torch.split(part, rows) for part in self.parts()]
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Each `count` observations that follow each other as one; the last one's mask counts."""
+        """Stack each `count` successive observations into one, which has the mask of the last."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -87,18 +88,18 @@ class Observations:
         return Observations(self.vector.reshape(rows, -1), images, mask)
 
     def to(self, device: torch.device) -> Observations:
-        """The same on another device."""
+        """Copy the observations to a device."""
         return self.like([part.to(device) for part in self.parts()])
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInput:
-    """How a network takes the pictures of one camera: (codes - shift) / scale.
+    """Normalization of the images of one leaf: (values - shift) / scale.
 
     Attributes:
-        shape: (height, width, channels).
-        shift: (height, width, channels) float32, codes; None is 0 everywhere.
-        scale: codes.
+        shape: Shape (height, width, channels) of one image.
+        shift: Mean image, (height, width, channels) float32; None for 0.
+        scale: Divisor of all pixels.
     """
 
     shape: tuple[int, ...]
@@ -106,18 +107,18 @@ class ImageInput:
     scale: float = 255.0
 
     def stacked(self, count: int) -> ImageInput:
-        """The same for `count` pictures in a row as one, each with its own channels."""
+        """Return the normalization of `count` images stacked along the channels."""
         height, width, channels = self.shape
         shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
         return replace(self, shape=(height, width, channels * count), shift=shift)
 
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
-        """Take the mean picture off, and divide by the root mean square of what is left.
+        """Return a normalization with the mean image and the standard deviation over all pixels.
 
-        One scale for the whole picture: what hardly ever changes stays small.
+        All pixels share one scale, so pixels that hardly change stay small.
 
         Args:
-            images: (N, height, width) or (N, height, width, channels), N at least 1.
+            images: Images, (N, height, width) or (N, height, width, channels), N at least 1.
         """
         chosen = np.linspace(0, len(images) - 1, min(len(images), _MOST_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
@@ -133,24 +134,24 @@ class ImageInput:
 
 
 class ObservationEncoder:
-    """Turns observations of one space into tensors; saved with each policy.
+    """Encoder that converts observations of one space to tensors; saved with each policy.
 
     Attributes:
-        space: of one observation.
-        width: V, the numbers of its vector.
-        image_inputs: how networks take each picture.
-        images: the leaves that are pictures.
-        numbers: the leaves that make the vector, and their spaces.
-        mask: the leaf that is the action mask, if there is one.
-        shift: (V,) float32, taken off the vector.
-        scale: (V,) float32, the vector is divided by it then.
+        space: Space of one observation.
+        width: Length V of the vector.
+        image_inputs: Normalization of each image leaf.
+        images: Leaves that are images.
+        numbers: Leaves of the vector, with their spaces.
+        mask: Leaf of the action mask; None if there is no mask.
+        shift: Subtrahend of the vector, (V,) float32.
+        scale: Divisor of the shifted vector, (V,) float32.
     """
 
     def __init__(self, space: spaces.Space[Any], n_actions: int) -> None:
-        """Build for a space, without normalisation.
+        """Create the encoder of a space, without normalization.
 
         Raises:
-            SpaceError: no network takes such observations.
+            SpaceError: The networks do not support such observations.
         """
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
@@ -162,7 +163,7 @@ class ObservationEncoder:
         self.images = [leaf for leaf, part in kinds if _is_image(part)]
         self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
         if not kinds:
-            raise SpaceError(f"the observation holds nothing but {MASK_KEY}")
+            raise SpaceError(f"the observation has only {MASK_KEY}")
         self.image_inputs = [ImageInput((*leaf.shape, 1)[:3]) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
@@ -171,10 +172,10 @@ class ObservationEncoder:
         self.scale = np.repeat(np.where(bytes_, 255, 1), widths).astype(np.float32)
 
     def normalize_to(self, observations: Any) -> None:
-        """Shift and scale all inputs to mean 0 and standard deviation 1 over these observations.
+        """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
 
-        Each number has its own scale, a picture one for all of its pixels. What never changes keeps
-        its scale: it only becomes 0.
+        Each element of the vector has a separate scale; all pixels of an image share one. Constant
+        elements keep their scale and become 0.
         """
         self.image_inputs = [
             image.normalized_to(leaf.of(observations))
@@ -192,10 +193,10 @@ class ObservationEncoder:
         """Encode B observations of the space.
 
         Args:
-            observations: (B, *shape), or nested dicts of such arrays.
+            observations: Arrays (B, *shape), or nested dicts of such arrays.
 
         Raises:
-            SpaceError: they have other shapes.
+            SpaceError: The observations do not have the shapes of the space.
         """
         for leaf in self.leaves:
             _check_shape(leaf, observations)
@@ -211,14 +212,14 @@ class ObservationEncoder:
         )
 
     def is_stack(self, observations: Any, count: int) -> bool:
-        """Whether these are `count` observations in a row each: (B, count, *shape)."""
+        """Return whether these are stacks of `count` observations, (B, count, *shape)."""
         return all(
             np.shape(leaf.of(observations))[1:] == (count, *leaf.shape) for leaf in self.leaves
         )
 
     @property
     def leaves(self) -> list[Leaf]:
-        """All parts of an observation: pictures, numbers, mask."""
+        """All leaves of an observation: images, then numbers, then the mask."""
         mask = [] if self.mask is None else [self.mask]
         return [*self.images, *(leaf for leaf, _ in self.numbers), *mask]
 
@@ -234,22 +235,22 @@ class ObservationEncoder:
         if self.mask is None:
             return None
         allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # Behind the end of an episode nothing may be allowed; no value there is ever used.
+        # After the end of an episode, all actions can be masked; values there are never used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:
-    """Whether observations are pictures: uint8, (height, width) or (height, width, channels).
+    """Return whether a space is an image: uint8, (height, width) or (height, width, channels).
 
     Raises:
-        SpaceError: they are, but of a kind that the convolutions do not take.
+        SpaceError: It is an image that the convolutions do not support.
     """
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
     shape = space.shape
-    if len(shape) == 3 and shape[0] < SMALLEST_PICTURE <= min(shape[1:]):
+    if len(shape) == 3 and shape[0] < SMALLEST_IMAGE <= min(shape[1:]):
         raise SpaceError(f"images need shape (height, width, channels), got {shape}: transpose")
-    if len(shape) not in (2, 3) or min(shape[:2]) < SMALLEST_PICTURE:
+    if len(shape) not in (2, 3) or min(shape[:2]) < SMALLEST_IMAGE:
         return False
     if min(shape[:2]) < MIN_IMAGE_EDGE:
         least = f"{MIN_IMAGE_EDGE}x{MIN_IMAGE_EDGE}"
@@ -265,7 +266,7 @@ def _part_of(space: spaces.Space[Any], path: tuple[str, ...]) -> spaces.Space[An
 
 
 def _choices(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
-    """The number of values of each counter of a discrete space; None for other spaces."""
+    """Return the number of values of each element of a discrete space; None for other spaces."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.n])
     return space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else None
@@ -277,7 +278,7 @@ def _width(space: spaces.Space[Any]) -> int:
 
 
 def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """(B, width) of a part of the space: one-hot codes of counters, else the numbers themselves."""
+    """Encode one part of the space as (B, width): discrete values one-hot, others unchanged."""
     choices = _choices(space)
     flat = np.asarray(values).reshape(len(values), -1)
     if choices is None:

@@ -1,4 +1,4 @@
-"""Several logs at once, each with its weight: `DATA...` as a user writes it."""
+"""Reading of several logs with weights, from the `DATA...` arguments of a command."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 
 def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
-    """Read logs, each a file, folder or glob, with `:WEIGHT` behind it or without.
+    """Read logs, each a file, folder or glob, optionally followed by `:WEIGHT`.
 
-    A transition of weight 2 is drawn twice as often as one of weight 1, which is the default.
-    `threads` read chunks at a time.
+    A transition of weight 2 is sampled twice as often as one of weight 1, the default.
+
+    Args:
+        data: Logs, with or without weights.
+        threads: Number of threads that read chunks.
 
     Returns:
         All logs as one dataset, and the weight of each of its episodes.
 
     Raises:
-        UsageError: a weight is negative or no number, or a file is meant twice with two weights.
-        LogError: a file is missing, no MCAP, damaged, or has no finished episode.
-        SpaceError: the logs' spaces differ.
+        UsageError: A weight is negative or not finite, or a file is listed with two weights.
+        LogError: A file is missing, not an MCAP file, damaged, or without a finished episode.
+        SpaceError: The spaces of the logs differ.
     """
     weights: dict[Path, float] = {}
     for part in data:
@@ -43,7 +46,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
 
 
 def _split_weight(part: str) -> tuple[str, float]:
-    """`logs/a.mcap:2` as a name and a weight; a file whose own name has a colon is a file."""
+    """Split `logs/a.mcap:2` into name and weight; the name of an existing file is not split."""
     name, colon, number = part.rpartition(":")
     if not colon or Path(part).exists():
         return part, 1.0

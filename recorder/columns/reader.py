@@ -140,8 +140,8 @@ class McapReader:
         """Return the positions of the messages of a channel, in file order.
 
         Chunks with an index are not read, and neither is the index of a chunk of one channel if the
-        summary confirms the number of messages: who reads a few rows of a large file then reads
-        only a few indexes.
+        summary confirms the number of messages: reading a few rows of a large file then needs only
+        a few indexes.
 
         Raises:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.

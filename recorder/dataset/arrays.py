@@ -164,12 +164,12 @@ def _assemble(
     lasts: NDArray[np.int64],
     step_ns: int,
 ) -> Transitions:
-    behind = lasts + 1
+    after = lasts + 1
     frames = tuple(
-        np.insert(observation, behind, following[lasts], axis=0)
+        np.insert(observation, after, following[lasts], axis=0)
         for observation, following in zip(here, there, strict=True)
     )
-    starts = np.concatenate([[0], behind[:-1]])
+    starts = np.concatenate([[0], after[:-1]])
     episodes = tuple(
         EpisodeSummary(
             episode=number,

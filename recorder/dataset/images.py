@@ -1,4 +1,4 @@
-"""Image observations: the pictures of a topic that belong to the records of `/rl/step`."""
+"""Image observations: the images of a topic that belong to the records of `/rl/step`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_images(
     storage: Storage,
     threads: int = 1,
 ) -> Frames:
-    """(F, *shape) pictures of an image leaf, one for each of `times`.
+    """Read the (F, *shape) images of an image leaf, one for each of `times`.
 
     Raises:
         CorruptLogError: one is missing, or is of another size or encoding.
@@ -61,7 +61,7 @@ class _Images:
 
     @property
     def are_mappable(self) -> bool:
-        """Whether all pictures stand in the file as they are."""
+        """Whether all images are stored uncompressed."""
         chunks = [messages.chunk for _, messages in self.topic.parts]
         return all(chunk is not None and not chunk.compression for chunk in chunks)
 
@@ -87,14 +87,14 @@ class _Images:
         return place if by_time is None else by_time[place]
 
     def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
-        """(F, *shape) the pictures in memory."""
+        """Read the images (F, *shape) into memory."""
         is_all = len(order) == len(self.topic) and bool((np.diff(order) == 1).all())
         columns = self.topic.read(_FIELDS, None if is_all else order, threads=threads)
         self._check(columns)
         return columns["data"].reshape(-1, *self._leaf.shape)
 
     def blocks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-        """All pictures in the order of their times, some at a time."""
+        """Yield the times and images of blocks of messages, in the order of log_time."""
         order = time_order(self.topic)
         order = np.arange(len(self.topic)) if order is None else order
         for start in range(0, len(order), IMAGES_PER_CHUNK):
@@ -102,13 +102,13 @@ class _Images:
             yield self.topic.times[part], self.read(part)
 
     def mapped(self, order: NDArray[np.int64]) -> MappedImages:
-        """(F, *shape) the pictures on disk, each checked when it is asked for."""
+        """Return the images (F, *shape) on disk; each chunk is checked when it is first read."""
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()
         for number, (decoder, messages) in enumerate(self.topic.parts):
             chunk, index = messages.chunk, messages.index
-            assert chunk is not None, "pictures outside of chunks are not mapped"
+            assert chunk is not None, "images outside of chunks are not mapped"
             data = chunk_header(self._reader.view, chunk.chunk_start_offset).data
             stop = start + len(index)
             places[start:stop, 0], places[start:stop, 1] = 0, number
@@ -120,7 +120,7 @@ class _Images:
         return MappedImages([file], self._leaf.shape, places[order])
 
     def _data_offset(self) -> int:
-        """Where the first message's picture is, counted from its record."""
+        """Return the offset of the image data in the first message record."""
         decoder, messages = self.topic.parts[0]
         found = decoder.alike(self._reader.records_of(messages), messages.index[:1], _FIELDS)
         if found is None:
@@ -142,7 +142,7 @@ class _Images:
         return check
 
     def _check(self, columns: Columns) -> None:
-        """Make sure that pictures are of the leaf's size and encoding.
+        """Check the size and encoding of images against the leaf.
 
         Raises:
             CorruptLogError: one is not.
@@ -155,11 +155,11 @@ class _Images:
         wrong = np.logical_or.reduce([a != b for a, b in zip(found, expected, strict=True)])
         if wrong.any() or columns["data"].shape[1:] != (self._leaf.size,):
             row = int(np.argmax(wrong))
-            told = ", ".join(
+            found_text = ", ".join(
                 f"{name} {column[row]}" for name, column in zip(_FIELDS, found, strict=False)
             )
             raise CorruptLogError(
-                f"{self._reader.path}: an image on {self.topic.name} has {told} and"
+                f"{self._reader.path}: an image on {self.topic.name} has {found_text} and"
                 f" {columns['data'].shape[1]} bytes; the space says {height}x{width} {encoding}"
             )
 

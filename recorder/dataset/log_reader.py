@@ -60,7 +60,7 @@ class LogReader:
         self._reader = McapReader(path)
         self._steps = _steps_of(self._reader)
         self._metadata = described(self._reader)
-        self._told = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC))
+        self._summaries = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC))
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
@@ -70,10 +70,10 @@ class LogReader:
             CorruptLogError: records are missing, doubled or out of order.
             NoEpisodesError: there is no finished episode.
         """
-        # What is told is believed only as far as it agrees with what is read then.
-        told = self._told.lengths if self._reader.complete else np.empty(0, np.int64)
-        if self._steps.chunks_rise and int(told.sum()) + len(told) == len(self._steps):
-            return told
+        # The summaries are compared with the records when these are read.
+        listed = self._summaries.lengths if self._reader.complete else np.empty(0, np.int64)
+        if self._steps.chunks_rise and int(listed.sum()) + len(listed) == len(self._steps):
+            return listed
         self._check_fields(COUNTERS)
         return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self._name))
 
@@ -149,18 +149,18 @@ class LogReader:
             )
 
     def _finished(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Tell of records behind the last finished episode.
+        """Warn about records after the last finished episode.
 
         Raises:
             NoEpisodesError: there is no finished one.
         """
         if not len(lengths):
             raise NoEpisodesError(f"{self.path} has no finished episode")
-        behind = len(self._steps) - int(lengths.sum()) - len(lengths)
-        if behind or not self._reader.complete:
+        extra = len(self._steps) - int(lengths.sum()) - len(lengths)
+        if extra or not self._reader.complete:
             warnings.warn(
                 f"{self.path} was cut off or is still being written; finished episodes read:"
-                f" {len(lengths)}, records behind them left out: {behind}",
+                f" {len(lengths)}, later records skipped: {extra}",
                 stacklevel=4,
             )
         return lengths
@@ -170,8 +170,8 @@ class LogReader:
     ) -> Dataset:
         leaves = self._leaves(metadata)
         finals = np.cumsum(lengths + 1) - 1
-        told = self._told.summaries(columns[LOG_TIME][finals])
-        episodes = summaries(self.path, columns, lengths, told)
+        recorded = self._summaries.summaries(columns[LOG_TIME][finals])
+        episodes = summaries(self.path, columns, lengths, recorded)
         action = action_leaf(metadata.action_space)
         probs = columns.get("behavior_prob")
         if probs is None:
@@ -223,7 +223,7 @@ def described(reader: McapReader) -> LogMetadata | None:
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The channel's copy stands in the summary, too, under its CRC.
+        # The channel's copy is also in the summary, which has a CRC.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata
@@ -287,7 +287,7 @@ def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
     """A column without some of its rows; it is overwritten."""
     if len(column) < _LONG_EPISODE * len(rows):
         return np.delete(column, rows, axis=0)
-    # Where much stands between them, moving that is cheaper than another column.
+    # Moving long runs of rows is cheaper than allocating another column.
     starts, stops = rows[:-1] + 1, rows[1:]
     for moved, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True), 1):
         column[start - moved : stop - moved] = column[start:stop]

@@ -30,7 +30,7 @@ def save_log(
     """Write columns as a log.
 
     Times are kept where they rise from the first frame to the last, else counted from now on.
-    Episodes are numbered anew.
+    Episodes are numbered from 0.
 
     Raises:
         OutputExistsError: there is a file, and `overwrite` is not set.

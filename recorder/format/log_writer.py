@@ -1,43 +1,44 @@
-"""Writes a log of format version 1, which is specified here, in `schema` and in `metadata`.
+"""Writer of logs of format version 1, which this text, `schema` and `metadata` specify.
 
 A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, all schemas `ros2msg`.
 
-    topic                  type                      a message for each
-    /rl/step               mcaprl_msgs/msg/Step...   observation: what `schema` says
-    /rl/observation/<key>  sensor_msgs/msg/Image     picture that is observed: mono8, rgb8 or rgba8
-    /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end: what `messages` says
-    /rosout                rcl_interfaces/msg/Log    episode's start, and end, in words
-    /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy told its version
-    all others                                       what only viewers show: see `display`
+    topic                  type                      one message for each
+    /rl/step               mcaprl_msgs/msg/Step...   observation; fields in `schema`
+    /rl/observation/<key>  sensor_msgs/msg/Image     image observation: mono8, rgb8 or rgba8
+    /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end; fields in `messages`
+    /rosout                rcl_interfaces/msg/Log    start and end of an episode, as text
+    /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy version is known
+    all others                                       display topics, see `record/display.py`
 
-Episodes. One of T transitions has T + 1 records of `/rl/step`, one behind the other: record k has
-observation k, and the action taken there with what it brought; record T is `final` and has only the
-last observation. `episode` counts from 0 in the recording, `step` from 0 in the episode. The last
-transition is `terminated`, `truncated` or both. One that was broken off is truncated for the reason
-`interrupted`. Episodes of many environments that ran side by side are written one after the other,
-in the order of their ends.
+Episodes. An episode of T transitions has T + 1 consecutive records of `/rl/step`. Record k < T has
+observation k, the action taken there, and the reward of that action; record T is `final` and has
+only the last observation. `episode` counts from 0 in the recording, `step` from 0 in the episode.
+The last transition is `terminated`, `truncated` or both. An episode that the recorder ends is
+truncated with the reason `interrupted`. Episodes of a vector environment are written one after the
+other, in the order of their ends.
 
 Times. log_time is the start of the recording since the Unix epoch plus simulated time, in integer
-nanoseconds; publish_time is the same. It rises from record to record of `/rl/step`, from episode to
-episode too, and all that belongs to one observation has its log_time: that is the key which joins
-topics. `/rl/episode` has that of the final record.
+nanoseconds; publish_time equals it. It increases strictly from record to record of `/rl/step`,
+across episodes. All messages of one observation have its log_time, which joins the topics.
+`/rl/episode` has the log_time of the final record.
 
-Chunks. Each holds one kind of topic, as the lines above divide them (but `/rosout` stands with
-`/rl/episode`), and is compressed by zstd, lz4 or not at all, with its CRC, and a MessageIndex for
-each channel in it. Schemas, channels, metadata and attachments are top-level records before the
-chunks that need them. The summary repeats schemas and channels, and indexes all else. Every CRC
-that MCAP has is there. When a log is closed, many chunks below 64 KiB are merged to chunks of about
-1 MiB of the same kind; the messages of each channel stay in their order.
+Chunks. Each chunk contains one kind of topic, one line of the table above (`/rosout` is in the
+chunks of `/rl/episode`). It is compressed by zstd, lz4 or not at all, and has a CRC and a
+MessageIndex for each of its channels. Schemas, channels, metadata and attachments are top-level
+records before the chunks that need them. The summary repeats schemas and channels, and indexes
+everything else. All CRCs of MCAP are present. When a log is closed, chunks below 64 KiB are merged
+into chunks of about 1 MiB of the same kind, if there are many; the messages of each channel keep
+their order.
 
-Order. First comes the metadata record `mcaprl.dataset`. Of an episode, `/rl/step` is written last:
-a finished episode is one whose record `final` is in the file, and then all else of it is there too.
-A file without a summary is one whose writer was killed, or is still at work; its finished episodes
-are whole. With the first episode comes the attachment `foxglove-layout.json`.
+Order. The metadata record `mcaprl.dataset` comes first. Of each episode, `/rl/step` is written
+last: if its `final` record is in the file, so is the rest of the episode. A file without a summary
+is still being written, or its writer was killed; its finished episodes are complete. The attachment
+`foxglove-layout.json` comes with the first episode.
 
-Growth. What is appended goes on counting episodes, and begins later than the file ended; its
-environment has the same id, arguments, spaces, names and step duration as the one before. A
-recording may go on in more files, `NAME-00000.mcap`, `NAME-00001.mcap` and so on: each is a log of
-whole episodes, and episodes and times go on from one to the next.
+Growth. An appended recording continues the episode numbers and starts later than the file ended;
+its environment has the same id, arguments, spaces, names and step duration. A recording can
+continue in further files, `NAME-00000.mcap`, `NAME-00001.mcap` and so on: each is a log of whole
+episodes, and episode numbers and times continue from one file to the next.
 """
 
 from __future__ import annotations

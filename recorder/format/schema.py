@@ -1,10 +1,10 @@
-"""Message types of one fixed length, as ROS 2 definition text and as NumPy dtype.
+"""Message types of fixed length, as ROS 2 definitions and as NumPy dtypes.
 
 A CDR message without strings and variable arrays is a C struct: a 4-byte encapsulation header,
-then the fields in order, each aligned to its own size, counted from behind that header. Such a
-type is a NumPy structured dtype, so that a chunk of messages is one array.
+then the fields in order, each aligned to its size relative to the end of that header. Such a type
+is a NumPy structured dtype, so a chunk of messages is one array.
 
-`/rl/step` has its fields in falling order of size, hence no padding:
+The fields of `/rl/step` are sorted by decreasing size, so there is no padding:
 
     float64 reward              of the action taken here; 0 in a final record
     int64 | float32[M] action   0 in a final record
@@ -14,13 +14,13 @@ type is a NumPy structured dtype, so that a chunk of messages is one array.
     bool terminated, truncated  of the transition that starts here
     bool final                  this record holds only an episode's last observation
 
-`/rl/learner` has, for each transition under its log_time, what changes while a policy learns:
+`/rl/learner` has one message for each transition, with the transition's log_time:
 
     float64 epsilon             probability of a random action; NaN if unknown
     int64 policy_version        updates that the policy had seen; -1 if unknown
 
 Observations and actions keep their dtype (float16 is widened to float32). Image observations are
-not in it: they are `sensor_msgs/msg/Image` on topics of their own, under the same log_time.
+`sensor_msgs/msg/Image` messages on separate topics, with the same log_time.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def step_schema(
 ) -> tuple[str, str]:
     """Name and definition text of `/rl/step` for a pair of spaces.
 
-    The name carries a hash of the text, since one name must mean one layout to a viewer that has
-    several logs open.
+    The name contains a hash of the text, because a viewer with several logs open expects one
+    layout for each name.
 
     Raises:
-        SpaceError: a log cannot hold these spaces.
+        SpaceError: A log cannot store these spaces.
     """
     vectors = [leaf for leaf in observation_leaves(observation_space) if leaf.encoding is None]
     fields = [
@@ -100,8 +100,8 @@ def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
 def telemetry_message(values: Iterable[float]) -> bytes:
     """A message of `telemetry_schema`.
 
-    Values are rounded to 16 significant bits, more than four digits: a plot shows no more, and the
-    digits behind would be the greater part of what viewers need in a log.
+    Values are rounded to 16 significant bits, more than four digits, which is enough for plots and
+    compresses better.
     """
     mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
     rounded = np.ldexp(np.rint(mantissas * 2**16), exponents - 16)
@@ -251,5 +251,5 @@ def _digest(text: bytes) -> str:
 
 
 def _align(offset: int, alignment: int) -> int:
-    """The next offset that is aligned, counted from behind the encapsulation header."""
+    """Return the next aligned offset, relative to the end of the encapsulation header."""
     return offset + -(offset - ENCAPSULATION_BYTES) % alignment

@@ -38,7 +38,7 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
-# Messages, what decodes them, and where they belong: rows of the steps' columns, or pictures.
+# A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 

@@ -1,4 +1,4 @@
-"""The layout for a log as it stands: from its topics, its schemas and its first frame."""
+"""The layout of an existing log, from its topics, schemas and first frame."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Plays logs as viewers take them: by a clock that can be stopped, sped up and set.
+"""Playback of logs by a clock with pause, speed and seek.
 
-Nothing is read ahead. Where a message is stands in the file's own indexes, which stay in the mapped
-file; of the chunks that are inflated, a few are kept. So a long log takes no more memory than a
-short one.
+Nothing is read ahead. The positions of messages come from the indexes in the memory-mapped file,
+and only a few decompressed chunks are kept, so memory does not grow with the log.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ class Played(NamedTuple):
         track: which log it is of, by its place in the player.
         channel_id: of the topic, in its log.
         time_ns: when, on the player's clock.
-        data: as it stands in the file.
+        data: Bytes of the message, as in the file.
     """
 
     track: int
@@ -43,7 +42,7 @@ class Track:
     Attributes:
         reader: of the file.
         start_ns: log_time of its first message that is played.
-        end_ns: likewise the last.
+        end_ns: log_time of its last message that is played.
     """
 
     def __init__(
@@ -86,7 +85,7 @@ class Track:
     def latest(self, time_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
         """Yield the last message of each topic up to a moment: all that is to be seen then.
 
-        What stood in the file before the window is part of it.
+        Messages before the window are included.
         """
         for topic in self._topics:
             place = topic.latest(min(time_ns, self.end_ns))
@@ -105,7 +104,7 @@ class Track:
 
 
 class _Place(NamedTuple):
-    """Where a message is; its chunk starts at -1 if it stands outside of all."""
+    """Position of a message; `chunk_start` is -1 for a message outside of chunks."""
 
     time_ns: int
     channel: Channel
@@ -192,8 +191,8 @@ class Player:
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next_ns = self.time_ns + 1
 
-    def picture(self) -> list[Played]:
-        """The last message of each topic: what a viewer must have that begins to look now."""
+    def current_messages(self) -> list[Played]:
+        """Return the last message of each topic: the state that a new viewer needs."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

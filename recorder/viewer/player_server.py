@@ -89,7 +89,7 @@ class LiveServer:
             fresh = restarts or self._newly_subscribed or self._seeked
             self._newly_subscribed = self._seeked = False
             was_playing = self._player.playing
-            due = self._player.picture() if fresh else []
+            due = self._player.current_messages() if fresh else []
             due += self._player.advance(elapsed_s)
             time_ns, stopped = self._player.time_ns, was_playing and not self._player.playing
             state = self._state(did_seek=restarts)

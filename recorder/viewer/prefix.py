@@ -1,4 +1,4 @@
-"""Several logs in one viewer: each one's topics and frames below a word of its own."""
+"""Several logs in one viewer: the topics and frames of each have a prefix."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ _MAP_CELLS = 80
 _MAX_ROWS = 60
 
 
-def dataset_picture(path: Path, dataset: Dataset, title: str) -> None:
+def dataset_figure(path: Path, dataset: Dataset, title: str) -> None:
     """Write a PNG with histograms of returns and lengths, and counts of actions and ends.
 
     Args:

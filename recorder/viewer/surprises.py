@@ -30,7 +30,7 @@ class Surprise:
         episode: its index in the log.
         step: of the episode.
         value: the TD error; of a disagreement, the advantage of the logged action, or, of a policy
-            without values, its normalised entropy.
+            without values, its normalized entropy.
     """
 
     file: str

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 _NEAR_M = 0.1
 """Distance of the near plane."""
 _BACK_M = 1e-6
-"""Distance behind a triangle from which a camera sees its back, despite rounding."""
+"""Distance too_near a triangle from which a camera sees its back, despite rounding."""
 
 
 class Lens(NamedTuple):
@@ -99,7 +99,7 @@ def draw(
         before_m += planes[face, 2] * eye_m[2] - planes[face, 3]
         if before_m < -_BACK_M:
             continue
-        behind = right = left = below = above = True
+        too_near = right = left = below = above = True
         for i in range(3):
             dx = mesh[face, i, 0] - eye_m[0]
             dy = mesh[face, i, 1] - eye_m[1]
@@ -108,13 +108,13 @@ def draw(
             y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
             z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
             corners[i, 0], corners[i, 1], corners[i, 2] = x, y, z
-            behind &= z < _NEAR_M
+            too_near &= z < _NEAR_M
             right &= x > wide * z
             left &= x < -wide * z
             below &= y > high * z
             above &= y < -high * z
         # A triangle with all corners beyond the same border is not in the image.
-        if behind or right or left or below or above:
+        if too_near or right or left or below or above:
             continue
         plane = _plane(corners)
         if plane.offset < 0.0:

@@ -22,7 +22,7 @@ from mcaprl.sims.geometry.mesh import box_mesh
 Floats = NDArray[np.float64]
 
 SIZE_PX = (960, 540)
-BEHIND_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
+BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
 """Position of the camera relative to the body, and the distance of its target in front of it."""
 FAR_M = 400.0
 _FOCAL_PX = 0.9 * SIZE_PX[0]
@@ -89,7 +89,7 @@ class ChaseView:
             lines: Lines of text in the corner.
         """
         poses = poses_of(frames)
-        eye = eye_behind(poses.get(follow, Pose(np.eye(3), np.zeros(3))))
+        eye = chase_eye(poses.get(follow, Pose(np.eye(3), np.zeros(3))))
         pieces = self._visible_in_map(static, eye)
         on_bodies = [shape for shape in static if shape.frame != "map"]
         for shape in (*on_bodies, *moving):
@@ -174,12 +174,12 @@ def rotation_matrix(xyzw: tuple[float, float, float, float]) -> Floats:
     )
 
 
-def eye_behind(body: Pose) -> Pose:
+def chase_eye(body: Pose) -> Pose:
     """Return the pose of the camera behind a body: x right and level, y down, z along the view."""
     forward = body.axes[:, 0] * [1.0, 1.0, 0.0]
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
-    at_m = body.at_m - BEHIND_M * forward + [0.0, 0.0, ABOVE_M]
+    at_m = body.at_m - BACK_M * forward + [0.0, 0.0, ABOVE_M]
     view = body.at_m + AHEAD_M * forward - at_m
     view /= np.linalg.norm(view)
     right = np.array([forward[1], -forward[0], 0.0])

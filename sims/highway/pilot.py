@@ -14,7 +14,7 @@ PURSUIT_M = 10.0
 ROOM_M = 30.0
 """Free distance ahead below which the pilot changes to the lane with the most."""
 BESIDE_M = 9.0
-"""Distance up to which a car behind also blocks its lane."""
+"""Distance up to which a following car also blocks its lane."""
 
 
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):

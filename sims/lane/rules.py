@@ -50,7 +50,7 @@ _FALL_2 = (STEERING_CURVE[0] - STEERING_CURVE[1]) / (STEERING_CURVE_M_S[1] - STE
 _FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STEERING_CURVE_M_S[1])
 """Decrease of the share per m/s before each knot."""
 
-BEHIND_M = 4.0
+BACK_M = 4.0
 AHEAD_M = 8.0
 """Search window of the nearest path point, relative to the last one."""
 
@@ -135,7 +135,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
     """Return the car with a motion, its place on the path searched around `near_m`."""
-    place = course_project(motion.x_m, motion.y_m, near_m - BEHIND_M, near_m + AHEAD_M)
+    place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
         motion.y_m,

@@ -54,7 +54,7 @@ MAX_SPEED_M_S = MAX_SPEED_PX * METERS_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
 """Approximate maximum turn of a drifting car's course in a step at top speed; more if slower."""
 
-BEHIND_M, AHEAD_M = 4.0, 8.0
+BACK_M, AHEAD_M = 4.0, 8.0
 """Search window of the nearest path point, relative to the last one."""
 
 CORNER_PX_2 = 0.25 * (CAR_LENGTH_PX**2 + CAR_WIDTH_PX**2)
@@ -114,7 +114,7 @@ def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Ca
     x_px = car.x_px + speed_px * math.cos(course_rad)
     y_px = car.y_px + speed_px * math.sin(course_rad)
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
-    place = project(track.path, x_m, y_m, car.along_m - BEHIND_M, car.along_m + AHEAD_M)
+    place = project(track.path, x_m, y_m, car.along_m - BACK_M, car.along_m + AHEAD_M)
     moved = Car(
         x_px,
         y_px,

@@ -318,7 +318,7 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "reported"),
     [
         (["record", "lan", "--steps", "5", "--out", "x"], 2, "did you mean lane?"),
         (["record", "CartPol-v1", "--steps", "5", "--out", "x"], 2, "CartPole-v1"),
@@ -368,11 +368,11 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )  # fmt: skip
 def test_mistakes_are_one_line(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, told: str
+    capsys: pytest.CaptureFixture[str], arguments: list[str], code: int, reported: str
 ) -> None:
     Path("taken").write_text("not a log")
     Path("empty.mcap").touch()
-    assert told in fails(capsys, code, *arguments)
+    assert reported in fails(capsys, code, *arguments)
     assert Path("taken").read_text() == "not a log"
 
 

@@ -22,7 +22,7 @@ from gymnasium.vector import SyncVectorEnv
 
 import mcaprl
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import Told, play
+from tests.support.faults import KnownEpisodes, play
 from tests.support.recordings import MIXED_SPACE, ScriptedEnv, leaves_of, record
 
 FOLDER = Path(__file__).parent
@@ -71,7 +71,7 @@ def recovered(path: Path, *, keep_unfinished: bool) -> None:
 
 def of_a_vector(path: Path) -> None:
     """Record a vector of two environments, with `/rl/learner`."""
-    envs = SyncVectorEnv([Told, Told])
+    envs = SyncVectorEnv([KnownEpisodes, KnownEpisodes])
     env = mcaprl.RecordVecMcap(envs, path, policy_version=3, epsilon=0.5, start_time_ns=START_NS)
     with closing(env):
         env.reset(seed=4)
@@ -92,9 +92,9 @@ def with_scene(path: Path) -> None:
             env.step(0)
 
 
-def told(path: Path) -> None:
+def reported(path: Path) -> None:
     """Run one episode of the environment whose values are all known."""
-    with closing(mcaprl.RecordMcap(Told(), path, start_time_ns=START_NS)) as env:
+    with closing(mcaprl.RecordMcap(KnownEpisodes(), path, start_time_ns=START_NS)) as env:
         play(env)
 
 
@@ -139,7 +139,7 @@ FILES: dict[str, Callable[[Path], None]] = {
     "recovered-unfinished": partial(recovered, keep_unfinished=True),
     "vector-of-environments": of_a_vector,
     "lane-with-scene": with_scene,
-    "told": told,
+    "reported": reported,
     "short-episodes": short_episodes,
 }
 

@@ -1,4 +1,4 @@
-// Connects to a live server as a viewer does, does what it is told, and prints what it got as JSON.
+// Connects to a live server as a viewer does, does what it is printed, and prints what it got as JSON.
 // usage: node viewer.mjs URL '[["seek", "NANOSECONDS"], ["play", 2.0, COUNT], ["episode", K], ...]'
 import protocol from "@foxglove/ws-protocol";
 import { createHash } from "node:crypto";

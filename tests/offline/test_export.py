@@ -28,11 +28,11 @@ except ImportError:
 
 TINY: dict[str, Any] = {"updates": 1, "batch_size": 4, "hidden": (16, 8)}
 VECTOR = spaces.Box(-5, 5, (3,), np.float32)
-PICTURE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
+IMAGE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
 MIXED = spaces.Dict(
     {
         "action_mask": spaces.MultiBinary(4),
-        "camera": PICTURE,
+        "camera": IMAGE,
         "gear": spaces.Discrete(3, start=-1),
         "state": spaces.Box(-5, 5, (2, 2), np.float64),
         "switches": spaces.MultiDiscrete([2, 3]),
@@ -42,8 +42,8 @@ CASES = [
     (DQNConfig(**TINY, normalize=True), VECTOR),
     (DQNConfig(**TINY, n_quantiles=3, dueling=True), VECTOR),
     (BCQConfig(**TINY), VECTOR),
-    (BCConfig(**TINY, frame_stack=2), PICTURE),
-    (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), PICTURE),
+    (BCConfig(**TINY, frame_stack=2), IMAGE),
+    (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), IMAGE),
     (DQNConfig(**TINY), MIXED),
 ]
 

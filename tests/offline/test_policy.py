@@ -146,26 +146,26 @@ def test_every_kind_of_network_can_be_loaded(tmp_path: Path, config: TrainingCon
 
 
 def test_normalized_images_can_be_loaded(tmp_path: Path) -> None:
-    pictures = np.random.default_rng(0).integers(90, 110, (9, 36, 36, 1), dtype=np.uint8)
+    images = np.random.default_rng(0).integers(90, 110, (9, 36, 36, 1), dtype=np.uint8)
     dataset = Dataset.from_arrays(
-        observations=pictures[:-1],
+        observations=images[:-1],
         actions=np.arange(8) % 2,
         rewards=np.ones(8),
         terminated=np.arange(8) == 7,
         truncated=np.zeros(8, bool),
-        next_observations=pictures[1:],
+        next_observations=images[1:],
     )
     learner = learner_of(DQNConfig(**TINY, frame_stack=2, normalize=True), dataset)
     policy = saved_and_loaded(tmp_path, learner)
-    stacks = np.stack([pictures[:-1], pictures[1:]], 1)
+    stacks = np.stack([images[:-1], images[1:]], 1)
     codes = stacks[..., 0].transpose(0, 2, 3, 1).astype(np.float32)
-    mean = pictures.astype(np.float64).mean(0)
-    centred = (codes - mean) / np.sqrt(np.square(pictures - mean).mean())
+    mean = images.astype(np.float64).mean(0)
+    centered = (codes - mean) / np.sqrt(np.square(images - mean).mean())
     network = learner.network("q", 0)
     convolutions, *layers = cast(torch.nn.Sequential, network.stems[0])
     with torch.no_grad():
         seen = cast(NatureConvolutions, convolutions).layers(
-            torch.from_numpy(centred).permute(0, 3, 1, 2).float()
+            torch.from_numpy(centered).permute(0, 3, 1, 2).float()
         )
         expected = network.head(network.body(torch.nn.Sequential(*layers)(seen)))
     np.testing.assert_allclose(policy.q_values(stacks), expected, rtol=1e-4, atol=1e-5)

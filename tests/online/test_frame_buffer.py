@@ -15,8 +15,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from mcaprl.online.frame_buffer import FrameReplayBuffer
 from mcaprl.online.frames import FrameMemory, stacked_space
 
-PICTURE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
-DICT = spaces.Dict({"picture": PICTURE, "vector": spaces.Box(-1, 1, (3,))})
+IMAGE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
+DICT = spaces.Dict({"image": IMAGE, "vector": spaces.Box(-1, 1, (3,))})
 ACTIONS = spaces.Discrete(4)
 
 
@@ -69,9 +69,9 @@ def check_same(ours: Any, theirs: Any) -> None:
 
 @given(steps=st.integers(1, 60), envs=st.integers(1, 3), seed=st.integers(0, 99))
 def test_samples_equal_those_of_sb3s_buffer(steps: int, envs: int, seed: int) -> None:
-    ours = FrameReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
-    theirs = ReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs)
-    feed([ours, theirs], PICTURE, steps, envs, seed)
+    ours = FrameReplayBuffer(20 * envs, IMAGE, ACTIONS, "cpu", envs)
+    theirs = ReplayBuffer(20 * envs, IMAGE, ACTIONS, "cpu", envs)
+    feed([ours, theirs], IMAGE, steps, envs, seed)
     check_same(ours, theirs)
 
 
@@ -85,9 +85,9 @@ def test_n_step_samples_equal_those_of_sb3s_buffer(
     steps: int, envs: int, n_steps: int, seed: int
 ) -> None:
     extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
-    ours = FrameReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs, **extra)
-    theirs = NStepReplayBuffer(20 * envs, PICTURE, ACTIONS, "cpu", envs, **extra)
-    feed([ours, theirs], PICTURE, steps, envs, seed)
+    ours = FrameReplayBuffer(20 * envs, IMAGE, ACTIONS, "cpu", envs, **extra)
+    theirs = NStepReplayBuffer(20 * envs, IMAGE, ACTIONS, "cpu", envs, **extra)
+    feed([ours, theirs], IMAGE, steps, envs, seed)
     check_same(ours, theirs)
 
 
@@ -128,16 +128,16 @@ class Stacking:
 def test_stacks_equal_those_of_sb3s_buffer(
     steps: int, envs: int, n_steps: int, count: int, seed: int
 ) -> None:
-    shown = stacked_space(PICTURE, count)
+    shown = stacked_space(IMAGE, count)
     extra: dict[str, Any] = {"n_steps": n_steps, "gamma": 0.9}
     ours = FrameReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra, frame_stack=count)
     theirs = NStepReplayBuffer(20 * envs, shown, ACTIONS, "cpu", envs, **extra)
-    assert ours.frames[""].shape[2:] == PICTURE.shape
-    feed([Stacking(b, PICTURE, count) for b in (ours, theirs)], PICTURE, steps, envs, seed)
+    assert ours.frames[""].shape[2:] == IMAGE.shape
+    feed([Stacking(b, IMAGE, count) for b in (ours, theirs)], IMAGE, steps, envs, seed)
     check_same(ours, theirs)
 
 
-@pytest.mark.parametrize("space", [PICTURE, DICT], ids=["picture", "dict"])
+@pytest.mark.parametrize("space", [IMAGE, DICT], ids=["image", "dict"])
 @pytest.mark.parametrize("steps", [7, 50])
 def test_a_saved_buffer_can_be_restored(space: spaces.Space[Any], steps: int) -> None:
     first = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, n_steps=3, gamma=0.9)
@@ -152,7 +152,7 @@ def test_a_saved_buffer_can_be_restored(space: spaces.Space[Any], steps: int) ->
 
 def test_overwritten_frames_are_replaced_by_the_oldest() -> None:
     """Four rows; frames count up, and one episode goes on."""
-    shown = stacked_space(PICTURE, 3)
+    shown = stacked_space(IMAGE, 3)
     buffer = FrameReplayBuffer(4, shown, ACTIONS, "cpu", 1, frame_stack=3)
     frames = np.arange(7, dtype=np.uint8)[:, None, None, None, None] * np.ones((1, 1, 6, 6))
     for now, following in itertools.pairwise(frames):
@@ -169,9 +169,9 @@ def test_overwritten_frames_are_replaced_by_the_oldest() -> None:
 
 
 def test_a_frame_is_stored_once() -> None:
-    ours = FrameReplayBuffer(1_000, PICTURE, ACTIONS, "cpu", 1)
-    theirs = ReplayBuffer(1_000, PICTURE, ACTIONS, "cpu", 1)
-    feed([ours, theirs], PICTURE, 300, 1, 0)
+    ours = FrameReplayBuffer(1_000, IMAGE, ACTIONS, "cpu", 1)
+    theirs = ReplayBuffer(1_000, IMAGE, ACTIONS, "cpu", 1)
+    feed([ours, theirs], IMAGE, 300, 1, 0)
     kept = sum(part.nbytes for part in (*ours.frames.values(), *ours.finals.values()))
     twice = theirs.observations.nbytes + theirs.next_observations.nbytes
     assert kept < 0.6 * twice

@@ -152,7 +152,7 @@ def test_a_stacking_offline_policy_initializes_an_agent(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [{}, {"observation": "depth"}])
 def test_a_run_with_frames_is_resumed(tmp_path: Path, options: dict[str, Any]) -> None:
-    """Weights, the optimiser's moments and the frames come back, pictures' among them."""
+    """Weights, the optimiser's moments and the frames come back, images' among them."""
     first = agent(tmp_path, options)
     with closing(first):
         first.learn(silent)

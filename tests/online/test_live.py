@@ -44,7 +44,7 @@ def silent(_: TrainingProgress) -> None:
 
 
 class Clock:
-    """Seconds that pass when they are told to."""
+    """Seconds that pass when they are reported to."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -132,7 +132,7 @@ def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
     assert {counts[topic] for topic in each_step | shown} == {100}
     assert counts["/scene/static"] >= 1
     steps, learner = decoded(seen, "/rl/step"), decoded(seen, "/rl/learner")
-    log, told = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
+    log, reported = mcaprl.open(tmp_path / "log.mcap"), read_learner(tmp_path / "log.mcap")
     # Episodes are logged at their ends: find the first environment's by its observations.
     places = {row.tobytes(): i for i, row in enumerate(log.observations)}
     rows = [places[observation.tobytes()] for observation in steps["observation"]]
@@ -140,8 +140,8 @@ def test_a_viewer_receives_what_is_recorded(tmp_path: Path) -> None:
         np.testing.assert_array_equal(steps[name], column[rows], err_msg=name)
     np.testing.assert_array_equal(steps["action"], log.actions[rows])
     np.testing.assert_array_equal(steps["terminated"], log.terminated[rows])
-    np.testing.assert_array_equal(learner["epsilon"], told.epsilon[rows])
-    np.testing.assert_array_equal(learner["policy_version"], told.policy_version[rows])
+    np.testing.assert_array_equal(learner["epsilon"], reported.epsilon[rows])
+    np.testing.assert_array_equal(learner["policy_version"], reported.policy_version[rows])
     ends = [base64.b64decode(m["bytes"]) for m in seen["messages"] if m["topic"] == "/rl/episode"]
     assert len(ends) == len(np.flatnonzero(steps["terminated"][:-1]))
     first = messages.decode(ends[0], messages.EPISODE_TYPE)
@@ -212,9 +212,9 @@ def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = tmp_path / "run"
     arguments = ["train-online", "lane", *short, "--out", str(out), "--live", "--port", "0"]
     assert run(arguments) == 0
-    told = capsys.readouterr().out
-    assert "ws://127.0.0.1:" in told
-    assert f"layout to import: {out / 'foxglove-layout.json'}" in told
+    reported = capsys.readouterr().out
+    assert "ws://127.0.0.1:" in reported
+    assert f"layout to import: {out / 'foxglove-layout.json'}" in reported
     assert (out / "foxglove-layout.json").exists()
 
 

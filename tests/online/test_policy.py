@@ -55,7 +55,7 @@ def observations_of(space: spaces.Space[Any], count: int = 20) -> Any:
 
 
 def rewrite(path: Path, out: Path, **members: bytes | None) -> Path:
-    """A copy of a zip with other contents; None leaves a member out. `_pth` stands for `.pth`."""
+    """A copy of a zip with other contents; None leaves a member out. `_pth` means `.pth`."""
     changed = {
         name.replace("_pth", ".pth").replace("_json", ".json"): c for name, c in members.items()
     }
@@ -167,7 +167,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
     }
     text = json.dumps(bombed).encode()
     read_policy(rewrite(path, tmp_path / "data.zip", data=text))
-    read_policy(rewrite(path, tmp_path / "bare.zip", data=text, mcaprl_json=None))
+    read_policy(rewrite(path, tmp_path / "plain.zip", data=text, mcaprl_json=None))
     weights = io.BytesIO()
     torch.save({"q_net.q_net.0.weight": Bomb()}, weights)
     with pytest.raises(PolicyError, match="not plain tensors"):

@@ -98,8 +98,8 @@ def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) ->
     np.testing.assert_array_equal(log.rewards.astype(np.float32), stored["rewards"])
     np.testing.assert_array_equal(log.terminated, (stored["dones"] * (1 - stored["timeouts"])) == 1)
     timeouts = [episode.truncated[-1] for episode in log.episodes]
-    told = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
-    assert timeouts == told
+    reported = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
+    assert timeouts == reported
 
 
 def test_the_log_can_be_trained_on_offline(tmp_path: Path) -> None:

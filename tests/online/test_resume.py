@@ -166,7 +166,7 @@ def test_a_killed_run_continues(tmp_path: Path) -> None:
     logged = len(GrowingLogs([log]).dataset)
     (summary,) = train(task, tmp_path / "run", record=log, resume=True, progress=silent)
     assert (summary.resumed_at, summary.steps) == (800, 2_000)
-    # What was logged before the kill is there, and behind it what was done since.
+    # The log has the steps before the kill, followed by those after it.
     assert 800 < logged <= 1_000
     assert len(mcaprl.open(log)) == logged + 1_200
     assert (tmp_path / "log.mcap.damaged").exists()

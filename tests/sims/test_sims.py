@@ -52,7 +52,7 @@ seeds = st.integers(0, 2**32 - 1)
 choices = st.lists(st.integers(0, 2**16), min_size=1, max_size=30)
 
 
-def bare(name: str, kwargs: dict[str, Any]) -> Any:
+def unwrapped(name: str, kwargs: dict[str, Any]) -> Any:
     """Return the sim without wrappers."""
     return make_sim(name, **kwargs).unwrapped
 
@@ -84,8 +84,8 @@ def trace(env: gym.Env[Any, Any], seed: int, actions: list[int]) -> Trace:
 def test_the_checkers_of_gymnasium_and_sb3_pass(name: str, kwargs: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(bare(name, kwargs))
-        check_env_of_sb3(bare(name, kwargs))
+        check_env(unwrapped(name, kwargs))
+        check_env_of_sb3(unwrapped(name, kwargs))
 
 
 @every_sim
@@ -94,7 +94,7 @@ def test_the_checkers_of_gymnasium_and_sb3_pass(name: str, kwargs: dict[str, Any
 def test_seed_and_actions_determine_every_bit(
     name: str, kwargs: dict[str, Any], seed: int, chosen: list[int]
 ) -> None:
-    first, second = bare(name, kwargs), bare(name, kwargs)
+    first, second = unwrapped(name, kwargs), unwrapped(name, kwargs)
     actions = actions_of(first, chosen)
     assert trace(first, seed, actions) == trace(second, seed, actions)
     assert trace(first, seed, actions) == trace(second, seed, actions), "an episode later"
@@ -103,7 +103,7 @@ def test_seed_and_actions_determine_every_bit(
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 @pytest.mark.parametrize("name", BATCHED)
 def test_a_copy_continues_independently(name: str, copied: Callable[[Any], Any]) -> None:
-    first = bare(name, {})
+    first = unwrapped(name, {})
     first.reset(seed=1)
     for action in (1, 2, 1):
         first.step(action)
@@ -117,7 +117,7 @@ def test_a_copy_continues_independently(name: str, copied: Callable[[Any], Any])
 
 @every_sim
 def test_seeds_differ_and_episodes_of_one_seed_too(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     starts = [sim.reset(seed=0)[0], sim.reset(seed=1)[0], sim.reset()[0]]
     assert len({as_bytes(start) for start in starts}) == 3
 
@@ -128,7 +128,7 @@ def test_seeds_differ_and_episodes_of_one_seed_too(name: str, kwargs: dict[str, 
 def test_observations_are_in_the_space_to_the_very_end(
     name: str, kwargs: dict[str, Any], seed: int, chosen: list[int]
 ) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     observation, _ = sim.reset(seed=seed)
     assert sim.observation_space.contains(observation)
     for action in actions_of(sim, chosen):
@@ -140,7 +140,7 @@ def test_observations_are_in_the_space_to_the_very_end(
 
 @every_sim
 def test_an_observation_is_a_copy(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     first, _ = sim.reset(seed=0)
     kept = as_bytes(first)
     sim.step(1)
@@ -149,7 +149,7 @@ def test_an_observation_is_a_copy(name: str, kwargs: dict[str, Any]) -> None:
 
 @every_sim
 def test_every_end_has_one_cause_and_a_reason(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     sim.action_space.seed(0)
     for seed in range(10):
         sim.reset(seed=seed)
@@ -164,7 +164,7 @@ def test_every_end_has_one_cause_and_a_reason(name: str, kwargs: dict[str, Any])
 
 @every_sim
 def test_every_shape_can_be_drawn(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     sim.reset(seed=0)
     names = [shape.name for shape in sim.scene()]
     sim.step(1)
@@ -178,7 +178,7 @@ def test_every_shape_can_be_drawn(name: str, kwargs: dict[str, Any]) -> None:
 
 @every_sim
 def test_names_and_metadata_fit_the_sim(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     sim.reset(seed=0)
     assert len(sim.action_meanings) == sim.action_space.n
     if sim.observation_names:
@@ -215,7 +215,7 @@ def test_each_sim_has_a_time_limit_and_a_pilot(name: str) -> None:
 
 @every_sim
 def test_an_invalid_action_is_refused(name: str, kwargs: dict[str, Any]) -> None:
-    sim = bare(name, kwargs)
+    sim = unwrapped(name, kwargs)
     sim.reset(seed=0)
     last = int(sim.action_space.n) - 1
     for action in (-1, last + 1):
@@ -230,7 +230,7 @@ def test_an_invalid_action_is_refused(name: str, kwargs: dict[str, Any]) -> None
 @pytest.mark.parametrize("argument", ["rules", "observation", "start"])
 def test_an_unknown_value_is_refused_with_the_known_ones(name: str, argument: str) -> None:
     with pytest.raises(UnknownNameError, match=f"unknown {argument} 'nonsense': .*known: "):
-        bare(name, {argument: "nonsense"})
+        unwrapped(name, {argument: "nonsense"})
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_an_unknown_value_is_refused_with_the_known_ones(name: str, argument: st
 @pytest.mark.parametrize("name", ON_THE_GROUND)
 def test_a_bad_pose_is_refused(name: str, options: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        bare(name, {}).reset(options=options)
+        unwrapped(name, {}).reset(options=options)
 
 
 def test_importing_the_sims_loads_no_engine() -> None:

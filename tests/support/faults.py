@@ -32,13 +32,13 @@ def tell(fault: str, **figures: Any) -> None:
             file.write(f"{fault}: {line}\n")
 
 
-class Told(gym.Env[Any, Any]):
+class KnownEpisodes(gym.Env[Any, Any]):
     """Environment whose episode k has 5 + 7k % 40 steps; all values follow from k and the step."""
 
     observation_space = spaces.Dict(
         {
             "x": spaces.Box(-np.inf, np.inf, (3,), np.float32),
-            "picture": spaces.Box(0, 255, (8, 8), np.uint8),
+            "image": spaces.Box(0, 255, (8, 8), np.uint8),
         }
     )
     action_space = spaces.Discrete(4)
@@ -66,7 +66,7 @@ def observation_of(episode: int, step: int) -> dict[str, Any]:
     """Return the observation after `step` steps."""
     return {
         "x": np.array([episode, step, np.sin(episode + step)], np.float32),
-        "picture": np.full((8, 8), (31 * episode + step) % 256, np.uint8),
+        "image": np.full((8, 8), (31 * episode + step) % 256, np.uint8),
     }
 
 
@@ -85,13 +85,13 @@ def play(env: Any) -> None:
 
 def write_log(path: Path, episodes: int, **options: Any) -> None:
     """Record episodes from the first one on."""
-    env = mcaprl.RecordMcap(Told(), path, start_time_ns=10**18, **options)
+    env = mcaprl.RecordMcap(KnownEpisodes(), path, start_time_ns=10**18, **options)
     for _ in range(episodes):
         play(env)
     env.close()
 
 
-def assert_is_told(episode: Episode) -> None:
+def assert_is_known(episode: Episode) -> None:
     """Check that an episode equals the recorded one bit for bit."""
     number = episode.summary.episode
     length = length_of(number)

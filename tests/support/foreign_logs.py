@@ -179,7 +179,7 @@ MCAP_OPTIONS: dict[str, dict[str, Any]] = {
     "schemas-in-chunks": {"repeat_schemas": False},
     "unchunked": {"use_chunking": False},
     "unchunked-with-crc": {"use_chunking": False, "enable_data_crcs": True},
-    "bare": {
+    "plain": {
         "index_types": IndexType.NONE,
         "repeat_channels": False,
         "repeat_schemas": False,

@@ -33,7 +33,7 @@ def try_bytes(data: bytes) -> None:
             assert len(dataset) == len(dataset.rewards)
             assert len(dataset.next_observations) == len(dataset.observations)
         except McaprlError:
-            assert problems, "what cannot be read has a problem that is told"
+            assert problems, "what cannot be read has a problem that is reported"
         try:
             recovery = recover_log(path, out, overwrite=True)
         except McaprlError:
@@ -44,15 +44,15 @@ def try_bytes(data: bytes) -> None:
 
 def without_crcs(data: bytes) -> bytes:
     """Return the log without CRCs."""
-    bare = bytearray(data)
+    plain = bytearray(data)
     for start, opcode, length in records_of(data):
         if opcode == Opcode.CHUNK:
-            struct.pack_into("<I", bare, start + 9 + 24, 0)
+            struct.pack_into("<I", plain, start + 9 + 24, 0)
         elif opcode == Opcode.DATA_END:
-            struct.pack_into("<I", bare, start + 9, 0)
+            struct.pack_into("<I", plain, start + 9, 0)
         elif opcode == Opcode.FOOTER:
-            struct.pack_into("<I", bare, start + length - 4, 0)
-    return bytes(bare)
+            struct.pack_into("<I", plain, start + length - 4, 0)
+    return bytes(plain)
 
 
 def write_seeds(folder: Path) -> None:
@@ -66,7 +66,7 @@ def write_seeds(folder: Path) -> None:
             path = folder / f"{name}-{compression}"
             record(path, space, spaces.Discrete(2), [2, 1], compression=compression, overwrite=True)
             data = path.read_bytes()
-            (folder / f"{path.name}-bare").write_bytes(without_crcs(data))
+            (folder / f"{path.name}-plain").write_bytes(without_crcs(data))
             # Without a summary, the reader scans the file.
             end = next(start for start, opcode, _ in records_of(data) if opcode == Opcode.DATA_END)
             (folder / f"{path.name}-cut").write_bytes(without_crcs(data)[:end])

@@ -76,7 +76,7 @@ def bombed(data: bytes, chance: random.Random) -> bytes:
 
 def reordered(data: bytes, chance: random.Random) -> bytes:
     """Shuffle the records and remove the summary."""
-    records = [record for record in records_of(data) if record[1] not in _BEHIND]
+    records = [record for record in records_of(data) if record[1] not in _SUMMARY_RECORDS]
     if chance.random() < 0.5:
         chance.shuffle(records)
     else:
@@ -95,7 +95,7 @@ def _joined(data: bytes, records: list[tuple[int, int, int]]) -> bytes:
     return b"".join(data[start : start + length] for start, _, length in records)
 
 
-_BEHIND = (
+_SUMMARY_RECORDS = (
     Opcode.DATA_END,
     Opcode.STATISTICS,
     Opcode.CHUNK_INDEX,

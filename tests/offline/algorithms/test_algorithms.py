@@ -346,7 +346,7 @@ def test_a_loss_that_is_not_finite_is_reported_and_changes_no_weights() -> None:
 
 
 def test_image_observations_are_learned_from() -> None:
-    # The brighter of two pictures asks for action 1.
+    # The brighter of two images asks for action 1.
     images: NDArray[np.uint8] = np.zeros((40, 36, 36), np.uint8)
     images[::2] = 200
     dataset = Dataset.from_arrays(

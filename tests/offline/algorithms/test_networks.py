@@ -18,9 +18,9 @@ def vectors(rows: int, width: int, seed: int = 0) -> Observations:
     return Observations(torch.randn(rows, width, generator=torch.Generator().manual_seed(seed)))
 
 
-def pictures(rows: int, *shapes: tuple[int, ...], width: int = 0) -> Observations:
-    images = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
-    return Observations(torch.randn(rows, width), tuple(images))
+def images(rows: int, *shapes: tuple[int, ...], width: int = 0) -> Observations:
+    parts = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
+    return Observations(torch.randn(rows, width), tuple(parts))
 
 
 def weights_of(network: torch.nn.Module) -> list[tuple[int, ...]]:
@@ -56,7 +56,7 @@ def test_the_number_of_channels_is_configurable() -> None:
 @pytest.mark.parametrize("shape", [(84, 84, 1), (36, 48, 3)])
 def test_images_go_through_convolutions(shape: tuple[int, ...]) -> None:
     network = Network(0, [ImageInput(shape)], (4,), Architecture((16,)))
-    assert network(pictures(2, shape)).shape == (2, 4)
+    assert network(images(2, shape)).shape == (2, 4)
 
 
 def test_images_and_vector_are_joined_after_one_layer_each() -> None:
@@ -64,7 +64,7 @@ def test_images_and_vector_are_joined_after_one_layer_each() -> None:
         3, [ImageInput((36, 36, 1)), ImageInput((40, 36, 2))], (4,), Architecture((8, 6))
     )
     assert weights_of(network.body) == [(6, 24)]
-    both = pictures(2, (36, 36, 1), (40, 36, 2), width=3)
+    both = images(2, (36, 36, 1), (40, 36, 2), width=3)
     assert network(both).shape == (2, 4)
     for part in (*both.images, both.vector):
         before = network(both)

@@ -83,7 +83,7 @@ def test_n_step_returns_by_hand() -> None:
     # Rewards 1, 2, 4 and 1, 2: two of them each, as far as the episode goes.
     assert batch.rewards.tolist() == [1 + 0.5 * 2, 2 + 0.5 * 4, 4, 1 + 0.5 * 2, 2]
     assert batch.next_observations.vector.flatten().tolist() == [2, 3, 3, 12, 12]
-    # Behind the first episode there is nothing; the second was only cut off.
+    # The first episode terminated; the second was truncated.
     assert batch.discounts.tolist() == [0.25, 0, 0, 0.25, 0.5]
 
 

@@ -1,4 +1,4 @@
-"""Observations of any space as one vector, pictures and an action mask."""
+"""Observations of any space as one vector, images and an action mask."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ def test_uint8_vectors_are_scaled_to_one() -> None:
 
 def test_images_stay_bytes_and_get_a_channel_axis() -> None:
     space = spaces.Box(0, 255, (36, 40), np.uint8)
-    pictures = batch(space, 2)
-    seen = ObservationEncoder(space, 2).encode(pictures)
+    images = batch(space, 2)
+    seen = ObservationEncoder(space, 2).encode(images)
     assert seen.vector.shape == (2, 0)
     assert seen.images[0].shape == (2, 36, 40, 1)
-    assert np.array_equal(seen.images[0].numpy()[..., 0], pictures)
+    assert np.array_equal(seen.images[0].numpy()[..., 0], images)
 
 
 def test_a_dict_becomes_a_vector_and_images() -> None:
@@ -116,10 +116,10 @@ def test_a_constant_column_becomes_zero_and_new_values_stay_finite(constant: flo
 
 def test_images_are_centered_and_scaled_by_one_number() -> None:
     encoder = ObservationEncoder(CAR, 2)
-    pictures = np.zeros((4, 36, 40, 1), np.uint8)
-    pictures[:, 0, 0, 0] = [10, 10, 30, 30]
-    pictures[:, 1, 1] = 255
-    observations = {**batch(CAR, 4), "camera": pictures}
+    images = np.zeros((4, 36, 40, 1), np.uint8)
+    images[:, 0, 0, 0] = [10, 10, 30, 30]
+    images[:, 1, 1] = 255
+    observations = {**batch(CAR, 4), "camera": images}
     encoder.normalize_to(observations)
     (image,) = encoder.image_inputs
     assert image.shift is not None

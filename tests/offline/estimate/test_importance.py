@@ -99,10 +99,14 @@ def tables(draw: st.DrawFn) -> EpisodeTable:
 @given(tables())
 def test_doubly_robust_without_a_model_is_per_decision_bit_for_bit(table: EpisodeTable) -> None:
     nothing = np.zeros_like(table.rewards)
-    bare = EpisodeTable(table.rewards, table.ratios, nothing, nothing, table.gamma)
+    without_model = EpisodeTable(table.rewards, table.ratios, nothing, nothing, table.gamma)
     counts = np.ones((1, len(table.rewards)))
-    assert ESTIMATORS["DR"](bare).values(counts) == ESTIMATORS["PDIS"](bare).values(counts)
-    assert ESTIMATORS["WDR"](bare).values(counts) == ESTIMATORS["WPDIS"](bare).values(counts)
+    assert ESTIMATORS["DR"](without_model).values(counts) == ESTIMATORS["PDIS"](
+        without_model
+    ).values(counts)
+    assert ESTIMATORS["WDR"](without_model).values(counts) == ESTIMATORS["WPDIS"](
+        without_model
+    ).values(counts)
 
 
 @given(tables())

@@ -74,8 +74,8 @@ def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
     for name in ("WPDIS", "DR", "WDR"):
         found = [ESTIMATORS[name](table) for table in tables]
         spread = np.std([one.values(once)[0] for one in found])
-        told = np.sqrt(np.mean([one.errors(once)[0] ** 2 for one in found]))
-        assert told == pytest.approx(spread, rel=4 / np.sqrt(2 * logs))
+        reported = np.sqrt(np.mean([one.errors(once)[0] ** 2 for one in found]))
+        assert reported == pytest.approx(spread, rel=4 / np.sqrt(2 * logs))
 
 
 def test_intervals_have_their_nominal_coverage() -> None:

@@ -128,10 +128,10 @@ def test_tensorboard_shows_the_same_curve(tmp_path: Path) -> None:
 
 
 def test_progress_is_reported_at_each_log_interval(tmp_path: Path) -> None:
-    told: list[TrainingProgress] = []
-    train(corridor(), SHORT_CQL, tmp_path / "run", progress=told.append)
-    assert [now.done for now in told] == list(range(10, 101, 10))
-    assert all(now.total == 100 and now.terms["loss"] > 0 for now in told)
+    reported: list[TrainingProgress] = []
+    train(corridor(), SHORT_CQL, tmp_path / "run", progress=reported.append)
+    assert [now.done for now in reported] == list(range(10, 101, 10))
+    assert all(now.total == 100 and now.terms["loss"] > 0 for now in reported)
 
 
 @pytest.mark.parametrize(
@@ -412,7 +412,7 @@ def test_other_data_are_accepted_on_request(tmp_path: Path) -> None:
     )
     assert summary.resumed_at == 40
     assert json.loads((tmp_path / "run" / "config.json").read_text())["data"] == other.fingerprint
-    # The weights are used to the old normalisation.
+    # The weights fit the old normalization.
     after = read_policy(tmp_path / "run" / "seed-0").encoder
     assert np.array_equal(before.shift, after.shift)
     train(other, config, tmp_path / "run", resume=True, progress=silent)

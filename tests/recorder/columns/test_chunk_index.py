@@ -56,7 +56,7 @@ def test_chunk_indexes_equal_those_of_the_library(chunk: ChunkIndex, after: byte
 def test_indexes_missing_from_the_summary_are_found(log_path: Path, every: int) -> None:
     record(log_path, MIXED_SPACE, spaces.Discrete(2), [5, 1, 30])
     reader = McapReader(log_path)
-    told = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
+    reported = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
     chunks = [
         replace(chunk, message_index_offsets={}, message_index_length=0)
         if number % every == 0
@@ -68,7 +68,7 @@ def test_indexes_missing_from_the_summary_are_found(log_path: Path, every: int) 
     log_path.write_bytes(data + summary.to_bytes(len(data)))
     assert McapReader(log_path).chunks != reader.chunks
     found = [mcaprl.open(log_path), mcaprl.open(log_path, episodes=1)]
-    assert [data.fingerprint for data in found] == [data.fingerprint for data in told]
+    assert [data.fingerprint for data in found] == [data.fingerprint for data in reported]
 
 
 def test_they_are_sorted_by_offset(log_path: Path) -> None:

@@ -22,7 +22,7 @@ from mcaprl.recorder.columns import compact, file_lock
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
 from tests.recorder.repair.test_faults_writes import FailingFile, failing
-from tests.support.faults import Told, assert_is_told, play, write_log
+from tests.support.faults import KnownEpisodes, assert_is_known, play, write_log
 from tests.support.paths import ROOT
 from tests.support.recordings import MIXED_SPACE, record
 
@@ -129,7 +129,7 @@ def test_each_write_of_the_compaction_fails(log_path: Path) -> None:
         episodes = mcaprl.open(log_path).episodes
         assert len(episodes) == 6
         for episode in episodes:
-            assert_is_told(episode)
+            assert_is_known(episode)
         if done:
             finished = writes
             break
@@ -189,14 +189,14 @@ def test_killed_while_compacting(log_path: Path, writes: int) -> None:
     episodes = mcaprl.open(log_path).episodes
     assert [episode.summary.episode for episode in episodes] == list(range(7))
     for episode in episodes:
-        assert_is_told(episode)
+        assert_is_known(episode)
 
 
 def append(path: Path, episodes: int, *, first: int) -> None:
     """Append episodes whose numbers start at `first`."""
-    told = Told()
-    told.episode = first - 1
-    env = mcaprl.RecordMcap(told, path, append=True)
+    reported = KnownEpisodes()
+    reported.episode = first - 1
+    env = mcaprl.RecordMcap(reported, path, append=True)
     for _ in range(episodes):
         play(env)
     env.close()
@@ -265,7 +265,7 @@ def test_links_and_modes_stay(tmp_path: Path) -> None:
 
 def test_a_file_that_was_moved_away_is_left_alone(tmp_path: Path) -> None:
     """Its path may be another recording's now."""
-    env = mcaprl.RecordMcap(Told(), tmp_path / "a.mcap")
+    env = mcaprl.RecordMcap(KnownEpisodes(), tmp_path / "a.mcap")
     for _ in range(6):
         play(env)
     os.replace(tmp_path / "a.mcap", tmp_path / "b.mcap")
@@ -283,4 +283,4 @@ def test_parts_of_a_rotated_log_are_compacted(tmp_path: Path) -> None:
     assert all(len(McapReader(part).chunks) <= 6 for part in parts)
     for number, episode in enumerate(mcaprl.open(tmp_path).episodes):
         assert episode.summary.episode == number
-        assert_is_told(episode)
+        assert_is_known(episode)

@@ -48,12 +48,12 @@ def assert_reads(path: Path, steps: Steps = STEPS, *, lengths: list[int] = LENGT
     """Check that the file contains these transitions, and spaces that contain them."""
     data = mcaprl.open(path)
     fields, actual = steps.fields, steps.actual
-    behind = np.roll(actual, 1)
+    following = np.roll(actual, 1)
     assert [episode.length for episode in data.episodes] == lengths
     assert_same_bits(data.rewards, fields["reward"][actual])
     assert_same_bits(data.actions, fields["action"][actual])
     assert_same_bits(data.observations, fields["observation"][actual])
-    assert_same_bits(data.next_observations, fields["observation"][behind])
+    assert_same_bits(data.next_observations, fields["observation"][following])
     assert_same_bits(data.terminated, fields["terminated"][actual])
     times = np.concatenate([episode.log_time_ns for episode in data.episodes])
     assert_same_bits(times, steps.times)
@@ -75,7 +75,7 @@ def test_variable_messages(log_path: Path, text_of: Any, big_endian: bool) -> No
     messages = variable_messages(STEPS, text_of, big_endian=big_endian)
     write_with_mcap(log_path, messages, VARIABLE)
     assert_reads(log_path)
-    assert np.isnan(mcaprl.open(log_path).behavior_probs).all(), "not told"
+    assert np.isnan(mcaprl.open(log_path).behavior_probs).all(), "not reported"
 
 
 def test_big_endian(log_path: Path) -> None:
@@ -187,10 +187,10 @@ def test_images_of_another_writer(log_path: Path) -> None:
     text = messages.definition("sensor_msgs/msg/Image")
     schema = writer.register_schema("sensor_msgs/msg/Image", "ros2msg", text.encode())
     camera = writer.register_channel("/rl/observation/front", "cdr", schema)
-    pictures = np.random.default_rng(0).integers(0, 256, (len(STEPS.times), 9, 11, 3), np.uint8)
-    for (time_ns, data), picture in zip(plain_messages(STEPS), pictures, strict=True):
+    images = np.random.default_rng(0).integers(0, 256, (len(STEPS.times), 9, 11, 3), np.uint8)
+    for (time_ns, data), image in zip(plain_messages(STEPS), images, strict=True):
         for late in (0, 5):
-            image = messages.new(
+            message = messages.new(
                 "sensor_msgs/msg/Image",
                 header=messages.header(time_ns, "cam" * (1 + time_ns // 10**6 % 2)),
                 height=9,
@@ -198,15 +198,15 @@ def test_images_of_another_writer(log_path: Path) -> None:
                 encoding="rgb8",
                 is_bigendian=0,
                 step=33,
-                data=(picture + late).ravel(),
+                data=(image + late).ravel(),
             )
-            writer.add_message(camera, time_ns + late, messages.encode(image), time_ns)
+            writer.add_message(camera, time_ns + late, messages.encode(message), time_ns)
         writer.add_message(step, time_ns, data, time_ns)
     writer.finish()
     found = mcaprl.open(log_path)
     assert isinstance(found.observation_space, spaces.Dict)
     assert found.observation_space["front"] == spaces.Box(0, 255, (9, 11, 3), np.uint8)
-    assert_same_bits(found.observations["front"], pictures[STEPS.actual])
+    assert_same_bits(found.observations["front"], images[STEPS.actual])
     assert_same_bits(found.observations["state"], STEPS.fields["observation"][STEPS.actual])
 
 
@@ -274,11 +274,11 @@ def test_observations_of_several_lengths(log_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("message_encoding", "schema_encoding", "told"),
+    ("message_encoding", "schema_encoding", "reported"),
     [("json", "jsonschema", "messages of /rl/step are 'json'"), ("cdr", "ros2idl", "'ros2idl'")],
 )
 def test_other_encodings(
-    log_path: Path, message_encoding: str, schema_encoding: str, told: str
+    log_path: Path, message_encoding: str, schema_encoding: str, reported: str
 ) -> None:
     writer = Writer(str(log_path))
     writer.start()
@@ -286,7 +286,7 @@ def test_other_encodings(
     channel = writer.register_channel("/rl/step", message_encoding, schema)
     writer.add_message(channel, 0, b"{}", 0)
     writer.finish()
-    with pytest.raises(LogError, match=told):
+    with pytest.raises(LogError, match=reported):
         mcaprl.open(log_path)
 
 

@@ -210,8 +210,8 @@ def test_an_index_with_too_few_messages_is_refused(large: Path, tmp_path: Path) 
     spoilt = bytearray(large.read_bytes())
     # The size of the entries follows opcode, length and channel id.
     place = chunk.message_index_offsets[channel.id] + 11
-    (told,) = struct.unpack_from("<I", spoilt, place)
-    struct.pack_into("<I", spoilt, place, told - 16)
+    (reported,) = struct.unpack_from("<I", spoilt, place)
+    struct.pack_into("<I", spoilt, place, reported - 16)
     path = tmp_path / "spoilt.mcap"
     path.write_bytes(spoilt)
     with pytest.raises(CorruptLogError, match="has 8191 entries, not the 8192 of the summary"):

@@ -13,7 +13,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.learner_topic import read_learner
 from mcaprl.recorder.repair.check import check_log
 from tests.golden.make import CONTENTS, FILES, FOLDER, contents_of
-from tests.support.faults import assert_is_told
+from tests.support.faults import assert_is_known
 
 STATED = json.loads(CONTENTS.read_text())
 
@@ -33,8 +33,8 @@ def test_golden_file_has_the_reference_contents(name: str) -> None:
 
 def test_known_values() -> None:
     """Check one file by its formula, independently of the stored hashes."""
-    (episode,) = mcaprl.open(FOLDER / "told.mcap").episodes
-    assert_is_told(episode)
+    (episode,) = mcaprl.open(FOLDER / "reported.mcap").episodes
+    assert_is_known(episode)
 
 
 def test_learner_topic_of_a_vector_environment() -> None:

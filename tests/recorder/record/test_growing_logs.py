@@ -103,7 +103,7 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("env", "options", "told"),
+    ("env", "options", "reported"),
     [
         (gym.make("CartPole-v1", sutton_barto_reward=True), {}, "its env_kwargs is"),
         (gym.make("CartPole-v0"), {}, "its env_id is CartPole-v1, the recording's CartPole-v0"),
@@ -114,11 +114,11 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
     ],
 )
 def test_incompatible_recordings_are_not_appended(
-    log_path: Path, env: Any, options: dict[str, Any], told: str
+    log_path: Path, env: Any, options: dict[str, Any], reported: str
 ) -> None:
     cartpole_log(log_path, 2)
     before = log_path.read_bytes()
-    with pytest.raises((LogError, UsageError), match=told):
+    with pytest.raises((LogError, UsageError), match=reported):
         mcaprl.RecordMcap(env, log_path, append=True, **options)
     assert log_path.read_bytes() == before
     cartpole_log(log_path, 1, append=True)
@@ -276,7 +276,7 @@ def test_overwriting_keeps_the_old_file_for_its_readers(log_path: Path) -> None:
 
 def test_readers_see_finished_episodes_during_recording(log_path: Path) -> None:
     """At any time, what is read was recorded, and no finished episode is missing."""
-    told: list[int] = []
+    reported: list[int] = []
     space = spaces.Dict({"x": BOX, "image": spaces.Box(0, 255, (8, 8), np.uint8)})
 
     def write() -> None:
@@ -285,14 +285,14 @@ def test_readers_see_finished_episodes_during_recording(log_path: Path) -> None:
             env.reset()
             while not env.step(0)[2]:
                 pass
-            told.append(env.episodes)
+            reported.append(env.episodes)
         env.close()
 
     writer = threading.Thread(target=write)
     writer.start()
     seen = 0
     while writer.is_alive():
-        finished = told[-1] if told else 0
+        finished = reported[-1] if reported else 0
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -319,8 +319,8 @@ class Counting(gym.Env[Any, Any]):
         self.episode, self.count = 0, 0
 
     def _observation(self) -> dict[str, Any]:
-        picture = np.full((8, 8), self.count % 256, np.uint8)
-        return {"x": np.full(2, self.count, np.float32), "image": picture}
+        image = np.full((8, 8), self.count % 256, np.uint8)
+        return {"x": np.full(2, self.count, np.float32), "image": image}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.episode, self.count = self.episode + 1, 0

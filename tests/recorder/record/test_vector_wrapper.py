@@ -167,11 +167,11 @@ def test_episodes_are_in_the_order_of_their_ends(tmp_path: Path) -> None:
         env.policy, env.epsilon = ("a", 0.5) if step < 2 else ("b", 0.25)
         env.step(np.zeros(3, np.int64))
     env.close()
-    told = [
+    reported = [
         (e.length, e.seed, e.policy, e.epsilon, e.reason)
         for e in mcaprl.open(tmp_path / "vector.mcap").episodes
     ]
-    assert told == [
+    assert reported == [
         (2, 11, "a", 0.5, "end 0"),
         (4, 10, "a", 0.5, "end 0"),
         (2, None, "a", 0.5, "end 1"),
@@ -254,8 +254,8 @@ def test_an_error_ends_all_episodes_before_the_step(log_path: Path) -> None:
         env.step(np.zeros(2, np.int64))
     env.close()
     env.close()
-    told = [(e.length, e.reason) for e in mcaprl.open(log_path).episodes]
-    assert told == [(2, "interrupted"), (2, "interrupted")]
+    reported = [(e.length, e.reason) for e in mcaprl.open(log_path).episodes]
+    assert reported == [(2, "interrupted"), (2, "interrupted")]
 
 
 def test_an_ended_environment_has_to_be_reset(log_path: Path) -> None:
@@ -301,7 +301,7 @@ def test_the_final_observation_is_required(log_path: Path) -> None:
 
 
 def test_large_images_preallocate_little_memory(log_path: Path) -> None:
-    class Film(gym.Env[Any, Any]):
+    class ImageEnv(gym.Env[Any, Any]):
         observation_space = spaces.Box(0, 255, (480, 640, 3), np.uint8)
         action_space = spaces.Discrete(2)
 
@@ -313,7 +313,7 @@ def test_large_images_preallocate_little_memory(log_path: Path) -> None:
             self.count += 1
             return np.full((480, 640, 3), self.count, np.uint8), 0.0, self.count == 12, False, {}
 
-    envs = SyncVectorEnv([Film, Film], autoreset_mode=AutoresetMode.SAME_STEP)
+    envs = SyncVectorEnv([ImageEnv, ImageEnv], autoreset_mode=AutoresetMode.SAME_STEP)
     with closing(mcaprl.RecordVecMcap(envs, log_path)) as env:
         env.reset()
         for _ in range(12):

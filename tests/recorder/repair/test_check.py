@@ -51,7 +51,7 @@ def rewritten(
     Args:
         path: of a good log.
         change: called with each record of `/rl/step`.
-        strings: metadata instead of its own.
+        strings: metadata that replaces the original.
         leave_out: a topic whose second chunk is missing.
     """
     reader, other = McapReader(path), path.with_name("other.mcap")
@@ -107,7 +107,7 @@ def at(number: int, row: int, **values: Any) -> Change:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (at(1, 1, step=2), "out of order"),
         (at(1, 1, episode=7), "out of order"),
@@ -118,9 +118,9 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 2, truncated=False), "reports truncated True, its records False"),
     ],
 )
-def test_inconsistent_episodes_are_reported(good: Path, change: Change, told: str) -> None:
+def test_inconsistent_episodes_are_reported(good: Path, change: Change, reported: str) -> None:
     problems = check_log(rewritten(good, change))
-    assert any(told in problem.what for problem in problems), problems
+    assert any(reported in problem.what for problem in problems), problems
     assert all("mcaprl recover" in problem.next for problem in problems)
 
 
@@ -197,7 +197,7 @@ def test_an_image_type_without_a_field_is_reported(log_path: Path, tmp_path: Pat
     assert data.count(b"string encoding") >= 2
     log_path.write_bytes(data.replace(b"string encoding", b"string encodinx"))
     (problem,) = check_log(log_path)
-    assert "images on /rl/observation/picture do not match the metadata's space" in problem.what
+    assert "images on /rl/observation/image do not match the metadata's space" in problem.what
     with pytest.raises(LogError, match="cannot be recovered: images on"):
         recover_log(log_path, tmp_path / "out.mcap")
 

@@ -18,7 +18,7 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import Told, assert_is_told, count, play, tell
+from tests.support.faults import KnownEpisodes, assert_is_known, count, play, tell
 
 # The fork server has imported everything, so that a new recorder starts at once.
 FORKS = multiprocessing.get_context("forkserver")
@@ -29,7 +29,7 @@ def _record_for_ever(path: Path, finished: Connection, number: int) -> None:
     """Print each episode whose end `step` has returned."""
     if number != signal.SIGKILL:
         signal.signal(number, signal.default_int_handler)
-    env = mcaprl.RecordMcap(Told(), path)
+    env = mcaprl.RecordMcap(KnownEpisodes(), path)
     try:
         while True:
             play(env)
@@ -40,12 +40,12 @@ def _record_for_ever(path: Path, finished: Connection, number: int) -> None:
 
 def _stop_one(path: Path, number: signal.Signals, delay_s: float) -> int:
     """Send a signal to a recorder, and return the number of episodes that it had reported."""
-    told, telling = FORKS.Pipe(duplex=False)
+    reported, telling = FORKS.Pipe(duplex=False)
     recorder = FORKS.Process(target=_record_for_ever, args=(path, telling, number))
     recorder.start()
     telling.close()
     try:
-        assert told.poll(60), "the recorder does not begin"
+        assert reported.poll(60), "the recorder does not begin"
         time.sleep(delay_s)
         assert recorder.pid is not None
         os.kill(recorder.pid, number)
@@ -55,9 +55,9 @@ def _stop_one(path: Path, number: signal.Signals, delay_s: float) -> int:
         recorder.kill()
         recorder.join()
     finished = 0
-    while told.poll():
+    while reported.poll():
         try:
-            told.recv_bytes()
+            reported.recv_bytes()
         except (EOFError, OSError):
             break
         finished += 1
@@ -75,7 +75,7 @@ def test_killed_recorders_lose_only_the_open_episode(tmp_path: Path) -> None:
         assert finished <= len(data.episodes) <= finished + 1
         for number, episode in enumerate(data.episodes):
             assert episode.summary.episode == number
-            assert_is_told(episode)
+            assert_is_known(episode)
         assert check_log(out) == []
         with out.open("rb") as file:
             reader = make_reader(file, validate_crcs=True)
@@ -107,7 +107,7 @@ def test_stopped_recorders_leave_whole_files(tmp_path: Path, number: signal.Sign
         *whole, last = mcaprl.open(path).episodes
         assert len(whole) in (finished - 1, finished)
         for episode in whole:
-            assert_is_told(episode)
+            assert_is_known(episode)
         assert last.reason in ("terminated", "interrupted")
     tell(f"recorders stopped with {number.name}", stopped=trials, files_not_whole=0)
 
@@ -115,7 +115,7 @@ def test_stopped_recorders_leave_whole_files(tmp_path: Path, number: signal.Sign
 def test_killed_before_its_first_episode(tmp_path: Path) -> None:
     """There is nothing to recover, and `recover` reports it."""
     path = tmp_path / "log.mcap"
-    env = mcaprl.RecordMcap(Told(), path)
+    env = mcaprl.RecordMcap(KnownEpisodes(), path)
     env.reset()
     env.step(0)
     begun = path.read_bytes()

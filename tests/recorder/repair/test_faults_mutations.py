@@ -20,7 +20,7 @@ import mcaprl
 from mcaprl.errors import McaprlError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import assert_is_told, count, tell, write_log
+from tests.support.faults import assert_is_known, count, tell, write_log
 from tests.support.mutations import MUTATIONS, Mutation
 
 MEMORY_BYTES = 512 * 2**20
@@ -31,13 +31,13 @@ FORKS.set_forkserver_preload(["tests.support.faults"])
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda mutation: mutation.__name__)
 def test_mutated_files(tmp_path: Path, mutation: Mutation) -> None:
     """Run in a separate process with limited memory."""
-    told, telling = FORKS.Pipe(duplex=False)
+    reported, telling = FORKS.Pipe(duplex=False)
     trials = count(12, 1250)
     process = FORKS.Process(target=_try_all, args=(tmp_path, mutation, trials, telling))
     process.start()
     telling.close()
     try:
-        figures = told.recv()
+        figures = reported.recv()
     except EOFError:
         pytest.fail(f"the process died with {process.exitcode}")
     finally:
@@ -93,7 +93,7 @@ def _outcome(path: Path) -> str:
             outcome = "read"
         except McaprlError:
             outcome = "refused"
-            assert problems, "what cannot be read has a problem that is told"
+            assert problems, "what cannot be read has a problem that is reported"
         try:
             recover_log(path, out, overwrite=True)
         except McaprlError:
@@ -108,6 +108,6 @@ def _assert_is_right(data: mcaprl.Dataset) -> None:
     assert data.env_id == ""
     assert [leaf.shape[1:] for leaf in data.observations.values()] == [(8, 8), (3,)]
     for episode in data.episodes:
-        assert_is_told(episode)
+        assert_is_known(episode)
     times = np.concatenate([episode.log_time_ns for episode in data.episodes])
     assert ((times - 10**18) % 10**8 == 0).all()

@@ -21,7 +21,7 @@ import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import recover_log
-from tests.support.faults import Told, assert_is_told, count, play, tell, write_log
+from tests.support.faults import KnownEpisodes, assert_is_known, count, play, tell, write_log
 
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EDQUOT)
 
@@ -66,7 +66,7 @@ def record_until_it_fails(path: Path, episodes: int, **options: Any) -> int:
     """Record, and return the number of episodes finished at the failure."""
     env = None
     try:
-        env = mcaprl.RecordMcap(Told(), path, **options)
+        env = mcaprl.RecordMcap(KnownEpisodes(), path, **options)
         for _ in range(episodes):
             play(env)
         env.close()
@@ -98,7 +98,7 @@ def assert_all_there(path: Path, finished: int) -> None:
     for data in logs:
         assert len(data.episodes) >= finished
         for episode in data.episodes:
-            assert_is_told(episode)
+            assert_is_known(episode)
 
 
 def test_every_write_fails_once(log_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_every_write_fails_once(log_path: Path) -> None:
     assert tried > 20
 
 
-class Later(Told):
+class Later(KnownEpisodes):
     """Start with the fourth episode."""
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ def test_disk_is_full_while_appending(log_path: Path) -> None:
 
 def test_vector_recording_on_a_full_disk(log_path: Path) -> None:
     for writes in range(14, 60, 5):
-        envs = SyncVectorEnv([Told, Told], autoreset_mode=AutoresetMode.SAME_STEP)
+        envs = SyncVectorEnv([KnownEpisodes, KnownEpisodes], autoreset_mode=AutoresetMode.SAME_STEP)
         with failing(writes, random.Random(writes)):
             env = mcaprl.RecordVecMcap(envs, log_path, overwrite=True)
             env.reset()
@@ -179,7 +179,7 @@ def test_recovering_onto_a_full_disk(log_path: Path) -> None:
 def test_the_environment_is_closed_after_a_failed_write(log_path: Path) -> None:
     closed = []
 
-    class Closes(Told):
+    class Closes(KnownEpisodes):
         def close(self) -> None:
             closed.append(True)
 

@@ -30,13 +30,13 @@ from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.recover import Recovery, recover_log
 from tests.support.recordings import Truth, assert_holds, record
 
-# Damage is told by chunks, of which each episode has its own here.
+# Losses are reported by chunk; each episode has a separate chunk here.
 pytestmark = pytest.mark.usefixtures("small_chunks")
 
 SPACE = spaces.Dict(
     {
         "x": spaces.Box(-1, 1, (2,), np.float32),
-        "picture": spaces.Box(0, 255, (8, 9), np.uint8),
+        "image": spaces.Box(0, 255, (8, 9), np.uint8),
     }
 )
 LENGTHS = [40, 9, 60, 25]
@@ -162,7 +162,7 @@ def test_a_lost_channel_loses_only_its_messages(log_path: Path, truth: tuple[byt
     assert topics == {c.topic for c in reader.channels.values()} - {"/rosout"}
 
 
-@pytest.mark.parametrize("topic", ["/rl/step", "/rl/observation/picture"])
+@pytest.mark.parametrize("topic", ["/rl/step", "/rl/observation/image"])
 @pytest.mark.parametrize("number", range(4))
 def test_a_damaged_chunk_loses_its_episode(
     log_path: Path, truth: tuple[bytes, Truth], topic: str, number: int
@@ -237,12 +237,12 @@ def killed(path: Path, steps: int) -> tuple[bytes, Truth]:
     """Record a log that is killed in its second episode, with some of its chunks on disk."""
     space, whole = spaces.Box(0, 255, (20, 20), np.uint8), path.with_name("whole.mcap")
     truth = record(whole, space, spaces.Discrete(2), [3, steps + 50])
-    pictures = chunks_of(whole.read_bytes(), "/rl/observation/image", path)
+    images = chunks_of(whole.read_bytes(), "/rl/observation/image", path)
     data = whole.read_bytes()
     whole.unlink()
     # Images are written in chunks of 100, rows of /rl/step in chunks of 8192.
-    behind = [offset for offset, _ in pictures if offset > 0]
-    return data[: behind[-1]], truth
+    later = [offset for offset, _ in images if offset > 0]
+    return data[: later[-1]], truth
 
 
 def test_an_unfinished_episode_can_be_kept(log_path: Path) -> None:
@@ -356,9 +356,9 @@ def test_command_output_and_exit_codes(
     assert run(["recover", str(log_path), str(out), "--overwrite"]) == 3
     assert "lost: " in capsys.readouterr().out
     assert run(["recover", str(log_path), str(out), "--overwrite", "--json"]) == 3
-    told = json.loads(capsys.readouterr().out)
-    assert told["ok"] is False
-    assert {"episodes", "messages", "damages", "dropped", "ended"} <= set(told)
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["ok"] is False
+    assert {"episodes", "messages", "damages", "dropped", "ended"} <= set(reported)
     log_path.write_bytes(b"nonsense")
     assert run(["recover", str(log_path), str(out), "--overwrite"]) == 1
     assert "cannot be recovered" in capsys.readouterr().err

@@ -87,7 +87,9 @@ def test_clock_pauses_seeks_and_restarts(log: Path) -> None:
 def test_the_current_state_is_the_last_message_of_each_topic(log: Path) -> None:
     player = Player([Track(McapReader(log))])
     player.seek(START_NS + 3 * STEP_NS + 1)
-    seen = dict(zip(topics_of(player, player.picture()), player.picture(), strict=True))
+    seen = dict(
+        zip(topics_of(player, player.current_messages()), player.current_messages(), strict=True)
+    )
     assert seen["/scene"].time_ns == seen["/rl/step"].time_ns == START_NS + 3 * STEP_NS
     assert seen["/scene/static"].time_ns == START_NS
     assert "/rl/episode" not in seen, "no episode has ended yet"
@@ -99,7 +101,9 @@ def test_one_episode(log: Path) -> None:
     times = [message.time_ns for message in player.advance(60)]
     assert (times[0], times[-1]) == (first, last)
     player.seek(first)
-    assert "/scene/static" in topics_of(player, player.picture()), "what came before is part of it"
+    assert "/scene/static" in topics_of(player, player.current_messages()), (
+        "what came before is part of it"
+    )
 
 
 def test_two_logs_share_their_time(log: Path, tmp_path: Path) -> None:
@@ -172,7 +176,7 @@ def test_a_log_of_an_hour_plays_from_anywhere(tmp_path: Path) -> None:
     player = Player([track])
     middle = (player.start_ns + player.end_ns) // 2
     player.seek(middle)
-    assert any(middle - m.time_ns < 10**9 for m in player.picture())
+    assert any(middle - m.time_ns < 10**9 for m in player.current_messages())
     player.playing = True
     assert len(player.advance(1.0)) >= 10
     assert track._records.cache_info().currsize <= 3
@@ -238,11 +242,11 @@ def test_a_viewer_connects_seeks_and_receives_the_files_bytes(log: Path) -> None
     assert info["dataStartTime"]["sec"] == START_NS // 10**9
     channels = {channel.topic: channel for channel in reader.channels.values()}
     assert seen["topics"].keys() == channels.keys()
-    for topic, told in seen["topics"].items():
+    for topic, reported in seen["topics"].items():
         schema = reader.schema_of(channels[topic])
-        assert told["schemaName"] == schema.name
-        assert told["schema"] == hashlib.sha256(schema.data).hexdigest()
-        assert (told["encoding"], told["schemaEncoding"]) == ("cdr", "ros2msg")
+        assert reported["schemaName"] == schema.name
+        assert reported["schema"] == hashlib.sha256(schema.data).hexdigest()
+        assert (reported["encoding"], reported["schemaEncoding"]) == ("cdr", "ros2msg")
     in_file = {
         (topic, str(time_ns), hashlib.sha256(message).hexdigest())
         for topic, channel in channels.items()

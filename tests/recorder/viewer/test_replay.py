@@ -141,18 +141,18 @@ def test_frames_form_a_tree_under_map(log: Path) -> None:
 
 
 def test_car_frame_agrees_with_the_telemetry(log: Path) -> None:
-    told = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
+    reported = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
     frames = [m.transforms[0] for _, m in read(log, "/tf", "tf2_msgs/msg/TFMessage")]
-    assert [frame.child_frame_id for frame in frames] == ["car"] * len(told["x_m"])
+    assert [frame.child_frame_id for frame in frames] == ["car"] * len(reported["x_m"])
     for axis in "xy":
         places = [getattr(frame.transform.translation, axis) for frame in frames]
-        np.testing.assert_allclose(places, told[f"{axis}_m"], rtol=2**-16, atol=2**-10)
-    assert (told["speed_m_s"] >= 0).all()
+        np.testing.assert_allclose(places, reported[f"{axis}_m"], rtol=2**-16, atol=2**-10)
+    assert (reported["speed_m_s"] >= 0).all()
 
 
 def test_depth_is_in_millimeters() -> None:
-    metres = np.array([[0.0, 1.2344, np.inf], [65.535, 65.536, 50.0]], np.float32)
-    assert depth_millimeters(metres).tolist() == [[0, 1234, 0], [65535, 0, 50000]]
+    meters = np.array([[0.0, 1.2344, np.inf], [65.535, 65.536, 50.0]], np.float32)
+    assert depth_millimeters(meters).tolist() == [[0, 1234, 0], [65535, 0, 50000]]
 
 
 def test_depth_topic(log: Path) -> None:
@@ -200,10 +200,10 @@ def test_layouts_refer_to_paths_in_the_log(sim: str, tmp_path: Path) -> None:
 
 
 def test_cumulative_return_is_the_sum_of_rewards(log: Path) -> None:
-    told = Topic(McapReader(log), "/telemetry").read(("return_so_far",))["return_so_far"]
+    reported = Topic(McapReader(log), "/telemetry").read(("return_so_far",))["return_so_far"]
     rewards = [episode.rewards for episode in mcaprl.open(log).episodes]
     sums = np.concatenate([[0.0, *np.cumsum(reward)] for reward in rewards])
-    np.testing.assert_allclose(told, sums, rtol=2**-16)
+    np.testing.assert_allclose(reported, sums, rtol=2**-16)
 
 
 @pytest.mark.parametrize(("sim", "episodes"), [("lane", 4), ("powerline", 10), ("racer", 1)])

@@ -17,7 +17,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.recorder.viewer.video import contact_sheet, evenly_spaced, shown_steps
 from mcaprl.sims import make_sim
-from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, eye_behind, poses_of
+from mcaprl.sims.drawing.chase_view import SIZE_PX, ChaseView, chase_eye, poses_of
 from mcaprl.sims.drawing.scene import Frame, Shape, yaw_rotation
 from tests.conftest import need
 
@@ -46,32 +46,32 @@ def box(color: Any, x_m: float, frame: str = "map", **others: Any) -> Shape:
     return Shape("box", "box", color, size=size, position=(x_m, 0.0, 0.5), frame=frame, **others)
 
 
-def share(picture: Any, channel: int) -> float:
+def share(image: Any, channel: int) -> float:
     """Return the mask of the pixels of one pure color at any brightness."""
     others = [c for c in range(3) if c != channel]
-    pure = (picture[..., channel] > 100) & (picture[..., others].max(-1) < 60)
+    pure = (image[..., channel] > 100) & (image[..., others].max(-1) < 60)
     return float(pure.mean())
 
 
 def test_the_followed_frame_is_in_the_image_center(view: ChaseView) -> None:
-    pictures = [
+    images = [
         view.draw([box(RED, 0.0, "car")], [], car_at(*place), "car", [])
         for place in ((0.0, 0.0, 0.0), (500.0, -80.0, 2.0))
     ]
-    assert pictures[0].shape == (HEIGHT, WIDTH, 3)
-    for picture in pictures:
-        rows, columns = np.nonzero(picture[..., 0] > picture[..., 2].astype(int) + 60)
+    assert images[0].shape == (HEIGHT, WIDTH, 3)
+    for image in images:
+        rows, columns = np.nonzero(image[..., 0] > image[..., 2].astype(int) + 60)
         assert abs(columns.mean() - WIDTH / 2) < 5
         assert HEIGHT / 2 < rows.mean() < HEIGHT
-    assert abs(share(pictures[0], 0) - share(pictures[1], 0)) < 2e-3
+    assert abs(share(images[0], 0) - share(images[1], 0)) < 2e-3
 
 
 def test_nearer_shapes_hide_farther_ones(view: ChaseView) -> None:
     wall = Shape("wall", "box", GREEN, size=(0.5, 9.0, 9.0), position=(-4.0, 0.0, 2.0))
     for scene in ([box(RED, 0.0), wall], [wall, box(RED, 0.0)]):
-        picture = view.draw(scene, [], car_at(0.0), "car", [])
-        assert share(picture, 0) == 0.0
-        assert share(picture, 1) > 0.2
+        image = view.draw(scene, [], car_at(0.0), "car", [])
+        assert share(image, 0) == 0.0
+        assert share(image, 1) > 0.2
     assert share(view.draw([box(RED, -100.0)], [], car_at(0.0), "car", []), 0) == 0.0
     assert share(view.draw([box(RED, 900.0)], [], car_at(0.0), "car", []), 0) == 0.0
 
@@ -96,7 +96,7 @@ def test_frames_are_relative_to_their_parents() -> None:
     np.testing.assert_allclose(poses["b"].axes[:, 0], [-1.0, 0.0, 0.0], atol=1e-12)
     round_about = [Frame("a", (1.0, 0.0, 0.0), quarter, "b"), Frame("b", (0, 0, 0), quarter, "a")]
     assert set(poses_of(round_about)) == {"a", "b"}
-    eye = eye_behind(poses["a"])
+    eye = chase_eye(poses["a"])
     np.testing.assert_allclose(eye.axes.T @ eye.axes, np.eye(3), atol=1e-12)
     assert np.linalg.det(eye.axes) == pytest.approx(1.0)
 
@@ -125,8 +125,8 @@ def test_a_log_reproduces_the_recorded_scene(tmp_path: Path) -> None:
 
 
 def test_sheet() -> None:
-    pictures = [np.full((40, 60, 3), value, np.uint8) for value in (10, 20, 30, 40)]
-    sheet = contact_sheet(pictures)
+    images = [np.full((40, 60, 3), value, np.uint8) for value in (10, 20, 30, 40)]
+    sheet = contact_sheet(images)
     assert sheet.shape == (46, 102, 3)
     assert [sheet[0, 0, 0], sheet[0, 36, 0], sheet[0, 72, 0], sheet[26, 0, 0]] == [10, 20, 30, 40]
     assert sheet[26, 36, 0] == 255
@@ -135,9 +135,9 @@ def test_sheet() -> None:
 
 def test_a_fast_video_skips_steps() -> None:
     assert shown_steps(3, 50.0) == (range(4), 50.0)
-    steps, pictures_per_s = shown_steps(7, 120.0)
+    steps, images_per_s = shown_steps(7, 120.0)
     assert list(steps) == [1, 4, 7], "the end is shown"
-    assert pictures_per_s == 40.0
+    assert images_per_s == 40.0
 
 
 def test_videos_of_a_scene_and_of_a_sim(
@@ -149,15 +149,15 @@ def test_videos_of_a_scene_and_of_a_sim(
     for sim, name in (("lane", "lane.mcap"), ("CartPole-v1", "cart.mcap")):
         assert run(["record", sim, "--policy", "random", "--steps", "5", "--out", name]) == 0
     for name, size in (("lane", (HEIGHT, WIDTH)), ("cart", (400, 600))):
-        films = ["replay", f"{name}.mcap", "--contact-sheet", f"{name}.png"]
-        assert run([*films, "--video", f"{name}.mp4"]) == 0
+        arguments = ["replay", f"{name}.mcap", "--contact-sheet", f"{name}.png"]
+        assert run([*arguments, "--video", f"{name}.mp4"]) == 0
         assert run(["replay", f"{name}.mcap", "--video", f"{name}.gif"]) == 0
         for kind, plugin in (("mp4", "pyav"), ("gif", "pillow")):
-            film = imageio.imread(f"{name}.{kind}", plugin=plugin)
+            video = imageio.imread(f"{name}.{kind}", plugin=plugin)
             # In a GIF, an image equal to the previous one extends its duration.
-            assert len(film) == 6 if kind == "mp4" else 2 <= len(film) <= 6
-            assert film.shape[1:] == (*size, 3)
-            assert (film[0] != film[-1]).any()
+            assert len(video) == 6 if kind == "mp4" else 2 <= len(video) <= 6
+            assert video.shape[1:] == (*size, 3)
+            assert (video[0] != video[-1]).any()
         assert imageio.imread(f"{name}.png").shape[2] == 3
     capsys.readouterr()
     for arguments, why in (
@@ -178,7 +178,7 @@ def test_a_log_without_a_scene_has_no_video(
     with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), path)) as env:
         env.reset()
         env.step(0)
-    film = ["replay", str(path), "--video", str(tmp_path / "film.mp4")]
-    assert run(film) == 1
+    video = ["replay", str(path), "--video", str(tmp_path / "video.mp4")]
+    assert run(video) == 1
     assert "has no scene, and no seed of episode 0" in capsys.readouterr().err
-    assert not (tmp_path / "film.mp4").exists()
+    assert not (tmp_path / "video.mp4").exists()

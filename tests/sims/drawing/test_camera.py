@@ -144,7 +144,7 @@ def test_left_of_the_car_is_left_in_the_image() -> None:
     assert np.all(image[:, 128:] == 0)
 
 
-def test_surfaces_behind_or_around_the_camera_are_not_visible() -> None:
+def test_surfaces_outside_the_view_are_not_visible() -> None:
     image = np.empty((144, 256))
     for mesh in (box_mesh((-5.0, 0.0, 0.0), (2.0, 2.0, 2.0)), box_mesh((0, 0, 0), (9.0, 9.0, 9.0))):
         draw_mesh(mesh, np.zeros(3), level_axes(0.0), LENS.focal_px, image)

@@ -88,7 +88,7 @@ def test_another_car_is_seen_where_it_is() -> None:
     sim = made(road=TRACK)
     sim.reset(seed=0, options={"pose": ON_THE_TRACK})
     (other,) = sim.others
-    # 8 m behind it and 1.5 m to its right, with the same heading.
+    # 8 m back and 1.5 m to its right, with the same heading.
     cos, sin = math.cos(other.yaw_rad), math.sin(other.yaw_rad)
     x_m, y_m = other.x_m - 8 * cos + 1.5 * sin, other.y_m - 8 * sin - 1.5 * cos
     seen, _ = sim.reset(seed=0, options={"pose": (x_m, y_m, other.yaw_rad)})

@@ -213,7 +213,7 @@ def test_fault_leaving_along_the_extension_is_rewarded() -> None:
     assert abs(info["lateral_offset_m"]) > 1000.0
 
 
-def test_fault_standing_still_never_ends() -> None:
+def test_fault_an_episode_at_rest_never_ends() -> None:
     sim = lane()
     sim.reset(options={"pose": (60.0, 1.0, 0.0, 10.0)})
     for _ in range(400):

@@ -17,7 +17,7 @@ from mcaprl.sims.lane.path import (
     course_project,
     course_spot_at,
 )
-from mcaprl.sims.lane.rules import AHEAD_M, BEHIND_M, LOOKAHEADS_M
+from mcaprl.sims.lane.rules import AHEAD_M, BACK_M, LOOKAHEADS_M
 
 # A subnormal distance before the start is rounded to a distance after it.
 along = st.one_of(
@@ -27,7 +27,7 @@ along = st.one_of(
 
 def test_no_lookahead_exceeds_the_shortest_leg() -> None:
     assert LONGEST_LOOK_M == 126.0
-    assert max(*LOOKAHEADS_M, BEHIND_M + AHEAD_M) < LONGEST_LOOK_M
+    assert max(*LOOKAHEADS_M, BACK_M + AHEAD_M) < LONGEST_LOOK_M
 
 
 @given(along)
@@ -49,5 +49,5 @@ def test_a_point_ahead(along_m: float, ahead_m: float) -> None:
 def test_the_nearest_point(along_m: float, away_m: float, angle: float, lag_m: float) -> None:
     x_m, y_m = point_of(COURSE, spot_at(COURSE, along_m))
     x_m, y_m = x_m + away_m * math.cos(angle), y_m + away_m * math.sin(angle)
-    window = (along_m - lag_m - BEHIND_M, along_m - lag_m + AHEAD_M)
+    window = (along_m - lag_m - BACK_M, along_m - lag_m + AHEAD_M)
     assert course_project(x_m, y_m, *window) == project(COURSE, x_m, y_m, *window)

@@ -76,8 +76,8 @@ def test_a_ray_ends_where_the_first_box_begins(x_m: float, y_m: float, angle_rad
         inside_y = np.abs(y_m + along_m * sin - box.y_m) <= box.width_m / 2
         assert not (inside_x & inside_y).any()
     if 0.0 < length_m < 100.0:
-        behind_m = length_m + 1e-9
-        assert in_a_box(x_m + behind_m * cos, y_m + behind_m * sin) or in_a_box(
+        inside_m = length_m + 1e-9
+        assert in_a_box(x_m + inside_m * cos, y_m + inside_m * sin) or in_a_box(
             x_m + length_m * cos, y_m + length_m * sin
         )
 
@@ -116,7 +116,7 @@ def test_the_path_point_distinguishes_the_streets_of_a_crossing() -> None:
         (60.0, 1.0 + 4.0 - 0.876, 0.0, False),
         (60.0, 1.0 + 4.0 - 0.874, 0.0, True),
         (60.0, 1.0 - 4.0 + 0.874, 0.0, True),
-        # Its nose is 2.2 m ahead of the middle of its wheelbase, its tail 2.1 m behind.
+        # Its nose is 2.2 m ahead of the middle of its wheelbase, its tail 2.1 m back.
         (134.0 - 2.201, 1.0, 0.0, False),
         (134.0 - 2.199, 1.0, 0.0, True),
         (134.0 - 2.101, 1.0, math.pi, False),
@@ -161,7 +161,7 @@ def test_the_scene_shows_the_rays_that_are_observed() -> None:
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     assert lengths[0] == pytest.approx(74.0)
     np.testing.assert_allclose(shapes["hits"].points[:, :2], lines[:, 1, :2])
-    bare = make_sim("lane").unwrapped
-    assert isinstance(bare, LaneKeepingEnv)
-    bare.reset(seed=0)
-    assert "rays" not in {shape.name for shape in bare.scene()}
+    plain = make_sim("lane").unwrapped
+    assert isinstance(plain, LaneKeepingEnv)
+    plain.reset(seed=0)
+    assert "rays" not in {shape.name for shape in plain.scene()}

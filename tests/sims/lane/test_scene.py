@@ -59,7 +59,7 @@ def test_the_camera_has_optical_axes(sim: LaneKeepingEnv) -> None:
     np.testing.assert_allclose(rotated(frame, (0, 1, 0)), [0, 0, -1], atol=1e-12)
 
 
-def test_the_car_stands_on_the_ground_on_its_wheels(sim: LaneKeepingEnv) -> None:
+def test_the_wheels_touch_the_ground(sim: LaneKeepingEnv) -> None:
     wheels = [shape for shape in sim.static_scene() if shape.name.startswith("car_wheel")]
     assert len(wheels) == 4
     for wheel in wheels:

@@ -88,7 +88,7 @@ def test_the_ground_is_straight_below() -> None:
 
 
 def test_forward_is_up_in_the_lower_camera_and_right_is_right() -> None:
-    """Over a mast's east side, 6 m north of it: the mast's arm is behind, so in the lower half."""
+    """6 m north of a mast, over its east side: its arm is south, in the lower half."""
     tower = towers()[2]
     camera = DroneCamera("down")
     north = camera.image_m(level_at(tower.x_m + 4.0, tower.y_m, tower.arm_z_m - 5.0))
@@ -110,10 +110,10 @@ def test_a_level_front_camera_has_its_horizon_in_the_middle() -> None:
 def test_conductors_are_seen_all_along_the_line(view: str) -> None:
     """Above the middle of each span; without wires, the image shows only the ground."""
     camera = DroneCamera(view)
-    bare = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
+    no_wires = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE)
     for leg in range(4):
         drone = level_at(*((POINTS_M[leg] + POINTS_M[leg + 1]) / 2).tolist())
-        with_wires, without = camera.image_m(drone), bare.image_m(*camera.pose(drone))
+        with_wires, without = camera.image_m(drone), no_wires.image_m(*camera.pose(drone))
         assert np.sum(with_wires < without) > 60
         assert np.all(with_wires <= without)
 
@@ -150,7 +150,7 @@ def test_a_wire_is_hidden_by_nearer_surfaces_and_clipped() -> None:
 
 
 def test_a_wire_that_passes_the_lens_is_cut_and_linear_in_1_over_z() -> None:
-    """Parallel to the axis, 1 m to the right, from behind: u = 8 + 8/z, so 1/z = (u - 8) / 8."""
+    """Parallel to the axis, 1 m to the right, seen along it: u = 8 + 8/z, so 1/z = (u - 8) / 8."""
     wire = np.array([[[1.0, 0.1, -5.0], [1.0, 0.1, 1000.0]]])
     image = np.zeros((12, 16))
     draw_wires(wire, np.zeros(3), np.eye(3), 8.0, 8.0, image)

@@ -78,13 +78,13 @@ def test_the_drones_frame_has_its_position_and_tilt() -> None:
     sim = flying()
     sim.step(EAST)
     level, body = sim.frames()
-    told = sim.telemetry()
+    reported = sim.telemetry()
     assert (level.name, level.parent) == ("base_stabilized", "map")
-    assert level.position == (told["x_m"], told["y_m"], told["z_m"])
+    assert level.position == (reported["x_m"], reported["y_m"], reported["z_m"])
     assert (body.name, body.parent) == ("drone", "base_stabilized")
     up = rotated(body, (0, 0, 1))
     assert up[1] < -0.01
-    assert math.acos(up[2]) == pytest.approx(told["tilt_rad"], abs=1e-6)
+    assert math.acos(up[2]) == pytest.approx(reported["tilt_rad"], abs=1e-6)
 
 
 @pytest.mark.parametrize(

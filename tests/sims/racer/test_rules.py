@@ -118,7 +118,7 @@ def test_speed_is_limited_both_ways() -> None:
 
 
 def test_a_drifting_course_follows_by_100_over_speed_plus_1_degrees() -> None:
-    """At 9 pixels a step by 10 degrees: after two turns of 15 it is 10 degrees behind."""
+    """At 9 pixels a step by 10 degrees: after two turns of 15 it lags by 10 degrees."""
     track = corridor()
     car = car_in(track, 500.0, 150.0, 0, 9)
     once = drive(track, car, RIGHT, False, True)

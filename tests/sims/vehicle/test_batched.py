@@ -110,8 +110,10 @@ def test_an_episode_of_a_batch_is_that_of_its_seed(name: str, kwargs: dict[str, 
             theirs = single.step(actions[i])
             check_same(part(seen, i), theirs[0], f"step {step} of {i}")
             assert (rewards[i], terminated[i], truncated[i]) == theirs[1:4]
-            told = {key: infos[key][i] for key in infos if key[0] != "_" and infos[f"_{key}"][i]}
-            assert told == theirs[4]
+            reported = {
+                key: infos[key][i] for key in infos if key[0] != "_" and infos[f"_{key}"][i]
+            }
+            assert reported == theirs[4]
             if terminated[i] or truncated[i]:
                 del going_on[i]
 
