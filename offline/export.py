@@ -3,7 +3,7 @@
 Inputs are the parts of the observation as the environment returns them, named as in `/rl/step`
 (`observation`, `camera`, ...), with a leading batch axis; a policy that stacks k frames accepts
 (B, k, *shape), oldest first. Outputs are `action` (B,) int64, values of the action space, and
-`scores` (B, A), of which the action has the largest. The file includes the normalization.
+`scores` (B, A); the action is the one with the largest score. The model includes normalization.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _remember(self, now: Observations) -> Observations:
-        """Store these observations and return the stack that ends with them, padded with the first."""
+        """Store observations and return the stack that ends with them, padded with the first."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))

@@ -82,7 +82,7 @@ def lane_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_browser_reports_no_error(lane_page: Path) -> None:
     document, console = browse(lane_page)
     assert console == ""
-    assert "Where the steps were" in document
+    assert "Positions in meters" in document
     assert document.count("mcaprl replay") == 4
     assert not re.search(r"(src|href)=.(https?:)?//|@import", document), "it needs no network"
 

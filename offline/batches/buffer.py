@@ -50,13 +50,13 @@ class Batch:
 
     Attributes:
         rows: Indices of the transitions in the buffer, (R,) int64.
-        observations: Observations before the actions, R.
+        observations: R observations before the actions.
         actions: Indices of the actions, (R,) int64, from 0.
         rewards: Sums of up to n discounted rewards, (R,) float32.
         discounts: Discounts of the next observations' values, (R,) float32: gamma to the power of
             the number of steps in between; 0 where the episode terminated, but not where it was
             truncated.
-        next_observations: Observations up to n steps later, R.
+        next_observations: R observations up to n steps later.
     """
 
     rows: Tensor
@@ -75,7 +75,7 @@ class TransitionBuffer:
         encoder: Encoder of the frames.
         action_space: Action space of the log.
         packing: Construction of transitions.
-        frames: Encoded observations, F, each stored once.
+        frames: F encoded observations, each stored once.
         starts: Index of the first frame of each frame's episode, (F,) int64.
         places: Frame indices of observations and next observations, (2, N) int64.
         actions: Indices of the actions, (N,) int64, from 0.
@@ -156,7 +156,7 @@ class TransitionBuffer:
         return self.actions.device
 
     def to(self, device: torch.device) -> TransitionBuffer:
-        """Copy all transitions to a device.
+        """Return the same transitions on a device.
 
         Rows are still sampled on the CPU, so a seed samples the same rows on every device.
         """
@@ -277,7 +277,10 @@ def _starts(frame_counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
-    """Check that observations are finite and actions allowed, before one NaN spoils all weights."""
+    """Check that observations are finite and logged actions are allowed.
+
+    A single NaN in the data would turn all network weights into NaN.
+    """
     rows = torch.from_numpy(dataset.frame_of_step)
     _check_finite("observations", frames.vector[rows])
     _check_finite("next_observations", frames.vector[rows + 1])

@@ -88,7 +88,7 @@ class Observations:
         return Observations(self.vector.reshape(rows, -1), images, mask)
 
     def to(self, device: torch.device) -> Observations:
-        """Copy the observations to a device."""
+        """Return the same observations on a device."""
         return self.like([part.to(device) for part in self.parts()])
 
 

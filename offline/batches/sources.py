@@ -26,7 +26,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
         All logs as one dataset, and the weight of each of its episodes.
 
     Raises:
-        UsageError: A weight is negative or not finite, or a file is listed with two weights.
+        UsageError: A weight is negative or not finite, or a file is listed with different weights.
         LogError: A file is missing, not an MCAP file, damaged, or without a finished episode.
         SpaceError: The spaces of the logs differ.
     """

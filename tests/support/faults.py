@@ -38,7 +38,7 @@ class KnownEpisodes(gym.Env[Any, Any]):
     observation_space = spaces.Dict(
         {
             "x": spaces.Box(-np.inf, np.inf, (3,), np.float32),
-            "image": spaces.Box(0, 255, (8, 8), np.uint8),
+            "picture": spaces.Box(0, 255, (8, 8), np.uint8),
         }
     )
     action_space = spaces.Discrete(4)
@@ -66,7 +66,7 @@ def observation_of(episode: int, step: int) -> dict[str, Any]:
     """Return the observation after `step` steps."""
     return {
         "x": np.array([episode, step, np.sin(episode + step)], np.float32),
-        "image": np.full((8, 8), (31 * episode + step) % 256, np.uint8),
+        "picture": np.full((8, 8), (31 * episode + step) % 256, np.uint8),
     }
 
 

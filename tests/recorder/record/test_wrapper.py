@@ -419,7 +419,7 @@ def test_killed_recorder_loses_only_the_open_episode(log_path: Path) -> None:
 
 def test_a_deferred_signal_keeps_no_references() -> None:
     """A buffer that is exported when the signal arrives can be cleared before it is handled."""
-    buffer = BytesIO(b"images")
+    buffer = BytesIO(b"12345678")
     # A shell that starts pytest in the background makes it ignore Ctrl-C.
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -112,7 +112,7 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 1, step=2), "out of order"),
         (at(1, 1, episode=7), "out of order"),
         (at(1, 3, final=False), "out of order"),
-        (at(1, 1, terminated=True), "goes on after its end"),
+        (at(1, 1, terminated=True), "continues after its end"),
         (at(2, 5, final=False), "6 records of an unfinished episode"),
         (at(0, 3, terminated=False), "reports terminated True, its records False"),
         (at(1, 2, truncated=False), "reports truncated True, its records False"),
@@ -197,7 +197,9 @@ def test_an_image_type_without_a_field_is_reported(log_path: Path, tmp_path: Pat
     assert data.count(b"string encoding") >= 2
     log_path.write_bytes(data.replace(b"string encoding", b"string encodinx"))
     (problem,) = check_log(log_path)
-    assert "images on /rl/observation/image do not match the metadata's space" in problem.what
+    assert (
+        "images on /rl/observation/picture do not match" in problem.what
+    )  # codespell:ignore picture
     with pytest.raises(LogError, match="cannot be recovered: images on"):
         recover_log(log_path, tmp_path / "out.mcap")
 
