@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mcaprl
-from mcaprl.api.curves import learning_curves
+from mcaprl.api.evaluate import learning_curves
 from mcaprl.figures import new_figure, to_svg
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.page import Card, Figure, Section, Table, write_page

@@ -1,6 +1,6 @@
-"""Networks from observations to numbers per action, built from what the observations hold.
+"""Networks that map observations to values per action; images and vectors have separate stems.
 
-picture -> convolutions -> layer -+
+image   -> convolutions -> layer -+
 vector  ------------------> layer +-> layers -> outputs
 """
 
@@ -19,14 +19,15 @@ from mcaprl.offline.batches.observations import ImageInput, Observations
 
 @dataclass(frozen=True)
 class Architecture:
-    """The shape of a network.
+    """Architecture of a network.
 
     Attributes:
-        hidden: widths of the fully connected hidden layers; the first is one for each input.
-        channels: of the three convolutions over each picture.
-        layer_norm: normalise before each ReLU of these layers (https://arxiv.org/abs/1607.06450).
-        dueling: outputs are a value plus advantages of mean 0, each with a last hidden layer of
-            its own (https://arxiv.org/abs/1511.06581).
+        hidden: Widths of the fully connected layers; the first layer exists once per input.
+        channels: Channels of the three convolutions over each image.
+        layer_norm: Whether these layers have layer normalization before each ReLU
+            (https://arxiv.org/abs/1607.06450).
+        dueling: Whether outputs are a value plus advantages of mean 0, with separate last hidden
+            layers (https://arxiv.org/abs/1511.06581).
     """
 
     hidden: tuple[int, ...]
@@ -36,7 +37,7 @@ class Architecture:
 
 
 class Network(nn.Module):
-    """Observations to outputs (B, *output_shape)."""
+    """Network from observations to outputs (B, *output_shape)."""
 
     def __init__(
         self,
@@ -45,13 +46,13 @@ class Network(nn.Module):
         output_shape: tuple[int, ...],
         architecture: Architecture,
     ) -> None:
-        """Build for a vector of `vector_width` numbers and pictures.
+        """Build a network for a vector and images.
 
         Args:
-            vector_width: 0 where there is no vector.
-            images: how each picture is taken.
-            output_shape: the first axis counts actions, if there is more than one.
-            architecture: what lies between.
+            vector_width: Length of the vector; 0 for no vector.
+            images: Normalization of each image.
+            output_shape: Shape of the output; the first axis is actions if there are several.
+            architecture: Architecture of the hidden layers.
         """
         super().__init__()
         self.output_shape = output_shape
@@ -97,11 +98,11 @@ class NatureConvolutions(nn.Module):
     scale: Tensor
 
     def __init__(self, image: ImageInput, channels: tuple[int, ...]) -> None:
-        """Build for images that are taken so, with so many channels behind each convolution."""
+        """Build three convolutions with these numbers of output channels."""
         super().__init__()
         first, second, third = channels
         shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
-        # Of the data, not learned, and saved with the rest of what is known of observations.
+        # Computed from the data, not learned; saved with the observation encoder.
         self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(
@@ -123,12 +124,12 @@ class NatureConvolutions(nn.Module):
 
 
 class DuelingHead(nn.Module):
-    """Q = V + A - mean(A): how good a state is apart from which action is best in it."""
+    """Dueling head: Q = V + A - mean(A), the state value plus centered advantages."""
 
     def __init__(
         self, n_inputs: int, hidden: tuple[int, ...], output_shape: tuple[int, ...], norm: bool
     ) -> None:
-        """Build two streams with hidden layers of their own."""
+        """Build two streams with separate hidden layers."""
         super().__init__()
         self.output_shape = output_shape
         layers, width = _layers(n_inputs, hidden, norm)

@@ -33,15 +33,15 @@ from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate, divid
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTable:
-    """E episodes side by side, padded to T columns: one more than the longest has steps.
+    """E episodes as rows, padded to T columns, one more than the steps of the longest episode.
 
     Attributes:
-        rewards: (E, T) r of step t; 0 past the end.
-        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end.
-        q: (E, T) the model's Q(s, a) of the action taken; 0 past the end.
-        v: (E, T) its value of the state before step t, sum_a pi(a|s) Q(s, a). Past the end 0, but
-            right behind a truncated episode the value of its last state.
-        gamma: the discount.
+        rewards: (E, T) reward of step t; 0 after the end.
+        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 after the end.
+        q: (E, T) Q(s, a) of the action taken, from the model; 0 after the end.
+        v: (E, T) value of the state before step t, sum_a pi(a|s) Q(s, a). After the end 0, except
+            for the value of the last state of a truncated episode.
+        gamma: Discount factor.
     """
 
     rewards: Floats
@@ -139,10 +139,10 @@ def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
 
 
 def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
-    """The effective number of episodes behind an estimate.
+    """Return the effective sample size of an estimate, in episodes.
 
-    For TIS and WIS that of whole episodes; for the others its harmonic mean over steps, weighted
-    with their discount: variances add up, and what is far off counts little.
+    For TIS and WIS it is that of whole episodes; for the other estimators it is the harmonic mean
+    over steps, weighted with the discounts, because the variances of the steps add up.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:

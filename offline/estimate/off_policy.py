@@ -205,17 +205,17 @@ class OffPolicyEvaluator:
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]
     ) -> tuple[Floats, Floats, Floats]:
-        """Q of the actions taken, V of the states, and V of the states after, (N,) each.
+        """Estimate Q of the actions, V of the states and V of the next states, (N,) each.
 
-        Each half of the episodes is judged by a model of the other half: one that had seen them
-        would take their luck for granted.
+        Cross-fitting: each half of the episodes is evaluated by a model that was trained on the
+        other half, because a model is biased on its training data.
         """
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()
         q, v, v_next = (np.zeros(len(fold)) for _ in range(3))
         for held_out in range(FOLDS):
-            judged = fold == held_out
-            seen = self._buffer.drawn_by((~judged).astype(np.float64))
+            in_fold = fold == held_out
+            seen = self._buffer.drawn_by((~in_fold).astype(np.float64))
             learner = FQE(
                 self._config,
                 seen,
@@ -227,9 +227,9 @@ class OffPolicyEvaluator:
                 on_update()
             values = learner.values(next_states=False).numpy().astype(np.float64)
             values_next = learner.values(next_states=True).numpy()
-            q[judged] = values[np.arange(len(fold)), actions][judged]
-            v[judged] = (pi * values).sum(1)[judged]
-            v_next[judged] = (pi_next * values_next.astype(np.float64)).sum(1)[judged]
+            q[in_fold] = values[np.arange(len(fold)), actions][in_fold]
+            v[in_fold] = (pi * values).sum(1)[in_fold]
+            v_next[in_fold] = (pi_next * values_next.astype(np.float64)).sum(1)[in_fold]
         return q, v, v_next
 
     def _table(self, ratios: Floats, q: Floats, v: Floats, v_next: Floats) -> EpisodeTable:

@@ -90,14 +90,14 @@ def td_errors(
     terminated: NDArray[np.bool_],
     gamma: float,
 ) -> NDArray[np.float32]:
-    """(T,) how much better each step was than its value: the Q-learning error.
+    """Return the Q-learning errors (T,) of an episode.
 
     Args:
-        q: (T + 1, A) values at each observation, the last one included.
-        actions: (T,) taken, counted from 0.
-        rewards: (T,)
-        terminated: (T,); nothing comes behind such a step.
-        gamma: the discount.
+        q: (T + 1, A) values at each observation, including the last.
+        actions: (T,) actions taken, counted from 0.
+        rewards: (T,) rewards.
+        terminated: (T,) flags of terminal transitions.
+        gamma: Discount factor.
     """
     target = q_learning_target(
         torch.from_numpy(rewards.astype(np.float32)),
@@ -137,7 +137,7 @@ def gamma_of_run(path: Path) -> float:
 
 
 def _with_last(observations: Any, next_observations: Any) -> Any:
-    """(T + 1, ...) the observations of all steps, and the one behind the last."""
+    """Return the observations of all steps and the final observation, (T + 1, ...)."""
     if isinstance(observations, dict):
         return {k: _with_last(observations[k], next_observations[k]) for k in observations}
     return np.concatenate([observations, next_observations[-1:]])

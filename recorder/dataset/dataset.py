@@ -13,11 +13,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError
-from mcaprl.recorder.dataset.batch import Batch
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
-from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.transitions import TransitionBatch, Transitions
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of, nest, space_to_json
 
@@ -266,7 +265,7 @@ class Dataset:
         """Return a copy with only the episodes for which `keep` returns true."""
         return self._take([episode.index for episode in self.episodes if keep(episode)])
 
-    def batch(self, steps: NDArray[np.integer[Any]]) -> Batch:
+    def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
         """Copy a batch of transitions; images that stay on disk are read.
 
         Args:
@@ -276,7 +275,7 @@ class Dataset:
             CorruptLogError: Images on disk are damaged.
         """
         columns, frames = self._transitions, self._frame_of_step[steps]
-        return Batch(
+        return TransitionBatch(
             observations=nest(self._leaves, [leaf[frames] for leaf in columns.frames]),
             actions=columns.actions[steps],
             rewards=columns.rewards[steps],

@@ -100,6 +100,29 @@ class Transitions:
         )
 
 
+@dataclass(frozen=True)
+class TransitionBatch:
+    """B transitions of a dataset, copied.
+
+    Attributes:
+        observations: (B, *shape), or nested dicts of such arrays.
+        actions: (B,) int64, or (B, *shape).
+        rewards: (B,) float64.
+        terminated: (B,) bool.
+        truncated: (B,) bool.
+        next_observations: like `observations`, one step later.
+        behavior_probs: (B,) float32; NaN where unknown.
+    """
+
+    observations: Any
+    actions: NDArray[Any]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    next_observations: Any
+    behavior_probs: NDArray[np.float32]
+
+
 def ranges(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the concatenated indexes of ranges that start at `starts` and have these lengths."""
     ends = np.cumsum(lengths)
