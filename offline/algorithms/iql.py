@@ -55,7 +55,7 @@ class IQLConfig(BootstrapConfig):
 
 
 class IQL(Learner):
-    """Values of logged actions, and a clone that prefers the better ones."""
+    """Learner of action values and of a policy that clones the better logged actions."""
 
     name = "iql"
     config_type: ClassVar[type[TrainingConfig]] = IQLConfig

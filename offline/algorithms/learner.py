@@ -80,7 +80,7 @@ class Learner(ABC):
         self._sync_interval = 0
         weights = [model.weights for model in self.models.values()]
         self.optimizer = torch.optim.AdamW(weights, weight_decay=config.weight_decay, fused=True)
-        # As the optimizer does it at its first step; a checkpoint can be loaded before that.
+        # Create the optimizer state now, so that a checkpoint can be loaded before the first step.
         for tensor in weights:
             moments = {name: torch.zeros_like(tensor) for name in _MOMENTS}
             step = torch.tensor(0.0, device=tensor.device)

@@ -199,7 +199,7 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def length(self) -> int:
-        """Skip the length of a string or sequence; the layout requires it of other messages."""
+        """Skip the length of a string or sequence; messages of this layout have the same length."""
         name = f"_length_{len(self._constants)}"
         self.take("u4", 1, name, scalar=True)
         (value,) = struct.unpack_from(f"{self._order}I", self._data, self.position - 4)

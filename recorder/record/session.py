@@ -78,7 +78,7 @@ class EpisodeLog:
                 " from 0 or later; give step_duration_s and start_time_ns"
             )
         if append and overwrite:
-            raise UsageError("append keeps what overwrite replaces: choose one of the two")
+            raise UsageError("append and overwrite exclude each other: choose one of the two")
         self._parts = None
         if max_file_bytes is not None:
             self._parts = _Parts(Path(path), max_file_bytes, overwrite=overwrite, append=append)

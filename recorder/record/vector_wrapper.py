@@ -69,8 +69,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Wrap `env` and create the file.
 
         Args:
-            env: Vector environment. `RecordMcap` could record its single environments, and its
-                metadata name the autoreset mode.
+            env: Vector environment with spaces that `RecordMcap` supports and an autoreset mode in
+                its metadata.
             path: File to write.
             policy: Name of the policy.
             epsilon: Probability of a random action; NaN if unknown.
