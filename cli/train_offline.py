@@ -56,7 +56,7 @@ def _configs() -> list[Settings]:
     show_default=True,
     help="Device of data and networks: cpu or cuda.",
 )
-@click.option("--resume", is_flag=True, help="Continuation from the checkpoints in OUT.")
+@click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="New episodes of logs that are still being written.")
 @click.option("--other-data", is_flag=True, help="With --resume: permission for other DATA.")
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:

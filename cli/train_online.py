@@ -64,7 +64,7 @@ def _configs() -> list[Settings]:
     help="Logs for the replay buffer, or a policy whose weights are the start (of a run with"
     " several seeds, one for each); may be given twice.",
 )
-@click.option("--resume", is_flag=True, help="Continuation from the checkpoints in OUT.")
+@click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Display in Foxglove during training.")
 @click.option(
     "--port",

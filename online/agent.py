@@ -125,7 +125,7 @@ class Agent:
             policy: Policy with Q-values, if any.
 
         Raises:
-            UsageError: The algorithm supports neither.
+            UsageError: The algorithm cannot start from the given data or policy.
             SpaceError: The spaces differ.
             PolicyError: The policy's network differs from the agent's.
         """

@@ -55,8 +55,8 @@ def train_online(
         seed: Seed of the first agent; agent k uses seed + k.
         threads: Number of threads of PyTorch.
         record: Log of every transition; with several seeds a folder.
-        sources: Logs that fill the replay buffer, and at most one policy whose weights are the
-            start.
+        sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
+            the agents.
         resume: Whether training continues from the checkpoints in `out`.
         live: Whether viewers can connect during training; frames are dropped, never steps.
         port: Port of 127.0.0.1 for viewers; 0 for any free one.
@@ -76,7 +76,7 @@ def train_online(
         UsageError: No sim is given, or the arguments contradict the preset.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
-        PolicyError: The policy in `sources` has another network than the agent.
+        PolicyError: The policy's network in `sources` differs from the agent's.
         TrainingError: `out` cannot be written, or has a run of another task.
         MissingExtraError: The packages of the `online` extra are not installed.
     """
@@ -116,7 +116,7 @@ def _experience(
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         names = " and ".join(map(str, policies))
-        raise UsageError(f"an agent begins with one policy, not with {names}")
+        raise UsageError(f"pass at most one policy to start from, not {names}")
     logs = [source for source in sources if source not in policies]
     data = open_logs(logs) if logs else None
     return data, load_policies(policies[0]) if policies else None

@@ -55,7 +55,7 @@ class IQLConfig(BootstrapConfig):
 
 
 class IQL(Learner):
-    """Learner of action values and of a policy that clones the better logged actions."""
+    """Implicit Q-learning: expectile values and a policy by advantage-weighted behavior cloning."""
 
     name = "iql"
     config_type: ClassVar[type[TrainingConfig]] = IQLConfig

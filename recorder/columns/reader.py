@@ -108,7 +108,7 @@ class McapReader:
         self._find_topics_in_chunks()
 
     def channels_of(self, topic: str) -> list[Channel]:
-        """Return the channels of a topic by id; several writers may have one channel each."""
+        """Return the channels of a topic, sorted by id; several writers have one channel each."""
         found = [channel for channel in self.channels.values() if channel.topic == topic]
         return sorted(found, key=lambda channel: channel.id)
 

@@ -79,7 +79,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
             damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # Only at the end: a copy of the rest at each record would take quadratic time.
+        # The length is checked first: copying the rest at each record would take quadratic time.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 

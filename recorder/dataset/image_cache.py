@@ -1,4 +1,4 @@
-"""Storage of image observations, and an uncompressed copy beside a log that can be mapped."""
+"""Storage of image observations, including an uncompressed copy that can be memory-mapped."""
 
 from __future__ import annotations
 

@@ -284,7 +284,7 @@ def _flags(column: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Remove rows from a column, in place if that is faster."""
+    """Return a column without some rows; the input array may be overwritten."""
     if len(column) < _LONG_EPISODE * len(rows):
         return np.delete(column, rows, axis=0)
     # Moving long runs of rows is cheaper than allocating another column.

@@ -114,7 +114,7 @@ def log_message(time_ns: int, text: str) -> bytes:
     # ROS's 32-bit seconds wrap around; the record's log_time does not.
     data += _LOG_START.pack(sec % 2**32, nanosec, _INFO)
     _append_strings(data, "mcaprl", text, "", "")
-    # The field `line`: 0.
+    # The value 0 of the field `line`.
     data += bytes(-len(data) % 4 + 4)
     return bytes(data)
 

@@ -65,7 +65,7 @@ def layout_of(
 
 
 def is_values_topic(topic: str) -> bool:
-    """Return whether a topic contains a policy's values of the steps."""
+    """Return whether a topic contains the outputs of a policy at each step, such as Q-values."""
     return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 

@@ -113,7 +113,7 @@ class SceneSource(Protocol):
         """Return frames that are fixed in their parents."""
 
     def frames(self) -> Sequence[Frame]:
-        """Return the current frames that move."""
+        """Return the moving frames at their current poses."""
 
 
 @runtime_checkable

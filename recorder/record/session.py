@@ -66,7 +66,7 @@ class EpisodeLog:
         """Create the file, or open it to append; see `RecordMcap`, whose arguments these are.
 
         Raises:
-            UsageError: The times would not rise, or `max_file_bytes` is too small.
+            UsageError: The timestamps would not increase, or `max_file_bytes` is too small.
             SpaceError, OutputExistsError, LogError: As for `LogWriter`.
         """
         self._description = description
@@ -74,11 +74,11 @@ class EpisodeLog:
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
         if self.step_ns < 1 or first_ns < 0:
             raise UsageError(
-                f"a step of {self.step_ns} ns from {first_ns} ns on: times must rise"
+                f"a step of {self.step_ns} ns from {first_ns} ns on: timestamps must increase"
                 " from 0 or later; give step_duration_s and start_time_ns"
             )
         if append and overwrite:
-            raise UsageError("append and overwrite exclude each other: choose one of the two")
+            raise UsageError("append and overwrite are mutually exclusive: pass only one")
         self._parts = None
         if max_file_bytes is not None:
             self._parts = _Parts(Path(path), max_file_bytes, overwrite=overwrite, append=append)

@@ -50,7 +50,7 @@ class OpenRows(Generic[Rows]):
 
         Args:
             field: Name in the message.
-            environments: (K,) numbers of environments, or one number.
+            environments: (K,) indexes of environments, or one index.
             steps: (K,) step of each environment, or one step.
             values: (K, *shape), or one scalar for all.
         """

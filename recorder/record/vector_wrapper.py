@@ -88,7 +88,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
         Raises:
             SpaceError: A log cannot contain the environments' spaces.
-            UsageError: The times would not rise, or the autoreset mode is unknown.
+            UsageError: The timestamps would not increase, or the autoreset mode is unknown.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if not isinstance(env, gym.vector.VectorEnv):

@@ -80,7 +80,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             SpaceError: A log cannot contain the environment's spaces.
-            UsageError: The times would not rise.
+            UsageError: The timestamps would not increase.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if isinstance(env, gym.vector.VectorEnv):

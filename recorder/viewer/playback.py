@@ -187,7 +187,7 @@ class Player:
         return self.time_ns >= self.end_ns
 
     def seek(self, time_ns: int) -> None:
-        """Set the clock, within the logs."""
+        """Set the clock, limited to the time range of the logs."""
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next_ns = self.time_ns + 1
 

@@ -16,7 +16,7 @@ Vector = tuple[float, float, float]
 
 
 def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, float]) -> Shape:
-    """Return a flat box just below z = 0, with its middle and edges in x and y."""
+    """Return a flat box just below z = 0, with the given center and edge lengths in x and y."""
     at = (float(middle_m[0]), float(middle_m[1]), -0.1)
     size = (float(size_m[0]), float(size_m[1]), 0.1)
     return Shape("ground", "box", color, size=size, position=at)

@@ -61,12 +61,12 @@ def classic_reward(distance_m: float, speed_m_s: float) -> float:
 
 @compiled
 def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_code: bool) -> int:
-    """Return the end of a decision: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
+    """Return the outcome of a step: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
 
     Args:
         distance_m: Distance to the nearest infinite line.
-        speed_m_s: Speed after the decision.
-        action: Action of the decision.
+        speed_m_s: Speed after the step.
+        action: Action of the step.
         hit: Whether the car's body touched something.
         by_code: Whether to follow the published code instead of the text.
     """

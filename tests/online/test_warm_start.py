@@ -270,4 +270,4 @@ def test_the_command_accepts_logs_and_a_policy(
     assert run([*command, "--from", str(logs), "--from", str(tmp_path / "cql")]) == 0
     twice = [*command, "--from", str(tmp_path / "cql"), "--from", str(tmp_path / "run")]
     assert run(twice) == 2
-    assert "begins with one policy" in capsys.readouterr().err
+    assert "pass at most one policy" in capsys.readouterr().err

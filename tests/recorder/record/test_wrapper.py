@@ -263,7 +263,7 @@ def test_the_policy_name_is_read_at_the_episodes_start(log_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [{"step_duration_s": 0.0}, {"start_time_ns": -5}])
 def test_log_times_must_increase(log_path: Path, options: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match="times must rise"):
+    with pytest.raises(UsageError, match="timestamps must increase"):
         mcaprl.RecordMcap(scripted(ONE), log_path, **options)
     assert not log_path.exists()
 
