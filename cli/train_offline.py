@@ -15,7 +15,6 @@ from mcaprl.texts import counted
 
 
 def _configs() -> list[Settings]:
-
     from mcaprl.offline.algorithms.registry import all_algorithms
 
     return [learner.config_type() for learner in all_algorithms().values()]

@@ -9,6 +9,7 @@ from typing import Any
 
 from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
+from mcaprl.api.ranges import check_fraction
 from mcaprl.errors import UsageError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -60,12 +61,13 @@ def annotate(
         progress: Opens the progress bar.
 
     Raises:
-        UsageError: There is nothing to add, or the log has it already.
+        UsageError: There is nothing to add, the log has it already, or `gamma` is out of its range.
         UnknownNameError: There is no such policy.
         PolicyError: A policy was trained on other spaces than the log's.
         LogError: The log cannot be read, or the sim does not repeat it.
         OutputExistsError: `out` exists.
     """
+    check_fraction(gamma=gamma)
     path, names, added = Path(file), as_names(policy), None
     if not names and not scene:
         raise UsageError("annotate needs --policy POLICY, --scene, or both")

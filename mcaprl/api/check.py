@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mcaprl.api.data import Paths
-from mcaprl.errors import LogError
+from mcaprl.api.ranges import check_least
+from mcaprl.errors import LogError, UsageError
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.repair.check import check_log
@@ -45,8 +46,14 @@ def check(data: Paths, *, threads: int = 1) -> CheckResult:
         data: File, folder or glob of logs, or several of them. A path without logs is a problem;
             the others are checked all the same.
         threads: Number of threads that decompress chunks.
+
+    Raises:
+        UsageError: `data` is empty, or `threads` is below 1.
     """
+    check_least(1, threads=threads)
     names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
+    if not names:
+        raise UsageError("no data: the list of files is empty")
     files: list[Path] = []
     missing: list[Problem] = []
     problems: list[Problem] = []

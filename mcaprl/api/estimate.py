@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.data import Data, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
+from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 
@@ -81,7 +82,7 @@ def estimate(
         progress: Opens the progress bar.
 
     Raises:
-        UsageError: A policy has no action probabilities.
+        UsageError: A policy has no action probabilities, or a number is out of its range.
         UnknownNameError: There is no such policy.
         PolicyError: A policy was trained on other spaces than the logs'.
         LogError: The logs cannot be read.
@@ -90,6 +91,9 @@ def estimate(
     from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
     from mcaprl.offline.estimate.ranking import ranking
 
+    check_fraction(gamma=gamma, epsilon=epsilon)
+    check_least(1, updates=updates)
+    check_least(0, seed=seed)
     dataset = opened(data, threads=threads)
     found = _policies(as_names(policies), dataset)
     config = replace(FQEConfig(), gamma=gamma, updates=updates)

@@ -14,6 +14,7 @@ import gymnasium as gym
 
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
+from mcaprl.api.ranges import check_least
 from mcaprl.errors import ReportError, UsageError, import_extra
 from mcaprl.files import write_json
 from mcaprl.page import Figure
@@ -112,13 +113,16 @@ def evaluate(
         progress: Opens the progress bar.
 
     Raises:
-        UsageError: `behavior` is of another sim, or would be overwritten.
+        UsageError: `behavior` is of another sim or would be overwritten, or a number is out of its
+            range.
         UnknownNameError: There is no such sim or policy.
         PolicyError: A policy has other spaces than the sim.
         OutputExistsError: `record` exists.
         MissingExtraError: The packages of the sim, the policies or the report are not installed.
         ReportError: The report cannot be written.
     """
+    check_least(1, episodes=episodes)
+    check_least(0, seed=seed)
     names, options = as_names(policies), all_options(observation, rules, sim_options)
     log, folder = (None if path is None else Path(path) for path in (record, report))
     env = make_sim(sim, **options)

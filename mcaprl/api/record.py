@@ -17,6 +17,7 @@ import numpy as np
 
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import policies_of, policy_names
+from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.errors import OutputExistsError, UsageError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.record.wrapper import RecordMcap
@@ -117,7 +118,7 @@ def record(
         progress: Opens the progress bar.
 
     Raises:
-        UsageError: The arguments contradict each other.
+        UsageError: The arguments contradict each other, or a number is out of its range.
         UnknownNameError: There is no such sim or policy.
         OutputExistsError: `out` exists and may not be replaced.
         LogError: The log cannot be written.
@@ -163,10 +164,9 @@ def record(
 def _check_request(request: _Request, envs: int) -> None:
     if (request.episodes is None) == (request.steps is None):
         raise UsageError("record needs --episodes N or --steps N, one of the two")
-    if not 0 <= request.epsilon <= 1:
-        raise UsageError(f"--epsilon {request.epsilon}: give a probability from 0 to 1")
-    if min(envs, request.episodes or 1, request.steps or 1) < 1:
-        raise UsageError("record needs at least one episode or step, and one process")
+    check_fraction(epsilon=request.epsilon)
+    check_least(1, episodes=request.episodes, steps=request.steps, envs=envs)
+    check_least(0, seed=request.seed)
     if envs > 1 and request.append:
         raise UsageError("--append needs one file, and --envs writes several: leave out one")
     if envs > 1 and request.out.suffix == ".mcap":

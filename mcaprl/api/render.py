@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.api.environments import check_episode, sim_of
+from mcaprl.api.ranges import check_positive
 from mcaprl.errors import LogError, UsageError
 from mcaprl.progress import Advance, ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -72,11 +73,15 @@ def render(
         progress: Opens the progress bar.
 
     Raises:
-        UsageError: The log has no such episode, or the sim renders no images.
+        UsageError: There is no output, the log has no such episode, `speed` is not positive, or the
+            sim renders no images.
         LogError: The log has no scene, and the sim does not repeat the episode.
         OutputExistsError: An output exists.
         MissingExtraError: The packages of the `video` extra are not installed.
     """
+    check_positive(speed=speed)
+    if video is None and contact_sheet is None:
+        raise UsageError("render needs a video, a contact sheet, or both")
     path = Path(file)
     check_episode(open_logs(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from mcaprl.api.data import Paths
 from mcaprl.api.environments import check_episode
+from mcaprl.api.ranges import check_port, check_positive
 from mcaprl.files import write_json
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
@@ -60,10 +61,13 @@ def replay(
         stop: Event that ends the replay.
 
     Raises:
-        UsageError: A log does not have the episode, or the port is taken.
+        UsageError: A log does not have the episode, the port is taken, or a number is out of its
+            range.
         LogError: A log cannot be read.
         MissingExtraError: The packages of the `foxglove` extra are not installed.
     """
+    check_positive(speed=speed)
+    check_port(port)
     paths = find_logs(files)
     datasets = [open_logs(path, columns=[]) for path in paths]
     windows = []

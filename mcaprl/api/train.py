@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.data import Data
+from mcaprl.api.ranges import check_least
 from mcaprl.errors import MissingExtraError, UsageError
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -62,7 +63,8 @@ def train(
 
     Raises:
         UnknownNameError: There is no such algorithm.
-        UsageError: The algorithm has no such setting, or there is no such device.
+        UsageError: The algorithm has no such setting, there is no such device, or a number is out
+            of its range.
         OutputExistsError: `out` contains a run.
         LogError: The logs cannot be read.
         SpaceError: The algorithm does not support the observations or actions.
@@ -75,6 +77,8 @@ def train(
     from mcaprl.offline.training.follow import GrowingLogs
     from mcaprl.offline.training.train import train as train_dataset
 
+    check_least(1, seeds=seeds, threads=threads)
+    check_least(0, seed=seed)
     out = Path(out)
     if resume and (out / CONFIG_NAME).exists():
         earlier = read_config(out)

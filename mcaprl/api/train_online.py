@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, is_policy, load_policies
+from mcaprl.api.ranges import check_least, check_port
 from mcaprl.api.replay import LiveAddress
 from mcaprl.api.train import torch_threads
 from mcaprl.errors import UsageError
@@ -73,7 +74,8 @@ def train_online(
 
     Raises:
         UnknownNameError: There is no such sim, algorithm or preset.
-        UsageError: No sim is given, or the arguments contradict the preset.
+        UsageError: No sim is given, the arguments contradict the preset, or a number is out of its
+            range.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
         PolicyError: The policy's network in `sources` differs from the agent's.
@@ -84,6 +86,9 @@ def train_online(
     from mcaprl.online.task import choose_task
     from mcaprl.online.train import train
 
+    check_least(1, seeds=seeds, threads=threads)
+    check_least(0, seed=seed)
+    check_port(port)
     out = Path(out)
     options = all_options(observation, rules, sim_options)
     task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)

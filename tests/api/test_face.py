@@ -17,6 +17,7 @@ import pytest
 
 import mcaprl
 from mcaprl.cli import cli
+from mcaprl.errors import UsageError
 from tests.support.paths import GOLDEN
 
 ROOT = Path(__file__).parent.parent.parent
@@ -79,6 +80,17 @@ def test_each_option_is_an_argument() -> None:
     assert used == set(ONLY_OPTIONS), "a reason without its option"
 
 
+def test_defaults_of_options_are_those_of_the_arguments() -> None:
+    for command, option, is_setting in _options():
+        # An option without a default has a marker of click's here, which is none of these types.
+        if is_setting or option.is_flag or not isinstance(option.default, str | int | float):
+            continue
+        name = max(option.opts, key=len).lstrip("-").replace("-", "_")
+        for function in (getattr(mcaprl, one) for one in _functions(command)):
+            argument = inspect.signature(function).parameters.get(name)
+            assert argument is None or argument.default == option.default, f"{command} {name}"
+
+
 def test_dir_lists_the_public_names() -> None:
     code = "import mcaprl, mcaprl.cli; print(dir(mcaprl) == sorted(mcaprl.__all__))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -90,6 +102,11 @@ def test_public_names_are_in_the_api_page(name: str) -> None:
     if name != "__version__":
         assert inspect.getdoc(getattr(mcaprl, name))
     assert f"\n## mcaprl.{name}\n" in (ROOT / "docs" / "api.md").read_text()
+
+
+def test_errors_show_their_public_path() -> None:
+    assert repr(UsageError) == "<class 'mcaprl.errors.UsageError'>"
+    assert mcaprl.McaprlError.__module__ == "mcaprl.errors"
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -163,3 +180,45 @@ def test_functions_print_nothing(
     assert mcaprl.annotate("a.mcap", "d.mcap", policy="run").steps == len(data)
     assert mcaprl.layout("a.mcap") == mcaprl.layout("a.mcap", "layout.json")
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        ("record", {"sim": "CartPole-v1", "episodes": 0}, "--episodes 0: give"),
+        ("record", {"sim": "CartPole-v1", "steps": 0}, "--steps 0: give"),
+        ("record", {"sim": "CartPole-v1", "steps": 9, "envs": 0}, "--envs 0: give"),
+        ("record", {"sim": "CartPole-v1", "steps": 9, "seed": -1}, "--seed -1: give"),
+        ("record", {"sim": "CartPole-v1", "steps": 9, "epsilon": 1.5}, "--epsilon 1.5: give"),
+        ("evaluate", {"sim": "CartPole-v1", "policies": "random", "episodes": 0}, "--episodes 0"),
+        ("evaluate", {"sim": "CartPole-v1", "policies": "random", "seed": -1}, "--seed -1"),
+        ("estimate", {"policies": "random", "gamma": float("nan")}, "--gamma nan: give"),
+        ("estimate", {"policies": "random", "epsilon": 2}, "--epsilon 2: give"),
+        ("estimate", {"policies": "random", "updates": 0}, "--updates 0: give"),
+        ("estimate", {"policies": "random", "seed": -1}, "--seed -1: give"),
+        ("annotate", {"policy": "run", "gamma": 2}, "--gamma 2: give"),
+        ("render", {"video": "a.gif", "speed": 0}, "--speed 0: give"),
+        ("render", {}, "render needs"),
+        ("replay", {"speed": 0}, "--speed 0: give"),
+        ("replay", {"port": 70_000}, "--port 70000: give"),
+        ("check", {"threads": 0}, "--threads 0: give"),
+        ("check", {"data": []}, "the list of files is empty"),
+        ("train", {"seeds": 0}, "--seeds 0: give"),
+        ("train", {"threads": 0}, "--threads 0: give"),
+        ("train", {"seed": -1}, "--seed -1: give"),
+        ("train_online", {"sim": "CartPole-v1", "threads": 0}, "--threads 0: give"),
+        ("train_online", {"sim": "CartPole-v1", "port": -1}, "--port -1: give"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_before_anything_is_written(
+    function: str, arguments: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    """Click checks the options' ranges, so that a function without checks would fail only here."""
+    call, out = getattr(mcaprl, function), tmp_path / "out.mcap"
+    log = GOLDEN / "discrete.mcap"
+    places = {"data": log, "file": log, "files": log, "out": out}
+    known = inspect.signature(call).parameters
+    given = {name: place for name, place in places.items() if name in known} | arguments
+    with pytest.raises(UsageError, match=message):
+        call(**given)
+    assert list(tmp_path.iterdir()) == []

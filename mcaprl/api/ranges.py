@@ -1,0 +1,57 @@
+"""Ranges of the numbers that the functions of the public API accept."""
+
+from __future__ import annotations
+
+from mcaprl.errors import UsageError
+from mcaprl.settings import flag
+
+
+def check_least(least: int, **numbers: int | None) -> None:
+    """Check that numbers are not below a bound; None is accepted.
+
+    >>> check_least(1, episodes=None, envs=0)
+    Traceback (most recent call last):
+    mcaprl.errors.UsageError: --envs 0: give a number of at least 1
+
+    Args:
+        least: Smallest number that is accepted.
+        **numbers: Numbers by the name of their argument.
+
+    Raises:
+        UsageError: A number is smaller.
+    """
+    for name, number in numbers.items():
+        if number is not None and number < least:
+            raise UsageError(f"{flag(name)} {number}: give a number of at least {least}")
+
+
+def check_fraction(**numbers: float | None) -> None:
+    """Check that numbers are from 0 to 1; None is accepted.
+
+    Raises:
+        UsageError: A number is not, or is NaN.
+    """
+    for name, number in numbers.items():
+        if number is not None and not 0 <= number <= 1:
+            raise UsageError(f"{flag(name)} {number}: give a number from 0 to 1")
+
+
+def check_positive(**numbers: float) -> None:
+    """Check that numbers are above 0.
+
+    Raises:
+        UsageError: A number is not, or is NaN.
+    """
+    for name, number in numbers.items():
+        if not number > 0:
+            raise UsageError(f"{flag(name)} {number}: give a number above 0")
+
+
+def check_port(port: int) -> None:
+    """Check that a port exists.
+
+    Raises:
+        UsageError: It does not.
+    """
+    if not 0 <= port <= 65535:
+        raise UsageError(f"--port {port}: give a number from 0 to 65535")
