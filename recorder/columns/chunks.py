@@ -35,7 +35,7 @@ SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
 LONG_RECORDS = _ZSTD(1)
 # Messages of different lengths are mostly for viewers and so repetitive that a slower search halves
 # their size.
-MIXED_RECORDS = _ZSTD(9)
+MIXED_RECORDS = _ZSTD(12)
 # Longer messages are mostly images.
 LONG_MESSAGE_BYTES = 2**11
 
