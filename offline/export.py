@@ -1,9 +1,9 @@
-"""Export of a trained policy as one self-contained ONNX file, for example for a robot.
+"""Export of a trained policy as one ONNX file for a robot.
 
 Inputs are the parts of the observation as the environment returns them, named as in `/rl/step`
-(`observation`, `camera`, ...), with a leading batch axis; a policy that stacks k frames accepts
-(B, k, *shape), oldest first. Outputs are `action` (B,) int64, values of the action space, and
-`scores` (B, A); the action is the one with the largest score. The model includes normalization.
+(`observation`, `camera`, ...), with a leading batch axis; a policy with frame stacks of k expects
+(B, k, *shape), oldest first. Outputs are `action` (B,) int64, a value of the action space, and
+`scores` (B, A), whose largest selects the action. The file includes the normalization.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, import_extra
-from mcaprl.offline.batches.observations import Observations
+from mcaprl.offline.batches.observations import Observations, discrete_sizes
 from mcaprl.offline.policy import Policy
 
 
@@ -29,7 +29,7 @@ class ExportedPolicy(nn.Module):
     """Policy as a module with plain tensors as inputs and outputs, for exporters."""
 
     def __init__(self, policy: Policy) -> None:
-        """Create the module from the networks and the normalization of a policy."""
+        """Wrap a policy's networks and normalization."""
         super().__init__()
         self.scores = policy.scores
         self.encoder = policy.encoder
@@ -44,7 +44,7 @@ class ExportedPolicy(nn.Module):
         return [leaf.name for leaf in self.encoder.leaves]
 
     def examples(self, batch_size: int, seed: int = 0) -> tuple[Tensor, ...]:
-        """Create arguments of `forward` from random observations."""
+        """Return arguments for `forward` from random observations."""
         space = self.encoder.space
         space.seed(seed)
         stack = (self.frame_stack,) if self.frame_stack > 1 else ()
@@ -68,7 +68,7 @@ class ExportedPolicy(nn.Module):
         return scores.argmax(1) + self.first_action, scores
 
     def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
-        """Encode observations as `ObservationEncoder.encode` does, in torch."""
+        """Do what `ObservationEncoder.encode` does, in torch."""
         encoder, rows = self.encoder, inputs[0].shape[0]
         n_images = len(encoder.images)
         shaped = zip(inputs[:n_images], encoder.image_inputs, strict=True)
@@ -116,7 +116,7 @@ def export_onnx(policy: object, path: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress the exporter's notices about optional packages and future versions."""
+    """Suppress the exporter's messages about optional packages and future changes."""
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -128,16 +128,15 @@ def _quiet() -> Iterator[None]:
 
 
 def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
-    """Encode one part of the space as (B, width): discrete values one-hot, others unchanged."""
+    """Return the numbers (B, width) of a part of the space: counters as one-hot codes."""
     flat = values.reshape(values.shape[0], -1)
-    if isinstance(space, spaces.Discrete):
-        counts, starts = [int(space.n)], [int(space.start)]
-    elif isinstance(space, spaces.MultiDiscrete):
-        counts, starts = space.nvec.ravel().tolist(), space.start.ravel().tolist()
-    else:
+    sizes = discrete_sizes(space)
+    if sizes is None:
         return flat.float()
+    assert isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+    starts = np.ravel(space.start)
     codes = [
-        nn.functional.one_hot(flat[:, k].long() - start, count).float()
-        for k, (count, start) in enumerate(zip(counts, starts, strict=True))
+        nn.functional.one_hot(column.long() - int(start), int(size)).float()
+        for column, start, size in zip(flat.unbind(1), starts, sizes, strict=True)
     ]
     return torch.cat(codes, 1)

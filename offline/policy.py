@@ -1,11 +1,10 @@
 """Trained policies: saved as safetensors and JSON, loaded without running any code from a file.
 
-`policy.json` describes the networks and how actions are selected; `policy.safetensors` contains
-the weights and the normalization of observations. The policy selects the action with the largest
-score. The kinds of scores (`acts_by`) and their algorithms:
+`policy.json` describes the networks and how they select actions; `policy.safetensors` contains
+their weights and the normalization of observations. The selected action is the largest of
 
     q_values            values Q(s, a)                                    dqn, double-dqn, cql
-    logits              unnormalized log-probabilities of actions         bc, iql
+    logits              log probabilities of actions, unnormalized        bc, iql
     filtered_q_values   Q(s, a) of actions likely under the logits        bcq
 """
 
@@ -52,10 +51,10 @@ _BROKEN_FILE_ERRORS = (
 
 
 class Scores(nn.Module):
-    """Module that maps observations to a score per action; the policy selects the largest."""
+    """Networks that map observations to a score per action; the policy selects the largest."""
 
     def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
-        """Create the module from the networks `q` or `logits`, or both."""
+        """Wrap the networks `q` or `logits`, or both."""
         super().__init__()
         self.networks = nn.ModuleDict(networks)
         self.acts_by = acts_by
@@ -67,7 +66,7 @@ class Scores(nn.Module):
         return allowed_only(outputs, observations.mask)
 
     def forward(self, observations: Observations) -> Tensor:
-        """Return the scores (B, A) of all actions."""
+        """Return the scores (B, A)."""
         if self.acts_by == "logits":
             return self.outputs("logits", observations)
         values = self.outputs("q", observations)
@@ -83,15 +82,15 @@ class Policy:
     """Trained policy with NumPy inputs and outputs, for B observations and A actions.
 
     Attributes:
-        name: Folders of the run and the seed, as `run/seed`.
-        algo: Name of the algorithm that trained the policy.
+        name: Folder names of the run and the seed.
+        algo: Algorithm that trained it.
         observation_space: Space of one observation.
         action_space: Space of one action.
         env_id: ID of the environment in the training log; empty if unknown.
-        env_kwargs: Keyword arguments of that environment.
-        frame_stack: Number of successive observations in one network input; see `act`.
+        env_kwargs: Keyword arguments to make that environment.
+        frame_stack: Number of successive observations in one input; see `act`.
         encoder: Encoder of observations as tensors.
-        scores: Module that computes the scores of actions.
+        scores: Networks that score actions.
     """
 
     name: str
@@ -106,59 +105,53 @@ class Policy:
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
-        """Drop the stored observations: the next ones are the first of their episodes."""
+        """Reset the stored frames: the next observations are the first of their episodes."""
         self._seen.clear()
 
     def act(self, observations: Any) -> NDArray[np.int64]:
         """Return the best actions (B,), values of `action_space`; the first of equal ones.
 
-        A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`
-        and stacks them. It also accepts full stacks (B, k, *shape), oldest first, and then neither
-        uses nor changes what is stored.
+        A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
+        It also accepts (B, k, *shape), oldest first, and then stores nothing.
 
         Raises:
-            PolicyError: The observations do not have the expected shape.
+            PolicyError: The shape of the observations is not (B, *shape).
         """
         if self.frame_stack > 1 and not self._is_stack(observations):
-            best = self._greedy(self._remember(self._encode(observations)))
+            best = self._greedy(self._stack_onto_stored(self._encode(observations)))
         else:
-            best = self._greedy(self._whole(observations))
+            best = self._greedy(self._inputs(observations))
         return best + self.action_space.start
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """Return the Q-values (B, A) of all actions, in the order of the action space.
-
-        Values of actions that the action mask excludes are minus infinity.
+        """Return the values (B, A) of all actions; minus infinity for masked actions.
 
         Args:
-            observations: Observations (B, *shape), or (B, k, *shape) if k frames are stacked.
+            observations: (B, *shape), or (B, k, *shape) for a frame stack of k.
 
         Raises:
-            PolicyError: The policy has no Q-values, or the observations do not have the expected
-                shape.
+            PolicyError: The policy has no values, or the observations have another shape.
         """
         if "q" not in self.scores.networks:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
         with torch.inference_mode():
             return cast(
-                NDArray[np.float32], self.scores.outputs("q", self._whole(observations)).numpy()
+                NDArray[np.float32], self.scores.outputs("q", self._inputs(observations)).numpy()
             )
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
         """Return the probabilities (B, A) of all actions.
 
-        For behavior cloning they estimate the policy that recorded the log; for IQL they are those
-        of the trained policy. A policy with Q-values is greedy: the action of `act` has
-        probability 1.
+        A policy that selects by Q-values is greedy: the action of `act` has probability 1.
 
         Args:
-            observations: Observations (B, *shape), or (B, k, *shape) if k frames are stacked.
+            observations: (B, *shape), or (B, k, *shape) for a frame stack of k.
 
         Raises:
-            PolicyError: The observations do not have the expected shape.
+            PolicyError: The observations have another shape.
         """
         with torch.inference_mode():
-            scores = self.scores(self._whole(observations))
+            scores = self.scores(self._inputs(observations))
             if self.scores.acts_by == "logits":
                 return cast(NDArray[np.float32], scores.softmax(1).numpy())
             best = nn.functional.one_hot(scores.argmax(1), scores.shape[1])
@@ -174,27 +167,27 @@ class Policy:
         except (KeyError, IndexError, TypeError):
             return False
 
-    def _whole(self, observations: Any) -> Observations:
-        """Encode complete network inputs, without stored observations."""
+    def _inputs(self, observations: Any) -> Observations:
+        """Return the networks' inputs, from these observations alone."""
         if self.frame_stack == 1:
             return self._encode(observations)
         if not self._is_stack(observations):
             raise PolicyError(
-                f"{self.name} looks at {self.frame_stack} observations in a row: give it"
+                f"{self.name} has a frame stack of {self.frame_stack}: observations must be"
                 f" (B, {self.frame_stack}, *shape), oldest first"
             )
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
-    def _remember(self, now: Observations) -> Observations:
-        """Store observations and return the stack that ends with them, padded with the first."""
+    def _stack_onto_stored(self, now: Observations) -> Observations:
+        """Store observations, and return the stack that ends with them; the first one repeats."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
         while len(self._seen) > self.frame_stack:
             self._seen.popleft()
         columns = zip(*(past.parts() for past in self._seen), strict=True)
-        in_rows = [torch.stack(column, 1).flatten(0, 1) for column in columns]
-        return now.like(in_rows).stacked(self.frame_stack)
+        stacks = [torch.stack(column, 1).flatten(0, 1) for column in columns]
+        return now.like(stacks).stacked(self.frame_stack)
 
     def _encode(self, observations: Any) -> Observations:
         try:
@@ -206,7 +199,7 @@ class Policy:
 def save_policy(
     folder: Path, learner: Learner, seed: int, env_id: str, env_kwargs: dict[str, Any]
 ) -> None:
-    """Write the current policy of one seed to a folder."""
+    """Write the current policy of a seed into a folder."""
     buffer = learner.buffer
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     weights = {
@@ -294,17 +287,17 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """Return the normalization of one image leaf and remove its tensors from the weights."""
+    """Return the input with the stored normalization, which is removed from `weights`."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()
     if shift.shape != image.shape:
-        raise ValueError(f"the mean image is {shift.shape}, images are {image.shape}")
+        raise ValueError(f"the mean image has shape {shift.shape}, images have {image.shape}")
     return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
 
 
 def _flatten(observations: Any) -> Any:
-    """Reshape arrays (B, k, *shape) to (B * k, *shape), also in nested dicts."""
+    """Reshape (B, k, *shape) to (B * k, *shape), also in nested dicts."""
     if isinstance(observations, dict):
         return {key: _flatten(part) for key, part in observations.items()}
     return observations.reshape(-1, *observations.shape[2:])

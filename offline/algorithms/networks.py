@@ -1,7 +1,7 @@
-"""Networks that map observations to values per action; images and vectors have separate stems.
+"""Networks from observations to one or more numbers per action.
 
-image   -> convolutions -> layer -+
-vector  ------------------> layer +-> layers -> outputs
+image  -> convolutions -> layer -+
+vector -----------------> layer -+-> layers -> outputs
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ class Architecture:
     """Architecture of a network.
 
     Attributes:
-        hidden: Widths of the fully connected layers; the first layer exists once per input.
-        channels: Channels of the three convolutions over each image.
-        layer_norm: Whether these layers have layer normalization before each ReLU
+        hidden: Widths of the fully connected hidden layers; each input has its own first layer.
+        channels: Output channels of the three convolutions over each image.
+        layer_norm: Whether the hidden layers are normalized before each ReLU
             (https://arxiv.org/abs/1607.06450).
-        dueling: Whether outputs are a value plus advantages of mean 0, with separate last hidden
-            layers (https://arxiv.org/abs/1511.06581).
+        dueling: Whether outputs are the sum of a value and advantages of mean 0, each with its own
+            last hidden layer (https://arxiv.org/abs/1511.06581).
     """
 
     hidden: tuple[int, ...]
@@ -37,7 +37,7 @@ class Architecture:
 
 
 class Network(nn.Module):
-    """Network from observations to outputs (B, *output_shape)."""
+    """A network that maps observations to outputs (B, *output_shape)."""
 
     def __init__(
         self,
@@ -46,18 +46,18 @@ class Network(nn.Module):
         output_shape: tuple[int, ...],
         architecture: Architecture,
     ) -> None:
-        """Build a network for a vector and images.
+        """Build the layers, with random weights.
 
         Args:
-            vector_width: Length of the vector; 0 for no vector.
-            images: Normalization of each image.
-            output_shape: Shape of the output; the first axis is actions if there are several.
-            architecture: Architecture of the hidden layers.
+            vector_width: Length of the vector; 0 if there is none.
+            images: Shape and normalization of each image.
+            output_shape: Shape of the outputs for one observation; (A, ...) for A actions.
+            architecture: Hidden layers.
         """
         super().__init__()
         self.output_shape = output_shape
         hidden, layer_norm = architecture.hidden, architecture.layer_norm
-        # Of a dueling network, the last hidden layer belongs to the head.
+        # The last hidden layer of a dueling network is part of its head.
         shared = hidden[:-1] if architecture.dueling else hidden
         self.stems = nn.ModuleList()
         width = 0
@@ -82,8 +82,8 @@ class Network(nn.Module):
         """Map observations to outputs."""
         inputs = [*observations.images, observations.vector]
         features = [stem(part) for stem, part in zip(self.stems, inputs, strict=False)]
-        whole = features[0] if len(features) == 1 else torch.cat(features, 1)
-        outputs = cast(Tensor, self.head(self.body(whole)))
+        joined = features[0] if len(features) == 1 else torch.cat(features, 1)
+        outputs = cast(Tensor, self.head(self.body(joined)))
         return outputs.view(-1, *self.output_shape)
 
 
@@ -98,11 +98,11 @@ class NatureConvolutions(nn.Module):
     scale: Tensor
 
     def __init__(self, image: ImageInput, channels: tuple[int, ...]) -> None:
-        """Build three convolutions with these numbers of output channels."""
+        """Build for images of this shape, with this number of output channels per convolution."""
         super().__init__()
         first, second, third = channels
         shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
-        # Computed from the data, not learned; saved with the observation encoder.
+        # They are not learned, and are saved with the normalization of the other observations.
         self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(
@@ -119,17 +119,17 @@ class NatureConvolutions(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map uint8 images to features."""
-        seen = (images.float() - self.shift) / self.scale
-        return cast(Tensor, self.layers(seen.permute(0, 3, 1, 2)))
+        normalized = (images.float() - self.shift) / self.scale
+        return cast(Tensor, self.layers(normalized.permute(0, 3, 1, 2)))
 
 
 class DuelingHead(nn.Module):
-    """Dueling head: Q = V + A - mean(A), the state value plus centered advantages."""
+    """Separate streams for the value of a state and the advantages: Q = V + A - mean(A)."""
 
     def __init__(
         self, n_inputs: int, hidden: tuple[int, ...], output_shape: tuple[int, ...], norm: bool
     ) -> None:
-        """Build two streams with separate hidden layers."""
+        """Build the two streams."""
         super().__init__()
         self.output_shape = output_shape
         layers, width = _layers(n_inputs, hidden, norm)
@@ -147,7 +147,7 @@ class DuelingHead(nn.Module):
 def _layers(
     n_inputs: int, widths: tuple[int, ...], layer_norm: bool
 ) -> tuple[list[nn.Module], int]:
-    """Fully connected layers with ReLU, and the width of the last."""
+    """Return fully connected layers with ReLU, and the width of the last."""
     layers: list[nn.Module] = []
     for width in widths:
         norm = [nn.LayerNorm(width)] if layer_norm else []

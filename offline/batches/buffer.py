@@ -1,7 +1,7 @@
 """Transitions as tensors, packed once and sampled at random.
 
-Each observation is stored once, as a frame. Transitions contain indices of frames; these and the
-n-step returns are computed when the data are packed, stacks of frames when they are sampled.
+Each observation is stored once, as a frame. Observations, next observations and frame stacks are
+indexes of frames; these and the n-step returns are computed when the data are packed.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
 
 @dataclass(frozen=True)
 class Packing:
-    """Construction of transitions from a log.
+    """How transitions are built from a log.
 
     Attributes:
-        frame_stack: Number of successive observations in one network input; at the start of an
-            episode, its first observation is repeated.
-        normalize: Normalization of network inputs to mean 0 and standard deviation 1.
-        gamma: Discount factor, within n-step returns and of the value that follows them.
+        frame_stack: Number of successive observations in one network input; the first of an
+            episode is repeated.
+        normalize: Whether network inputs are normalized to mean 0 and standard deviation 1.
+        gamma: Discount per step.
         n_steps: Number of rewards in a return; fewer at the end of an episode.
     """
 
@@ -49,14 +49,13 @@ class Batch:
     """Batch of R transitions.
 
     Attributes:
-        rows: Indices of the transitions in the buffer, (R,) int64.
-        observations: R observations before the actions.
-        actions: Indices of the actions, (R,) int64, from 0.
-        rewards: Sums of up to n discounted rewards, (R,) float32.
-        discounts: Discounts of the next observations' values, (R,) float32: gamma to the power of
-            the number of steps in between; 0 where the episode terminated, but not where it was
-            truncated.
-        next_observations: R observations up to n steps later.
+        rows: (R,) int64, row numbers in the buffer.
+        observations: R observations.
+        actions: (R,) int64, counted from 0.
+        rewards: (R,) float32, discounted sums of up to n rewards.
+        discounts: (R,) float32, gamma to the power of the number of steps between the two
+            observations; 0 where the episode terminated (and not where it was truncated).
+        next_observations: R observations, up to n steps later.
     """
 
     rows: Tensor
@@ -72,17 +71,16 @@ class TransitionBuffer:
     """All N transitions of a dataset, over F frames.
 
     Attributes:
-        encoder: Encoder of the frames.
+        encoder: Encoder that created the frames.
         action_space: Action space of the log.
-        packing: Construction of transitions.
-        frames: F encoded observations, each stored once.
-        starts: Index of the first frame of each frame's episode, (F,) int64.
-        places: Frame indices of observations and next observations, (2, N) int64.
-        actions: Indices of the actions, (N,) int64, from 0.
-        returns: n-step rewards and discounts, (2, N) float32; see `Batch`.
-        drawable: Rows with a weight above 0, (M,) int64; None if all rows have one.
-        cumulative: Cumulative weights of the drawable rows, (M,) float64; None if the weights
-            are equal.
+        packing: How transitions are built.
+        frames: Each observation once.
+        starts: (F,) int64, first frame of each frame's episode.
+        places: (2, N) int64, frames of each transition's observation and next observation.
+        actions: (N,) int64, counted from 0.
+        returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
+        drawable: (M,) int64, rows whose weight is above 0; None if all are.
+        cumulative: (M,) float64, cumulative weights of these rows; None if the weights are equal.
     """
 
     encoder: ObservationEncoder
@@ -109,14 +107,14 @@ class TransitionBuffer:
 
         Args:
             dataset: Dataset with discrete actions.
-            packing: Construction of transitions; default: single steps of single frames.
-            encoder: Encoder of other data, with its normalization; default: a new encoder.
-            weights: Sampling weight of the transitions of each episode, (E,), 0 for never;
-                default: equal weights.
+            packing: How transitions are built; default: single steps, single frames.
+            encoder: Encoder of other data, to reuse its normalization; default: a new one.
+            weights: (E,) relative frequencies with which an episode's transitions are drawn;
+                default: all equal.
 
         Raises:
-            SpaceError: The actions are not discrete or not in their space, or the networks do not
-                support the observations.
+            SpaceError: The actions are not discrete or outside their space, or no network supports
+                the observations.
             TrainingError: There are no transitions, a number is NaN or infinite, a logged action
                 was not allowed, or all weights are 0.
         """
@@ -156,15 +154,15 @@ class TransitionBuffer:
         return self.actions.device
 
     def to(self, device: torch.device) -> TransitionBuffer:
-        """Return the same transitions on a device.
+        """Return the same transitions on another device.
 
-        Rows are still sampled on the CPU, so a seed samples the same rows on every device.
+        Rows are still drawn on the CPU, so a seed draws the same ones on any device.
         """
         parts = {name: getattr(self, name).to(device) for name in _ON_DEVICE}
         return replace(self, **parts)
 
     def sample_rows(self, count: int, generator: torch.Generator) -> Tensor:
-        """Sample rows (count,) by their weights, with replacement, on the CPU."""
+        """Draw row numbers (count,) with replacement, by their weights, on the CPU."""
         if self.cumulative is None:
             total = len(self) if self.drawable is None else len(self.drawable)
             draws = torch.randint(total, (count,), generator=generator)
@@ -175,14 +173,14 @@ class TransitionBuffer:
         return draws if self.drawable is None else self.drawable.index_select(0, draws)
 
     def batch(self, rows: Tensor) -> Batch:
-        """Return the transitions of these rows (R,)."""
+        """Return the transitions of rows (R,)."""
         here, there = self.places.index_select(1, rows)
         rewards, discounts = self.returns.index_select(1, rows)
         actions = self.actions.index_select(0, rows)
         return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
 
     def drawn_by(self, weights: NDArray[np.float64]) -> TransitionBuffer:
-        """Return the same transitions with sampling weights (N,); 0 means never.
+        """Return the same transitions, with relative frequencies (N,) of being drawn.
 
         Raises:
             TrainingError: All weights are 0.
@@ -198,11 +196,11 @@ class TransitionBuffer:
         )
 
     def sample(self, batch_size: int, generator: torch.Generator) -> Batch:
-        """Sample transitions by their weights, with replacement."""
+        """Draw a batch of transitions."""
         return self.batch(self.sample_rows(batch_size, generator).to(self.device))
 
     def observe(self, places: Tensor) -> Observations:
-        """Return the network inputs at frames (R,), stacked with earlier frames if configured."""
+        """Return the network inputs at frames (R,), stacked with the frames before if configured."""
         count = self.packing.frame_stack
         if count == 1:
             return self.frames.rows(places)
@@ -213,12 +211,12 @@ class TransitionBuffer:
 
     @property
     def vector_width(self) -> int:
-        """Length of the vector in a network input."""
+        """Length of a network's input vector."""
         return self.encoder.width * self.packing.frame_stack
 
     @property
     def image_inputs(self) -> list[ImageInput]:
-        """Normalization of each image in a network input."""
+        """Shape and normalization of each image that a network sees."""
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
 
 
@@ -240,10 +238,10 @@ def choose_device(name: str) -> torch.device:
 
 
 def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
-    """Return the action space if the offline algorithms support it.
+    """Return the action space, if it is discrete.
 
     Raises:
-        SpaceError: The space is not Discrete.
+        SpaceError: It is not.
     """
     if not isinstance(space, spaces.Discrete):
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
@@ -251,10 +249,10 @@ def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
 
 
 def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Compute `places` and `returns` of `TransitionBuffer`.
+    """Return the places and returns of `TransitionBuffer`, over n steps or to the episode's end.
 
-    Rewards are summed over n steps or up to the end of the episode. After a truncation, the value
-    of the last observation still counts; after a termination, the discount is 0.
+    Termination ends the return. Truncation only ends the sum of rewards: the value of the state
+    after it still counts.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)
@@ -277,10 +275,7 @@ def _starts(frame_counts: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
-    """Check that observations are finite and logged actions are allowed.
-
-    A single NaN in the data would turn all network weights into NaN.
-    """
+    """Raise if a number is not finite or an action was not allowed; one NaN spoils all weights."""
     rows = torch.from_numpy(dataset.frame_of_step)
     _check_finite("observations", frames.vector[rows])
     _check_finite("next_observations", frames.vector[rows + 1])

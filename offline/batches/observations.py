@@ -1,11 +1,11 @@
-"""Encoding of observations as network inputs: one vector, images and an action mask.
+"""Encoding of an environment's observations as network inputs: a vector, images, an action mask.
 
-All parts that are not images (floats, flags, counters, at any depth of a Dict space) become one
-float32 vector: a Discrete part is one-hot encoded, uint8 values are divided by 255. Images stay
+Everything that is not an image (floats, flags, counters; at any depth of a Dict space) becomes part
+of one float32 vector: Discrete parts as one-hot codes, uint8 numbers divided by 255. Images stay
 uint8.
 
-The top-level key `action_mask` of a Dict space, with one flag per action, is not a network input:
-it marks the allowed actions, as in PettingZoo. It is part of the observation, so logs contain it.
+The top-level key `action_mask` of a Dict space, with one flag per action, is not an input: it lists
+the allowed actions, as in PettingZoo. It is in the log because it is part of the observation.
 """
 
 from __future__ import annotations
@@ -22,17 +22,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError
-from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE as SMALLEST_IMAGE
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
 
-MIN_IMAGE_EDGE = 36
-"""Smallest height and width in pixels for which the output of the convolutions is not empty."""
+MIN_CONVOLUTION_EDGE = 36
+"""Smallest image edge in pixels for which the output of the convolutions is not empty."""
 MASK_KEY = "action_mask"
-_MOST_IMAGES = 10_000
-"""Largest number of images, evenly spaced, used to compute the mean and the scale."""
+_MAX_IMAGES = 10_000
+"""Maximum number of images in a mean, evenly spaced."""
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
-"""Variance at or below which all images are considered equal up to rounding."""
+"""Variance of pixels (0 to 255) below which it is rounding error of equal images."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +39,9 @@ class Observations:
     """B observations as network inputs.
 
     Attributes:
-        vector: Vector inputs, (B, V) float32; V is 0 if there are only images.
-        images: Image inputs, (B, height, width, channels) uint8 each.
-        mask: Allowed actions, (B, A) bool; None if all actions are always allowed.
+        vector: (B, V) float32; V is 0 if there are only images.
+        images: (B, height, width, channels) uint8 each.
+        mask: (B, A) bool, allowed actions; None if all are always allowed.
     """
 
     vector: Tensor
@@ -50,7 +49,7 @@ class Observations:
     mask: Tensor | None = None
 
     def __len__(self) -> int:
-        """Return B, the number of observations."""
+        """Return B."""
         return len(self.vector)
 
     def parts(self) -> list[Tensor]:
@@ -59,24 +58,24 @@ class Observations:
         return [self.vector, *self.images, *mask]
 
     def like(self, parts: Sequence[Tensor]) -> Observations:
-        """Create observations with the same layout from other tensors, in the order of `parts`."""
+        """Return observations of other tensors, in the order of `parts`."""
         n_images = len(self.images)
         mask = None if self.mask is None else parts[-1]
         return Observations(parts[0], tuple(parts[1 : 1 + n_images]), mask)
 
     def rows(self, index: Tensor) -> Observations:
-        """Copy the rows with these indices (R,)."""
+        """Return a copy of the rows of an index (R,)."""
         if not self.images and self.mask is None:
             return Observations(self.vector.index_select(0, index))
         return self.like([part.index_select(0, index) for part in self.parts()])
 
     def split(self, rows: int) -> list[Observations]:
-        """Split into views of `rows` observations each; the last may have fewer."""
+        """Return views of `rows` observations each; the last may have fewer."""
         columns = [torch.split(part, rows) for part in self.parts()]
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Stack each `count` successive observations into one, which has the mask of the last."""
+        """Return B / count stacks of successive observations, each with the mask of its last one."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -88,18 +87,18 @@ class Observations:
         return Observations(self.vector.reshape(rows, -1), images, mask)
 
     def to(self, device: torch.device) -> Observations:
-        """Return the same observations on a device."""
+        """Return the same observations on another device."""
         return self.like([part.to(device) for part in self.parts()])
 
 
 @dataclass(frozen=True, eq=False)
 class ImageInput:
-    """Normalization of the images of one leaf: (values - shift) / scale.
+    """The shape and normalization of one camera's images: (pixels - shift) / scale.
 
     Attributes:
-        shape: Shape (height, width, channels) of one image.
-        shift: Mean image, (height, width, channels) float32; None for 0.
-        scale: Divisor of all pixels.
+        shape: (height, width, channels).
+        shift: (height, width, channels) float32, in 0 to 255; None is 0 everywhere.
+        scale: Divisor of the shifted pixels.
     """
 
     shape: tuple[int, ...]
@@ -107,51 +106,51 @@ class ImageInput:
     scale: float = 255.0
 
     def stacked(self, count: int) -> ImageInput:
-        """Return the normalization of `count` images stacked along the channels."""
+        """Return the input for stacks of `count` images along the channel axis."""
         height, width, channels = self.shape
         shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
         return replace(self, shape=(height, width, channels * count), shift=shift)
 
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
-        """Return a normalization with the mean image and the standard deviation over all pixels.
+        """Return the input whose shift is the mean image and whose scale is the deviation.
 
         All pixels share one scale, so pixels that hardly change stay small.
 
         Args:
             images: Images, (N, height, width) or (N, height, width, channels), N at least 1.
         """
-        chosen = np.linspace(0, len(images) - 1, min(len(images), _MOST_IMAGES)).astype(np.int64)
+        used = np.linspace(0, len(images) - 1, min(len(images), _MAX_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
         squares = 0.0
-        for rows in np.split(chosen, range(_IMAGES_AT_ONCE, len(chosen), _IMAGES_AT_ONCE)):
-            codes = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
-            total += codes.sum(0)
-            squares += float(np.square(codes).sum())
-        mean = total / len(chosen)
-        variance = squares / (len(chosen) * mean.size) - float(np.square(mean).mean())
+        for rows in np.split(used, range(_IMAGES_AT_ONCE, len(used), _IMAGES_AT_ONCE)):
+            pixels = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
+            total += pixels.sum(0)
+            squares += float(np.square(pixels).sum())
+        mean = total / len(used)
+        variance = squares / (len(used) * mean.size) - float(np.square(mean).mean())
         scale = math.sqrt(variance) if variance > _SMALLEST_VARIANCE else self.scale
         return replace(self, shift=mean.astype(np.float32), scale=scale)
 
 
 class ObservationEncoder:
-    """Encoder that converts observations of one space to tensors; saved with each policy.
+    """An encoder of observations of one space as tensors; saved with each policy.
 
     Attributes:
         space: Space of one observation.
         width: Length V of the vector.
-        image_inputs: Normalization of each image leaf.
-        images: Leaves that are images.
-        numbers: Leaves of the vector, with their spaces.
-        mask: Leaf of the action mask; None if there is no mask.
-        shift: Subtrahend of the vector, (V,) float32.
-        scale: Divisor of the shifted vector, (V,) float32.
+        image_inputs: Shape and normalization of each image.
+        images: Leaves of the space that are images.
+        numbers: Leaves that form the vector, with their spaces.
+        mask: Leaf that is the action mask, if any.
+        shift: (V,) float32, subtracted from the vector.
+        scale: (V,) float32, divisor of the shifted vector.
     """
 
     def __init__(self, space: spaces.Space[Any], n_actions: int) -> None:
-        """Create the encoder of a space, without normalization.
+        """Create the encoder, without normalization.
 
         Raises:
-            SpaceError: The networks do not support such observations.
+            SpaceError: No network supports these observations.
         """
         self.space = space
         leaves = {leaf.path: leaf for leaf in observation_leaves(space)}
@@ -163,7 +162,7 @@ class ObservationEncoder:
         self.images = [leaf for leaf, part in kinds if _is_image(part)]
         self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
         if not kinds:
-            raise SpaceError(f"the observation has only {MASK_KEY}")
+            raise SpaceError(f"the observation contains only {MASK_KEY}")
         self.image_inputs = [ImageInput((*leaf.shape, 1)[:3]) for leaf in self.images]
         widths = [_width(part) for _, part in self.numbers]
         self.width = sum(widths)
@@ -174,8 +173,8 @@ class ObservationEncoder:
     def normalize_to(self, observations: Any) -> None:
         """Normalize all inputs to mean 0 and standard deviation 1 over these observations.
 
-        Each element of the vector has a separate scale; all pixels of an image share one. Constant
-        elements keep their scale and become 0.
+        Each number has its own scale; all pixels of an image share one. Constant inputs keep their
+        scale and become 0.
         """
         self.image_inputs = [
             image.normalized_to(leaf.of(observations))
@@ -196,7 +195,7 @@ class ObservationEncoder:
             observations: Arrays (B, *shape), or nested dicts of such arrays.
 
         Raises:
-            SpaceError: The observations do not have the shapes of the space.
+            SpaceError: They have other shapes.
         """
         for leaf in self.leaves:
             _check_shape(leaf, observations)
@@ -212,14 +211,14 @@ class ObservationEncoder:
         )
 
     def is_stack(self, observations: Any, count: int) -> bool:
-        """Return whether these are stacks of `count` observations, (B, count, *shape)."""
+        """Return whether these are stacks of observations (B, count, *shape)."""
         return all(
             np.shape(leaf.of(observations))[1:] == (count, *leaf.shape) for leaf in self.leaves
         )
 
     @property
     def leaves(self) -> list[Leaf]:
-        """All leaves of an observation: images, then numbers, then the mask."""
+        """All parts of an observation: images, numbers, mask."""
         mask = [] if self.mask is None else [self.mask]
         return [*self.images, *(leaf for leaf, _ in self.numbers), *mask]
 
@@ -235,25 +234,25 @@ class ObservationEncoder:
         if self.mask is None:
             return None
         allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # After the end of an episode, all actions can be masked; values there are never used.
+        # After the end of an episode no action may be allowed; values there are never used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether a space is an image: uint8, (height, width) or (height, width, channels).
+    """Return whether a space is of images: uint8, (height, width) or (height, width, channels).
 
     Raises:
-        SpaceError: It is an image that the convolutions do not support.
+        SpaceError: It is, but the convolutions do not support its shape.
     """
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
     shape = space.shape
-    if len(shape) == 3 and shape[0] < SMALLEST_IMAGE <= min(shape[1:]):
+    if len(shape) == 3 and shape[0] < MIN_IMAGE_EDGE <= min(shape[1:]):
         raise SpaceError(f"images need shape (height, width, channels), got {shape}: transpose")
-    if len(shape) not in (2, 3) or min(shape[:2]) < SMALLEST_IMAGE:
+    if len(shape) not in (2, 3) or min(shape[:2]) < MIN_IMAGE_EDGE:
         return False
-    if min(shape[:2]) < MIN_IMAGE_EDGE:
-        least = f"{MIN_IMAGE_EDGE}x{MIN_IMAGE_EDGE}"
+    if min(shape[:2]) < MIN_CONVOLUTION_EDGE:
+        least = f"{MIN_CONVOLUTION_EDGE}x{MIN_CONVOLUTION_EDGE}"
         raise SpaceError(f"image observations need at least {least} pixels, got {shape}")
     return True
 
@@ -265,30 +264,30 @@ def _part_of(space: spaces.Space[Any], path: tuple[str, ...]) -> spaces.Space[An
     return space
 
 
-def _choices(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
-    """Return the number of values of each element of a discrete space; None for other spaces."""
+def discrete_sizes(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
+    """Return the number of values of each counter of a discrete space; None for other spaces."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.n])
     return space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else None
 
 
 def _width(space: spaces.Space[Any]) -> int:
-    choices = _choices(space)
-    return int(np.prod(space.shape or ()) if choices is None else choices.sum())
+    sizes = discrete_sizes(space)
+    return int(np.prod(space.shape or ()) if sizes is None else sizes.sum())
 
 
 def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Encode one part of the space as (B, width): discrete values one-hot, others unchanged."""
-    choices = _choices(space)
+    """Return the numbers (B, width) of a part of the space: counters as one-hot codes."""
+    sizes = discrete_sizes(space)
     flat = np.asarray(values).reshape(len(values), -1)
-    if choices is None:
+    if sizes is None:
         return flat.astype(np.float32, copy=False)
     assert isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     counted = flat - np.ravel(space.start)
-    if ((counted < 0) | (counted >= choices)).any():
+    if ((counted < 0) | (counted >= sizes)).any():
         raise SpaceError(f"observations are not in their space {space}")
     codes = [
-        np.eye(n, dtype=np.float32)[column] for n, column in zip(choices, counted.T, strict=True)
+        np.eye(n, dtype=np.float32)[column] for n, column in zip(sizes, counted.T, strict=True)
     ]
     return np.concatenate(codes, 1)
 

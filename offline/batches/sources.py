@@ -1,4 +1,4 @@
-"""Reading of several logs with weights, from the `DATA...` arguments of a command."""
+"""Datasets from several weighted logs: the argument `DATA...` of commands."""
 
 from __future__ import annotations
 
@@ -14,20 +14,16 @@ from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 
 def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
-    """Read logs, each a file, folder or glob, optionally followed by `:WEIGHT`.
-
-    A transition of weight 2 is sampled twice as often as one of weight 1, the default.
+    """Read logs as one dataset, and return it with the weight of each of its episodes.
 
     Args:
-        data: Logs, with or without weights.
+        data: Files, folders or globs, each with an optional suffix `:WEIGHT`. A transition of
+            weight 2 is drawn twice as often as one of weight 1, the default.
         threads: Number of threads that read chunks.
 
-    Returns:
-        All logs as one dataset, and the weight of each of its episodes.
-
     Raises:
-        UsageError: A weight is negative or not finite, or a file is listed with different weights.
-        LogError: A file is missing, not an MCAP file, damaged, or without a finished episode.
+        UsageError: A weight is negative or infinite, or a file is named with two weights.
+        LogError: A file is missing, damaged, not an MCAP file, or has no finished episode.
         SpaceError: The spaces of the logs differ.
     """
     weights: dict[Path, float] = {}
@@ -36,8 +32,8 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
         for path in find_logs(name):
             if weights.setdefault(path.resolve(), weight) != weight:
                 raise UsageError(
-                    f"{path} is meant twice, with weights {weights[path.resolve()]:g} and"
-                    f" {weight:g}: name it once"
+                    f"{path} is named twice, with weights {weights[path.resolve()]:g} and"
+                    f" {weight:g}; name it once"
                 )
     parts = [open_logs(path, threads=threads) for path in weights]
     pairs = zip(parts, weights.values(), strict=True)
@@ -46,7 +42,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
 
 
 def _split_weight(part: str) -> tuple[str, float]:
-    """Split `logs/a.mcap:2` into name and weight; the name of an existing file is not split."""
+    """Split `logs/a.mcap:2` into name and weight, unless a file has this whole name."""
     name, colon, number = part.rpartition(":")
     if not colon or Path(part).exists():
         return part, 1.0

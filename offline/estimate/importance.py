@@ -1,7 +1,6 @@
-"""Estimates of a policy's value from another's log, by importance sampling: pure functions.
+"""Off-policy estimates of a policy's value by importance sampling: pure functions.
 
-Each maps a table of episodes to ratios of means over them, which have a value for each resampling
-and an interval:
+Each maps a table of episodes to a `RatioEstimate`, which has a value and an interval:
 
     TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
     WIS     weighted                               the same, over the sum of all rho
@@ -33,15 +32,15 @@ from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate, divid
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTable:
-    """E episodes as rows, padded to T columns, one more than the steps of the longest episode.
+    """E episodes, padded to T steps: one more than the longest episode has.
 
     Attributes:
-        rewards: (E, T) reward of step t; 0 after the end.
-        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 after the end.
-        q: (E, T) Q(s, a) of the action taken, from the model; 0 after the end.
-        v: (E, T) value of the state before step t, sum_a pi(a|s) Q(s, a). After the end 0, except
-            for the value of the last state of a truncated episode.
-        gamma: Discount factor.
+        rewards: (E, T) reward of step t; 0 past the end.
+        ratios: (E, T) pi(a|s) / mu(a|s) of step t; 1 past the end.
+        q: (E, T) Q(s, a) of the model for the action taken; 0 past the end.
+        v: (E, T) V(s) = sum_a pi(a|s) Q(s, a) of the model; 0 past the end, except for the last
+            next state of a truncated episode.
+        gamma: Discount per step.
     """
 
     rewards: Floats
@@ -51,53 +50,53 @@ class EpisodeTable:
     gamma: float
 
     def __post_init__(self) -> None:
-        """Make sure that all columns are of the same episodes and steps."""
+        """Check that all arrays have the same shape."""
         shapes = {array.shape for array in (self.rewards, self.ratios, self.q, self.v)}
-        assert len(shapes) == 1, f"columns of different shapes: {shapes}"
+        assert len(shapes) == 1, f"arrays of different shapes: {shapes}"
 
     @property
     def discounts(self) -> Floats:
-        """(T,) gamma^t."""
+        """Discounts gamma^t (T,)."""
         powers: Floats = self.gamma ** np.arange(self.rewards.shape[1], dtype=np.float64)
         return powers
 
     @property
     def rho(self) -> Floats:
-        """(E, T) the product of the ratios up to and with step t."""
+        """Products (E, T) of the ratios up to and including step t."""
         return np.cumprod(self.ratios, axis=1, dtype=np.float64)
 
     @property
     def rho_before(self) -> Floats:
-        """(E, T) the product of the ratios before step t."""
+        """Products (E, T) of the ratios before step t."""
         return np.hstack([np.ones((len(self.ratios), 1)), self.rho[:, :-1]])
 
 
 def trajectory(episodes: EpisodeTable) -> RatioEstimate:
-    """TIS: the mean of rho_T sum_t gamma^t r_t."""
+    """Return TIS: the mean of rho_T sum_t gamma^t r_t."""
     return RatioEstimate.mean(episodes.rho[:, -1] * _returns(episodes))
 
 
 def weighted_trajectory(episodes: EpisodeTable) -> RatioEstimate:
-    """WIS: the mean of the returns, weighted by rho_T."""
+    """Return WIS: the mean of the returns, weighted by rho_T."""
     rho = episodes.rho[:, -1:]
     return RatioEstimate(np.ones(1), ((rho * _returns(episodes)[:, None], rho),))
 
 
 def per_decision(episodes: EpisodeTable) -> RatioEstimate:
-    """PDIS: the mean of sum_t gamma^t rho_t r_t."""
+    """Return PDIS: the mean of sum_t gamma^t rho_t r_t."""
     return RatioEstimate.mean((episodes.discounts * (episodes.rho * episodes.rewards)).sum(1))
 
 
 def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
-    """WPDIS: sum_t gamma^t of the mean reward at t, weighted by rho_t."""
+    """Return WPDIS: sum_t gamma^t times the mean reward at t, weighted by rho_t."""
     rho = episodes.rho
     return RatioEstimate(episodes.discounts, ((rho * episodes.rewards, rho),))
 
 
 def doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
-    """DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
+    """Return DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
 
-    Jiang and Li, equation 10, written out. With a model of zeros it is PDIS.
+    See Jiang and Li, equation 10. With a model of zeros it is PDIS.
     """
     unexplained = episodes.rho * (episodes.rewards - episodes.q)
     per_step = unexplained + episodes.rho_before * episodes.v
@@ -105,9 +104,9 @@ def doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
 
 
 def weighted_doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
-    """WDR: DR with rho_t over its sum at that step.
+    """Return WDR: DR with rho_t divided by its sum over the episodes.
 
-    Thomas and Brunskill, equation 10.
+    See Thomas and Brunskill, equation 10.
     """
     rho, before = episodes.rho, episodes.rho_before
     unexplained = rho * (episodes.rewards - episodes.q)
@@ -122,27 +121,26 @@ ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], RatioEstimate]]] = {
     "DR": doubly_robust,
     "WDR": weighted_doubly_robust,
 }
-"""Short names, as tables show them."""
+"""The estimators by their names in tables."""
 
 WHOLE_EPISODE: Final = ("TIS", "WIS")
-"""Those whose weights are of whole episodes; the others weigh each step."""
+"""Estimators with one weight per episode; the others have one per step."""
 
 
 def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
-    """(T,) how many episodes of the policy itself step t of the log is worth.
+    """Return Kish's effective sample size (T,) of each step: (sum rho_t)^2 / sum rho_t^2.
 
-    (sum rho_t)^2 / sum rho_t^2, Kish's effective sample size: E if all weights are equal, 1 if one
-    episode has all the weight, 0 if none has any.
+    It is E if all weights are equal, 1 if only one is not 0, and 0 if all are 0.
     """
     rho = episodes.rho
     return divide(rho.sum(0) ** 2, (rho**2).sum(0))
 
 
 def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
-    """Return the effective sample size of an estimate, in episodes.
+    """Return the effective number of episodes of an estimate.
 
-    For TIS and WIS it is that of whole episodes; for the other estimators it is the harmonic mean
-    over steps, weighted with the discounts, because the variances of the steps add up.
+    For TIS and WIS it is that of the last step. For the others it is the harmonic mean over steps,
+    weighted with the discounts, because the variances of the steps add up.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:
@@ -153,11 +151,10 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 
 
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
-    """The mean of an unbiased estimator's weights, over steps with their discounts: 1 is right.
+    """Return the mean importance weight of an unbiased estimator, whose expectation is 1.
 
-    It is clearly less where the log lacks whole episodes that the policy would make: the few that
-    could stand for them would have huge weights, and none happened to be logged. None for the
-    estimators that divide by it.
+    It is well below 1 if the log does not cover the policy's actions: the rare episodes with large
+    weights are missing. None for the weighted estimators, which divide by it.
     """
     if estimator == "TIS":
         return RatioEstimate.mean(episodes.rho[:, -1])
@@ -167,6 +164,6 @@ def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
 
 
 def _returns(episodes: EpisodeTable) -> Floats:
-    """(E,) discounted."""
+    """Return the discounted returns (E,)."""
     returns: Floats = (episodes.discounts * episodes.rewards).sum(1)
     return returns

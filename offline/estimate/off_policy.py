@@ -1,14 +1,13 @@
-"""What a policy is worth, from a log of others alone: estimates, how sure they are, and refusals.
+"""Off-policy evaluation: estimates of a policy's value from a log, with intervals and verdicts.
 
-Returns are discounted, and of whole episodes: from their first step to their end in the log. What a
-truncated episode would still have earned is counted by the estimators that have a model (FQE, DR,
-WDR), and not by those that only weigh what was logged.
+Values are discounted returns of whole episodes. The rewards that a truncated episode would still
+have received are included by the estimators with a model (FQE, DR, WDR) and not by the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -30,33 +29,33 @@ if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 LEAST_SAMPLE_SIZE: Final = 10.0
-"""Below this effective number of episodes there is an estimate, but no verdict."""
+"""Effective number of episodes below which the verdict is refused."""
 RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
 _ROWS_AT_ONCE = 4096
 _STANDARD_ERRORS = 4.0
-"""So far from what must be, chance no longer explains it."""
+"""Deviation of the mean weight from 1 above which the verdict is refused."""
 
 
 class StochasticPolicy(Protocol):
-    """What is to be evaluated."""
+    """A policy that can be evaluated."""
 
     def action_probabilities(self, observations: Any) -> NDArray[np.floating]:
-        """(B, A) for B observations."""
+        """Return the probabilities (B, A) of the actions for B observations."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One estimator's answer.
+    """The estimate of one estimator for one policy.
 
     Attributes:
-        policy: its name.
+        policy: Name of the policy.
         estimator: `FQE` or one of `importance.ESTIMATORS`.
-        value: the discounted return; None where nothing can be computed.
+        value: Discounted return; None if it cannot be computed.
         interval: 95 % bootstrap-t interval over episodes.
-        effective_sample_size: how many episodes of the policy itself the log is worth.
-        verdict: `ok`, or `refused: ` and why.
+        effective_sample_size: Number of the policy's own episodes that would be as informative.
+        verdict: `ok`, or `refused: ` and the reason.
     """
 
     policy: str
@@ -72,27 +71,19 @@ class Estimate:
         return self.verdict == TRUSTED
 
     def to_json(self) -> dict[str, Any]:
-        """As `mcaprl evaluate --data --json` prints it."""
-        return {
-            "policy": self.policy,
-            "estimator": self.estimator,
-            "value": self.value,
-            "interval": self.interval and list(self.interval),
-            "effective_sample_size": self.effective_sample_size,
-            "verdict": self.verdict,
-        }
+        """Return the attributes, as `mcaprl evaluate --data --json` prints them."""
+        return asdict(self)
 
 
 @dataclass(frozen=True)
 class PolicyEstimates:
-    """What a log says of one policy.
+    """The estimates of all estimators for one policy.
 
     Attributes:
-        policy: its name.
-        coverage: the mean probability that it has for the logged actions: 1 if the log does just
-            what it would do, 0 if never. Where it is low, estimates rest on few steps or on the
-            model's guesses.
-        estimates: one for each estimator.
+        policy: Name of the policy.
+        coverage: Mean probability of the logged actions under the policy. If it is low, the
+            estimates depend on few steps or on the model's values of unseen actions.
+        estimates: One estimate per estimator.
     """
 
     policy: str
@@ -101,26 +92,26 @@ class PolicyEstimates:
 
 
 class OffPolicyEvaluator:
-    """A log, ready to be asked about policies.
+    """An evaluator of policies on one log.
 
     Attributes:
-        gamma: the discount.
-        behavior_return: mean discounted return of the logged episodes.
-        behavior_interval: its 95 % bootstrap-t interval.
+        gamma: Discount per step.
+        behavior_return: Mean discounted return of the logged episodes.
+        behavior_interval: 95 % bootstrap-t interval of that mean.
     """
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
         """Prepare a log.
 
         Args:
-            dataset: with discrete actions.
-            config: of the model; its `gamma` is the discount of all estimates.
-            seed: of the model and of the resampling.
+            dataset: Dataset with discrete actions.
+            config: Settings of the model; its `gamma` is the discount of all estimates.
+            seed: Seed of the model and of the resampling.
 
         Raises:
-            SpaceError: the actions are not discrete.
-            TrainingError: there are no transitions, or numbers that are not finite.
-            UsageError: there are fewer episodes than the model needs to be tested on others.
+            SpaceError: The actions are not discrete.
+            TrainingError: There are no transitions, or a number is not finite.
+            UsageError: There are fewer episodes than cross-fitting needs.
         """
         self._config = config or FQEConfig()
         self._seed = seed
@@ -151,15 +142,15 @@ class OffPolicyEvaluator:
         """Estimate a policy's discounted return with every estimator.
 
         Args:
-            policy: what is to be evaluated; None acts at random.
-            name: for tables.
-            epsilon: probability with which it is to act at random; some, and the estimates need
-                fewer episodes.
-            on_update: called after each of the model's updates, `updates_of_model` in all.
+            policy: Policy to evaluate; None is the uniform random policy.
+            name: Name in tables.
+            epsilon: Probability of a random action instead of the policy's; with a larger one, the
+                estimates need fewer episodes.
+            on_update: Callback for each update of the model, `updates_of_model` in total.
 
         Raises:
-            PolicyError: the policy takes other observations.
-            SpaceError: it has another number of actions.
+            PolicyError: The observations do not fit the policy.
+            SpaceError: The policy has another number of actions.
         """
         pi, pi_next = (
             self._probabilities(policy, observations, epsilon)
@@ -182,13 +173,13 @@ class OffPolicyEvaluator:
 
     @property
     def updates_of_model(self) -> int:
-        """How often `evaluate` calls `on_update`."""
+        """Number of calls of `on_update` in `evaluate`."""
         return FOLDS * self._config.updates
 
     def _probabilities(
         self, policy: StochasticPolicy | None, observations: Any, epsilon: float
     ) -> Floats:
-        """(N, A) of the policy in question."""
+        """Return the probabilities (N, A) of a policy with this epsilon."""
         actions = int(self._buffer.action_space.n)
         uniform = np.full((len(self._buffer), actions), 1 / actions)
         if policy is None:
@@ -205,20 +196,20 @@ class OffPolicyEvaluator:
     def _model(
         self, pi: Floats, pi_next: Floats, on_update: Callable[[], None]
     ) -> tuple[Floats, Floats, Floats]:
-        """Estimate Q of the actions, V of the states and V of the next states, (N,) each.
+        """Return Q of the actions taken, V of the states, and V of the next states, (N,) each.
 
-        Cross-fitting: each half of the episodes is evaluated by a model that was trained on the
-        other half, because a model is biased on its training data.
+        Cross-fitting: the model that evaluates an episode was trained on the other half of the log,
+        because values of its own training episodes are biased.
         """
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()
         q, v, v_next = (np.zeros(len(fold)) for _ in range(3))
         for held_out in range(FOLDS):
-            in_fold = fold == held_out
-            seen = self._buffer.drawn_by((~in_fold).astype(np.float64))
+            evaluated = fold == held_out
+            training = self._buffer.drawn_by((~evaluated).astype(np.float64))
             learner = FQE(
                 self._config,
-                seen,
+                training,
                 [self._seed + held_out],
                 torch.from_numpy(pi_next.astype(np.float32)),
             )
@@ -227,9 +218,9 @@ class OffPolicyEvaluator:
                 on_update()
             values = learner.values(next_states=False).numpy().astype(np.float64)
             values_next = learner.values(next_states=True).numpy()
-            q[in_fold] = values[np.arange(len(fold)), actions][in_fold]
-            v[in_fold] = (pi * values).sum(1)[in_fold]
-            v_next[in_fold] = (pi_next * values_next.astype(np.float64)).sum(1)[in_fold]
+            q[evaluated] = values[np.arange(len(fold)), actions][evaluated]
+            v[evaluated] = (pi * values).sum(1)[evaluated]
+            v_next[evaluated] = (pi_next * values_next.astype(np.float64)).sum(1)[evaluated]
         return q, v, v_next
 
     def _table(self, ratios: Floats, q: Floats, v: Floats, v_next: Floats) -> EpisodeTable:
@@ -266,12 +257,16 @@ class OffPolicyEvaluator:
         mean, error = float(weights.values(once)[0]), float(weights.errors(once)[0])
         if abs(mean - 1) <= _STANDARD_ERRORS * error + 1e-9:
             return verdict
-        return f"refused: weights of {mean:.2f} in the mean, not 1: the log lacks what it does"
+        return (
+            f"refused: mean importance weight {mean:.2f}, expected 1: the log does not cover this"
+            " policy's actions"
+        )
 
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
-        """The model's mean value of the first states; the interval knows of no other model.
+        """Return the model's mean value of the first states.
 
-        Its sample size is that of single steps, in episodes: the model follows no trajectory.
+        The interval does not include the variation between trained models. The effective sample
+        size is that of single steps, in episodes, because the model is trained on single steps.
         """
         first = v[np.cumsum(self._lengths) - self._lengths]
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
@@ -280,13 +275,13 @@ class OffPolicyEvaluator:
         if verdict == TRUSTED and not self._config.enough_syncs:
             verdict = (
                 f"refused: {self._config.updates // self._config.target_interval} target syncs"
-                f" are too few for gamma {self.gamma}: more updates"
+                f" are too few for gamma {self.gamma}; increase the updates"
             )
         interval = RatioEstimate.mean(first).interval(self._counts)
         return Estimate(name, "FQE", float(first.mean()), interval, size, verdict)
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:
-        """(E, T) a column of steps as one row for each episode, one longer than the longest."""
+        """Return a column of steps as rows (E, T), one per episode, padded with `fill`."""
         table = np.full((len(self._lengths), int(self._lengths.max()) + 1), fill)
         steps = np.arange(table.shape[1]) < self._lengths[:, None]
         table[steps] = column

@@ -6,7 +6,7 @@ b is 1 for the unbiased estimators and the mean weight for the weighted (self-no
 Weights that are products over many steps are skewed: most logs lack the rare episodes of large
 weight, and for the same reason show little variance. Percentiles of a bootstrap share this fault:
 their 95 % intervals contain the true value in 85 to 93 of 100 logs of 50 episodes. The bootstrap-t
-resamples the error in units of the standard error instead:
+resamples the error in units of the resampling's standard error instead:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
 

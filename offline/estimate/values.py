@@ -1,6 +1,6 @@
-"""What a policy thinks of logged steps: values, surprises, doubts, and what else it would do.
+"""Values, TD errors, entropy and actions of a policy at logged steps.
 
-T is the number of an episode's steps and A that of actions.
+T is the number of steps of an episode, A the number of actions, B the number of observations.
 """
 
 from __future__ import annotations
@@ -25,42 +25,38 @@ Columns = dict[str, NDArray[Any]]
 
 
 class ValuePolicy(Protocol):
-    """A trained policy with discrete actions; B is the number of observations."""
+    """A trained policy with discrete actions."""
 
     @property
     def name(self) -> str:
-        """What to call it."""
+        """Name of the policy."""
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
-        """(B, A); raises PolicyError if it has none."""
+        """Return the values (B, A); raise PolicyError if the policy has none."""
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """(B, A)."""
+        """Return the probabilities (B, A)."""
 
 
 def value_columns(
     policy: ValuePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
 ) -> Columns:
-    """What a policy thinks of an episode: the fields of `recorder.schema.values_schema`.
+    """Return the fields of `recorder.format.schema.values_schema` for an episode, of length T.
 
     Args:
-        policy: with or without Q-values; without, all that comes of them is NaN. One that stacks
-            frames is given each observation with those before it.
-        episode: of T steps.
-        action_space: of the log.
-        gamma: the discount that the policy learned with.
-
-    Returns:
-        Arrays of length T.
+        policy: Policy to evaluate; if it has no Q-values, fields computed from them are NaN.
+        episode: Episode of T steps.
+        action_space: Action space of the log.
+        gamma: Discount with which the policy was trained.
 
     Raises:
-        UsageError: the actions are not discrete.
-        PolicyError: the policy does not take these observations.
+        UsageError: The actions are not discrete.
+        PolicyError: The observations do not fit the policy.
     """
     if not isinstance(action_space, spaces.Discrete):
         raise UsageError(f"values are of discrete actions; the log's are {action_space}")
-    seen = _with_last(episode.observations, episode.next_observations)
-    observations = _in_a_row(seen, getattr(policy, "frame_stack", 1))
+    frames = _with_last(episode.observations, episode.next_observations)
+    observations = _stacked(frames, getattr(policy, "frame_stack", 1))
     taken = episode.actions - int(action_space.start)
     try:
         q = policy.q_values(observations)
@@ -90,14 +86,14 @@ def td_errors(
     terminated: NDArray[np.bool_],
     gamma: float,
 ) -> NDArray[np.float32]:
-    """Return the Q-learning errors (T,) of an episode.
+    """Return the Q-learning errors (T,): r + gamma max_a Q(s', a) - Q(s, a_data).
 
     Args:
-        q: (T + 1, A) values at each observation, including the last.
+        q: (T + 1, A) values at each observation, including the last next one.
         actions: (T,) actions taken, counted from 0.
         rewards: (T,) rewards.
-        terminated: (T,) flags of terminal transitions.
-        gamma: Discount factor.
+        terminated: (T,) steps after which the return ends.
+        gamma: Discount per step.
     """
     target = q_learning_target(
         torch.from_numpy(rewards.astype(np.float32)),
@@ -109,13 +105,13 @@ def td_errors(
 
 
 def softmax(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Of each row: the Boltzmann policy at temperature 1."""
+    """Return the Boltzmann policy at temperature 1, row by row."""
     odds = np.exp(values - values.max(1, keepdims=True))
     return cast(NDArray[np.float32], odds / odds.sum(1, keepdims=True))
 
 
 def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(T,) -sum p log p over log A, of rows (T, A): from 0, sure, to 1, all alike."""
+    """Return -sum p log p / log A (T,) of rows (T, A): 0 is deterministic, 1 is uniform."""
     actions = probabilities.shape[1]
     if actions == 1:
         return np.zeros(len(probabilities), np.float32)
@@ -125,7 +121,7 @@ def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32
 
 
 def gamma_of_run(path: Path) -> float:
-    """The discount in a run's settings, of a run or of one of its seeds; else our default."""
+    """Return the discount in the settings of a run or seed folder, or the default of DQN."""
     for folder in (path, path.parent):
         config = folder / CONFIG_NAME
         if config.is_file():
@@ -137,20 +133,17 @@ def gamma_of_run(path: Path) -> float:
 
 
 def _with_last(observations: Any, next_observations: Any) -> Any:
-    """Return the observations of all steps and the final observation, (T + 1, ...)."""
+    """Return the observations of all steps and the last next one, (T + 1, ...)."""
     if isinstance(observations, dict):
         return {k: _with_last(observations[k], next_observations[k]) for k in observations}
     return np.concatenate([observations, next_observations[-1:]])
 
 
-def _in_a_row(observations: Any, count: int) -> Any:
-    """(T + 1, count, ...) each observation with those before it, oldest first; the first repeats.
-
-    One alone stays as it is, (T + 1, ...).
-    """
+def _stacked(observations: Any, count: int) -> Any:
+    """Return frame stacks (T + 1, count, ...), oldest first; for a count of 1, (T + 1, ...)."""
     if count == 1:
         return observations
     if isinstance(observations, dict):
-        return {key: _in_a_row(part, count) for key, part in observations.items()}
+        return {key: _stacked(part, count) for key, part in observations.items()}
     rows = np.arange(len(observations))[:, None] - np.arange(count)[::-1]
     return observations[np.maximum(rows, 0)]

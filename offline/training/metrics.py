@@ -6,8 +6,6 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
@@ -18,7 +16,7 @@ from mcaprl.sims.evaluation.statistics import bootstrap_interval
 
 
 class MetricsWriter:
-    """A writer of one row per call; a context manager that closes both files.
+    """A writer of one row per call.
 
     The CSV has columns `update`, `learning_rate` and the algorithm's terms. Values are those of one
     batch, not averages, so the same seed writes the same file.
@@ -51,16 +49,7 @@ class MetricsWriter:
         for name, value in scalars.items():
             self._board.add_scalar(f"train/{name}", value, update)
 
-    def __enter__(self) -> Self:
-        """Return the writer itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Close both files."""
         self._file.close()
         self._board.close()

@@ -8,14 +8,14 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mcaprl.errors import TrainingError, UsageError
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -43,8 +43,6 @@ from mcaprl.runs import CHECKPOINT_NAME, RunIdentity, open_run, policy_files, se
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
-
-_T = TypeVar("_T")
 
 
 def train(
@@ -187,9 +185,11 @@ class _Run:
         warned = False
         with ExitStack() as stack:
             metrics = [
-                stack.enter_context(MetricsWriter(seed_folder(self.folder, seed), learner.step + 1))
+                MetricsWriter(seed_folder(self.folder, seed), learner.step + 1)
                 for seed in (seeds if learner.step < updates else ())
             ]
+            for writer in metrics:
+                stack.callback(writer.close)
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
@@ -209,7 +209,7 @@ class _Run:
         """Update until metrics or a checkpoint are due, and write them."""
         config = learner.config
         while True:
-            terms = self._check(learner.update)
+            terms = self._update(learner)
             last = learner.step == config.updates
             checkpoint_due = last or learner.step % config.checkpoint_interval == 0
             if checkpoint_due or learner.step % config.log_interval == 0:
@@ -245,10 +245,10 @@ class _Run:
             save_policy(folder, learner, seed, self.dataset.env_id, self.dataset.env_kwargs)
             save_checkpoint(folder, learner, seed, self.identity)
 
-    def _check(self, work: Callable[[], _T]) -> _T:
-        """Call `work`, and report a loss that is not finite with the last good checkpoint."""
+    def _update(self, learner: Learner) -> dict[str, Tensor]:
+        """Make one update; report a loss that is not finite with the last good checkpoint."""
         try:
-            return work()
+            return learner.update()
         except NotFiniteError as error:
             paths = sorted(self.folder.glob(f"seed-*/{CHECKPOINT_NAME}"))
             good = ", ".join(map(str, paths)) or "none yet"

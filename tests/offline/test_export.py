@@ -1,4 +1,4 @@
-"""Exported policies act as the originals do, in a runtime that knows nothing of us."""
+"""Exported policies act as the originals, in ONNX Runtime."""
 
 from __future__ import annotations
 

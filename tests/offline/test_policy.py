@@ -1,4 +1,4 @@
-"""Saved policies: a round trip through files, and files that are not one."""
+"""Saved policies: the round trip through files, and broken files."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def learner_of(config: TrainingConfig, dataset: Dataset) -> Learner:
 
 
 def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> Learner:
-    """A learner whose networks give the same outputs for whatever they see."""
+    """A learner whose networks have constant outputs."""
     learner = learner_of(learner_type.config_type(**{**TINY, "hidden": ()}), corridor())
     for name, constants in zip(learner.policy_models, outputs, strict=True):
         *_, weight, bias = learner.network(name, 0).parameters()
@@ -191,7 +191,7 @@ def test_masked_actions_are_not_taken(tmp_path: Path) -> None:
 
 
 def walk_policy(folder: Path, count: int) -> Policy:
-    """A policy that looks at the last `count` of one number."""
+    """A policy with a frame stack of `count` over one number."""
     steps = np.arange(8, dtype=np.float32)[:, None]
     dataset = Dataset.from_arrays(
         observations=steps[:-1],
@@ -218,7 +218,7 @@ def test_a_policy_keeps_the_frames_of_its_stack(tmp_path: Path) -> None:
 
 
 def test_values_of_single_frames_are_refused_by_a_stacking_policy(tmp_path: Path) -> None:
-    with pytest.raises(PolicyError, match="looks at 3 observations in a row"):
+    with pytest.raises(PolicyError, match="has a frame stack of 3"):
         walk_policy(tmp_path, 3).q_values(np.zeros((4, 1), np.float32))
 
 

@@ -55,7 +55,7 @@ def trained(learner: Learner) -> Learner:
 
 
 def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q") -> Tensor:
-    """(B, A) of the first seed."""
+    """Return the outputs (B, A) of the first seed."""
     network = learner.network(name, learner.seeds[0])
     with torch.no_grad():
         found = network(Observations(torch.from_numpy(observations)))
@@ -64,7 +64,7 @@ def outputs(learner: Learner, observations: NDArray[np.float32], name: str = "q"
 
 
 def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
-    """The actions, counted from 0, that the first seed's policy takes."""
+    """Return the actions of the first seed's policy, counted from 0."""
     networks = {name: learner.network(name, learner.seeds[0]) for name in learner.policy_models}
     scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
     found: list[int] = scores(Observations(torch.from_numpy(observations))).argmax(1).tolist()
@@ -72,7 +72,7 @@ def best(learner: Learner, observations: NDArray[np.float32]) -> list[int]:
 
 
 def lone_state(*, terminated: bool, gamma: float, reward: float = 1.0, **settings: Any) -> float:
-    """Q of a state that pays `reward` and leads to itself, learned by DQN."""
+    """Return Q, learned by DQN, of a state with `reward` that leads to itself."""
     observation = np.ones((8, 1), np.float32)
     dataset = Dataset.from_arrays(
         observations=observation,
@@ -110,7 +110,7 @@ def test_values_equal_those_of_value_iteration(config: Any) -> None:
 
 
 def test_the_corridors_values_by_hand() -> None:
-    # Written out: right is worth 1, .9, .81 counted from the far exit; the near exit pays .3.
+    # Going right is worth 1, .9, .81 from the far exit backward; the near exit has reward .3.
     np.testing.assert_allclose(optimal_values(), [[0.3, 0.81], [0.729, 0.9], [0.81, 1.0]])
 
 
@@ -130,7 +130,7 @@ def test_quantiles_stop_at_termination() -> None:
 
 
 def test_n_step_returns_propagate_a_reward_over_the_corridor() -> None:
-    # One episode from cell 1 to the far exit; with one copy of the target, only returns tell.
+    # One episode from cell 1 to the far exit; with one sync, only n-step returns reach back.
     walk = corridor_walk()
     config = DQNConfig(**{**SMALL_Q, "n_steps": 3, "target_interval": 600})
     values = outputs(trained(learner_of(config, walk)), inner_observations())[:, 1]
@@ -155,7 +155,7 @@ def corridor_walk() -> Dataset:
 def test_the_cached_target_equals_the_computed_one(
     learner_type: type[Learner], seeds: tuple[int, ...]
 ) -> None:
-    # With as many updates between copies as there are rows or more, a table of targets is kept.
+    # If a sync interval has at least as many rows as the data, targets are cached in a table.
     learner = learner_of(learner_type.config_type(**SMALL_Q), corridor(), *seeds)
     for _ in range(25):
         learner.update()
@@ -196,7 +196,7 @@ ONLY_LEFT = {(cell, 0): 1 for cell in (1, 2, 3)}
     ],
 )
 def test_actions_absent_from_the_data_are_not_taken(config: Any) -> None:
-    # Nobody ever went right: whatever lies there, the log cannot tell.
+    # The log never goes right, so the outcome of that action is unknown.
     for seed in range(3):
         learner = trained(learner_of(config, corridor(ONLY_LEFT), seed))
         assert best(learner, inner_observations()) == [0, 0, 0]
@@ -222,7 +222,7 @@ def test_more_alpha_means_lower_values_of_unseen_actions() -> None:
     ],
 )
 def test_the_better_action_is_found_if_the_data_has_both(config: Any) -> None:
-    # One in three visits goes right; imitation pulls towards left and the reward wins.
+    # One in three visits goes right: cloning alone would go left, the reward favors right.
     mostly_left = corridor({(cell, action): 2 - action for cell in (1, 2, 3) for action in (0, 1)})
     assert best(trained(learner_of(config, mostly_left)), inner_observations()) == [1, 1, 1]
     clone = trained(learner_of(BCConfig(**SMALL), mostly_left))
@@ -262,7 +262,7 @@ def test_bc_learns_how_often_each_action_was_taken() -> None:
 
 
 def masked_corridor() -> Dataset:
-    """The corridor, in whose middle one may not go right."""
+    """Return the corridor with the action right masked in the middle."""
     data = corridor(ONLY_LEFT | {(1, 1): 1, (3, 1): 1})
     blocked: dict[str, Any] = {
         name: {
@@ -285,7 +285,7 @@ def masked_corridor() -> Dataset:
 @pytest.mark.parametrize("config", [DQNConfig(**SMALL_Q), DoubleDQNConfig(**SMALL_Q)])
 def test_masked_actions_do_not_contribute(config: Any) -> None:
     values = outputs(trained(learner_of(config, masked_corridor())), inner_observations())
-    # From cell 1 the near exit pays .3 at once; going right leads to a cell that only leads back.
+    # From cell 1 the near exit has reward .3; going right leads to a cell that only leads back.
     assert values[0].tolist() == pytest.approx([0.3, 0.9 * 0.9 * 0.3], abs=0.02)
     assert values[1, 0].item() == pytest.approx(0.9 * 0.3, abs=0.02)
     assert values[2].tolist() == pytest.approx([0.81 * 0.3, 1.0], abs=0.02)
@@ -318,7 +318,7 @@ def test_a_restored_learner_continues_bit_for_bit(learner_type: type[Learner]) -
         whole.update()
     saved = [{name: t.clone() for name, t in whole.state(seed).items()} for seed in (0, 1)]
     trained(whole)
-    # Seed 1 goes on alone.
+    # Seed 1 continues alone.
     resumed = learner_of(config, corridor(), 1)
     resumed.load_state(1, saved[1], 25)
     after, expected = trained(resumed).state(1), whole.state(1)
@@ -346,7 +346,7 @@ def test_a_loss_that_is_not_finite_is_reported_and_changes_no_weights() -> None:
 
 
 def test_image_observations_are_learned_from() -> None:
-    # The brighter of two images asks for action 1.
+    # Action 1 is right for the brighter of two images.
     images: NDArray[np.uint8] = np.zeros((40, 36, 36), np.uint8)
     images[::2] = 200
     dataset = Dataset.from_arrays(
@@ -383,7 +383,7 @@ def test_updates_on_a_gpu_are_those_of_the_cpu(learner_type: type[Learner]) -> N
         trained(learner_type(config, buffer.to(torch.device(device)), (0, 1)))
         for device in ("cuda", "cpu")
     )
-    # Sums are added up in another order, and Adam divides by small numbers: not to the last bit.
+    # Sums have another order, and Adam divides by small numbers, so bits differ.
     for name, model in expected.all_models().items():
         weights = found.all_models()[name].weights.detach().cpu()
         torch.testing.assert_close(weights, model.weights.detach(), rtol=2e-3, atol=2e-3)

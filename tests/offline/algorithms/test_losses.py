@@ -1,4 +1,4 @@
-"""The equations of offline learning, against numbers worked by hand: values and gradients."""
+"""The equations of offline learning, against values and gradients calculated by hand."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_expected_sarsa_weights_the_next_values_with_the_policy() -> None:
 
 
 def test_quantile_targets_are_those_of_the_largest_mean() -> None:
-    # Means 2 and 2.5; the largest quantile is the other action's.
+    # The means are 2 and 2.5; the first action has the largest quantile.
     z_t = torch.tensor([[[0.0, 4.0], [2.0, 3.0]]])
     target = q_learning_target(torch.tensor([1.0]), torch.tensor([0.5]), z_t)
     torch.testing.assert_close(target, torch.tensor([[2.0, 2.5]]))
@@ -71,7 +71,7 @@ def test_masked_actions_are_not_bootstrapped_from() -> None:
 
 
 def gradient(loss_of: Callable[[Tensor], Tensor], outputs: Tensor) -> Tensor:
-    """The gradient of the summed loss with respect to a network's outputs."""
+    """Return the gradient of the summed loss with respect to a network's outputs."""
     leaf = outputs.clone().requires_grad_()
     (found,) = torch.autograd.grad(loss_of(leaf).sum(), leaf)
     return found
@@ -154,7 +154,7 @@ def test_conservative_penalty_by_hand() -> None:
 def test_conservative_penalty_lowers_unseen_actions_and_raises_the_logged_one() -> None:
     q_tm1 = torch.tensor([[1.0, 0.0, -1.0]])
     found = gradient(lambda q: cross_entropy(q, torch.tensor([1])), q_tm1)[0]
-    # softmax(q) - onehot(a); descent goes against it.
+    # softmax(q) - onehot(a); gradient descent moves the opposite way.
     weights = [math.exp(q) / (math.e + 1 + 1 / math.e) for q in (1.0, 0.0, -1.0)]
     torch.testing.assert_close(found, torch.tensor([weights[0], weights[1] - 1, weights[2]]))
     assert found[1] < 0 < found[2] < found[0]
@@ -211,7 +211,7 @@ def losses_to_check() -> dict[str, tuple[Callable[[Tensor], Tensor], tuple[int, 
 @given(data=st.data())
 def test_gradients_are_finite_differences(name: str, data: st.DataObject) -> None:
     loss_of, shape = losses_to_check()[name]
-    # Eighths, moved off the kinks at whole numbers.
+    # Multiples of 1/8, shifted away from the kinks at integers.
     grid = arrays(int64, shape, elements=st.integers(-40, 40))
     outputs = (torch.from_numpy(data.draw(grid)) / 8 + 0.03).double().requires_grad_()
     assert torch.autograd.gradcheck(loss_of, outputs, eps=1e-6, atol=1e-5)
@@ -238,7 +238,7 @@ def test_double_q_learning_targets_never_exceed_q_learning(
 
 
 def test_noise_biases_q_learning_but_not_double_q_learning() -> None:
-    # Ten actions are all worth 0 and two networks guess them with independent noise.
+    # Ten actions have value 0, and two networks estimate it with independent noise.
     generator = torch.Generator().manual_seed(0)
     noise, other_noise = torch.randn(2, 20_000, 10, generator=generator)
     r_t, discount_t = torch.zeros(len(noise)), torch.ones(len(noise))

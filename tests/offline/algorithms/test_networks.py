@@ -1,4 +1,4 @@
-"""Networks: what they take, what they give, and K of them at once."""
+"""Networks: inputs, outputs, and K of them at once."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def vectors(rows: int, width: int, seed: int = 0) -> Observations:
 
 
 def images(rows: int, *shapes: tuple[int, ...], width: int = 0) -> Observations:
-    parts = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
-    return Observations(torch.randn(rows, width), tuple(parts))
+    images = [torch.randint(0, 256, (rows, *shape), dtype=torch.uint8) for shape in shapes]
+    return Observations(torch.randn(rows, width), tuple(images))
 
 
 def weights_of(network: torch.nn.Module) -> list[tuple[int, ...]]:
@@ -73,7 +73,7 @@ def test_images_and_vector_are_joined_after_one_layer_each() -> None:
 
 
 def test_channels_are_not_mixed_with_rows() -> None:
-    # Equal channels must give the same in any order of the weights.
+    # With equal channels, the order of the weights does not matter.
     network = Network(0, [ImageInput((36, 36, 2))], (3,), Architecture((16,)))
     image = torch.randint(0, 256, (1, 36, 36, 1), dtype=torch.uint8)
     twice = Observations(torch.empty(1, 0), (torch.cat([image, image], dim=3),))
@@ -93,7 +93,7 @@ def test_dueling_advantages_have_mean_zero(output_shape: tuple[int, ...]) -> Non
     torch.testing.assert_close(network(seen).mean(1).flatten(), value.flatten())
 
 
-def test_layer_norm_makes_outputs_invariant_to_the_first_layers_scale() -> None:
+def test_layer_norm_keeps_outputs_invariant_to_the_first_layers_scale() -> None:
     network = Network(3, [], (2,), Architecture((32, 16), layer_norm=True))
     seen = vectors(4, 3)
     before = network(seen)
@@ -144,7 +144,7 @@ def test_a_seed_gets_the_same_bits_alone_and_in_a_batch(model_type: type[Model],
     assert all(torch.equal(alone, beside) for alone, beside in alone_and_together(model_type, rows))
 
 
-def test_a_network_shows_the_weights_of_its_model() -> None:
+def test_a_network_has_the_weights_of_its_model() -> None:
     model = build_model(networks(2))
     seen = vectors(6, 5)
     with torch.no_grad():

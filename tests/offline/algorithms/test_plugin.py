@@ -29,7 +29,7 @@ class SmoothedConfig(TrainingConfig):
     """Settings of cloning with label smoothing."""
 
     smoothing: float = 0.1
-    """share of the probability that is spread over all actions"""
+    """fraction of the probability that is spread over all actions"""
 
 
 class Smoothed(Learner):
@@ -56,7 +56,7 @@ FEW = ["--updates", "300", "--batch-size", "32", "--hidden", "16", "--learning-r
 
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch, entry_point: str) -> None:
-    """Put a package into a folder of the import path, as pip does."""
+    """Install a package into a folder on the import path, as pip does."""
     (folder / "smoothed_bc_package.py").write_text(MODULE)
     info = folder / "smoothed_bc-1.0.dist-info"
     info.mkdir()

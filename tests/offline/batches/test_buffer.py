@@ -1,4 +1,4 @@
-"""The buffer: columns packed into tensors, rows drawn at random."""
+"""Buffers: columns packed into tensors, rows sampled at random."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 
 def numbered(n_rows: int, **changes: Any) -> Dataset:
-    """Row k goes from (k, -k) to (k + 100, 100 - k) by action 3 + k % 2 and earns k / 2."""
+    """Row k is (k, -k) to (k + 100, 100 - k), with action 3 + k % 2 and reward k / 2."""
     k = np.arange(n_rows)
     observations = np.stack([k, -k], axis=1).astype(np.float32)
     columns: dict[str, Any] = {
@@ -80,7 +80,7 @@ def test_n_step_returns_by_hand() -> None:
         walks([3, 2], [True, False]), Packing(gamma=0.5, n_steps=2)
     )
     batch = whole(buffer)
-    # Rewards 1, 2, 4 and 1, 2: two of them each, as far as the episode goes.
+    # Rewards are 1, 2, 4 and 1, 2; a return has two of them, or one at the end of an episode.
     assert batch.rewards.tolist() == [1 + 0.5 * 2, 2 + 0.5 * 4, 4, 1 + 0.5 * 2, 2]
     assert batch.next_observations.vector.flatten().tolist() == [2, 3, 3, 12, 12]
     # The first episode terminated; the second was truncated.
@@ -154,7 +154,7 @@ def test_stacked_images_are_channels() -> None:
 
 
 @given(n_rows=st.integers(1, 40), batch_size=st.integers(1, 64), seed=st.integers(0, 99))
-def test_a_batch_is_made_of_whole_rows(n_rows: int, batch_size: int, seed: int) -> None:
+def test_a_batch_consists_of_whole_rows(n_rows: int, batch_size: int, seed: int) -> None:
     buffer = TransitionBuffer.from_dataset(numbered(n_rows))
     batch = buffer.sample(batch_size, torch.Generator().manual_seed(seed))
     k = batch.rows
@@ -177,7 +177,7 @@ def test_the_generator_determines_the_sample() -> None:
 def test_rows_are_sampled_uniformly() -> None:
     buffer = TransitionBuffer.from_dataset(numbered(10))
     rows = buffer.sample_rows(100_000, torch.Generator().manual_seed(0))
-    # 10,000 each with a standard deviation of 95.
+    # Each row is drawn 10,000 times on average, with a standard deviation of 95.
     assert (torch.bincount(rows) - 10_000).abs().max() < 5 * 95
 
 
@@ -187,7 +187,7 @@ def test_rows_are_sampled_by_their_episodes_weights(weights: list[float]) -> Non
     rows = buffer.sample_rows(60_000, torch.Generator().manual_seed(0))
     share = torch.bincount(rows, minlength=6) / 60_000
     each = np.repeat(weights, [2, 3, 1])
-    # The largest standard deviation of a share is .002.
+    # The largest standard deviation of a frequency is .002.
     np.testing.assert_allclose(share.numpy(), each / each.sum(), atol=0.01)
     assert share[2:5].sum() == 0
 
@@ -214,7 +214,7 @@ def test_a_given_encoder_keeps_its_normalization() -> None:
 
 
 def masked(actions: list[int]) -> Dataset:
-    """Three states in which only action 1 is allowed, and an end in which nothing is."""
+    """Return three states with only action 1 allowed, and a last one with no action allowed."""
     mask = np.array([[0, 1], [0, 1], [0, 1], [0, 0]], np.int8)
     x = np.zeros((4, 1), np.float32)
     return Dataset.from_arrays(

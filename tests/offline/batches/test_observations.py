@@ -27,7 +27,7 @@ CAR = spaces.Dict(
 
 
 def batch(space: spaces.Space[Any], rows: int, seed: int = 0) -> Any:
-    """(rows, *shape) samples of a space, in nested dicts."""
+    """Return samples (rows, *shape) of a space, in nested dicts."""
     if isinstance(space, spaces.Dict):
         return {key: batch(part, rows, seed) for key, part in space.spaces.items()}
     space.seed(seed)
@@ -126,7 +126,7 @@ def test_images_are_centered_and_scaled_by_one_number() -> None:
     assert image.shift[0, 0, 0] == 20
     assert image.shift[1, 1, 0] == 255, "what never changes becomes 0, however bright"
     assert np.count_nonzero(image.shift) == 2
-    # One pixel of 1,440 differs from its mean, by 10 each time: sqrt(100 / 1440).
+    # One of 1,440 pixels differs from its mean, always by 10: sqrt(100 / 1440).
     assert image.scale == pytest.approx(math.sqrt(100 / 1440))
     assert encoder.encode(observations).images[0].dtype == torch.uint8, "frames stay small"
 
@@ -155,7 +155,7 @@ def test_a_mask_is_not_a_network_input() -> None:
     seen = encoder.encode({"action_mask": mask, "x": np.zeros((2, 2), np.float32)})
     assert encoder.width == 2
     assert seen.mask is not None
-    # Where nothing is allowed the episode is over, and all count alike.
+    # No action is allowed after the last step; all count as allowed there.
     assert seen.mask.tolist() == [[True, False, True], [True, True, True]]
 
 

@@ -1,4 +1,4 @@
-"""Several logs at once, each with its weight."""
+"""Several logs, each with its weight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 
 @pytest.fixture(autouse=True)
 def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Logs a, b and c of 2, 3 and 1 episodes, each of another environment."""
+    """Logs a, b and c of 2, 3 and 1 episodes, from different environments."""
     monkeypatch.chdir(tmp_path)
     for name, episodes in (("a", 2), ("b", 3), ("c", 1)):
         save(Path(f"logs/{name}.mcap"), episodes, width=1)
@@ -48,18 +48,18 @@ def test_each_episode_has_the_weight_of_its_log() -> None:
     assert dataset.env_id == "", "the logs do not agree on it"
 
 
-def test_a_folder_or_a_glob_has_a_weight_too() -> None:
+def test_a_folder_or_a_glob_can_have_a_weight() -> None:
     assert open_weighted(["logs:3"])[1].tolist() == [3] * 6
     assert open_weighted(["logs/[ab].mcap:3", "logs/c.mcap"])[1].tolist() == [3] * 5 + [1]
 
 
 def test_a_file_given_twice_is_read_once() -> None:
     assert len(open_weighted(["logs", "logs/a.mcap"])[0].episodes) == 6
-    with pytest.raises(UsageError, match=r"a\.mcap is meant twice, with weights 1 and 2"):
+    with pytest.raises(UsageError, match=r"a\.mcap is named twice, with weights 1 and 2"):
         open_weighted(["logs", "logs/a.mcap:2"])
 
 
-def test_a_colon_in_a_name_is_no_weight() -> None:
+def test_a_colon_in_a_file_name_is_not_a_weight() -> None:
     save(Path("logs/run:2"), 1, width=1)
     assert open_weighted(["logs/run:2"])[1].tolist() == [1]
 

@@ -1,4 +1,4 @@
-"""The equations of off-policy estimation, by hand and against a chain whose values are known."""
+"""The equations of off-policy estimation, by hand and on a task with known values."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ONCE = np.ones((1, 2))
         ("PDIS", (4 + 6) / 2),
         # Step 0: (2 + 6) / (2 + 3). Step 1: (4 + 0) / (1 + 3), half of it.
         ("WPDIS", 8 / 5 + 0.5 * 4 / 4),
-        # First: 3 + 2 (1 - 1) + 1/2 (2 x 2 + 1 (4 - 2)) = 6. Second: 3 + 3 (2 - 1) = 6.
+        # First episode: 3 + 2 (1 - 1) + 1/2 (2 x 2 + 1 (4 - 2)) = 6. Second: 3 + 3 (2 - 1) = 6.
         ("DR", (6 + 6) / 2),
         # Step 0: V 3, and (0 + 3) / 5. Step 1: V (2 x 2 + 3 x 0) / 5, and (2 + 0) / 4; half.
         ("WDR", 3 + 3 / 5 + 0.5 * (4 / 5 + 2 / 4)),
@@ -99,18 +99,18 @@ def tables(draw: st.DrawFn) -> EpisodeTable:
 @given(tables())
 def test_doubly_robust_without_a_model_is_per_decision_bit_for_bit(table: EpisodeTable) -> None:
     nothing = np.zeros_like(table.rewards)
-    without_model = EpisodeTable(table.rewards, table.ratios, nothing, nothing, table.gamma)
+    unmodeled = EpisodeTable(table.rewards, table.ratios, nothing, nothing, table.gamma)
     counts = np.ones((1, len(table.rewards)))
-    assert ESTIMATORS["DR"](without_model).values(counts) == ESTIMATORS["PDIS"](
-        without_model
-    ).values(counts)
-    assert ESTIMATORS["WDR"](without_model).values(counts) == ESTIMATORS["WPDIS"](
-        without_model
-    ).values(counts)
+    assert ESTIMATORS["DR"](unmodeled).values(counts) == ESTIMATORS["PDIS"](unmodeled).values(
+        counts
+    )
+    assert ESTIMATORS["WDR"](unmodeled).values(counts) == ESTIMATORS["WPDIS"](unmodeled).values(
+        counts
+    )
 
 
 @given(tables())
-def test_on_policy_all_without_a_model_are_the_mean_return(table: EpisodeTable) -> None:
+def test_on_policy_estimators_without_a_model_equal_the_mean_return(table: EpisodeTable) -> None:
     nothing, ones = np.zeros_like(table.rewards), np.ones_like(table.rewards)
     own = EpisodeTable(table.rewards, ones, nothing, nothing, table.gamma)
     mean = (table.rewards @ own.discounts).mean()
@@ -136,7 +136,7 @@ def test_weighted_estimates_ignore_a_common_factor_of_the_first_weights(
 
 
 def test_the_task_agrees_with_its_linear_equations() -> None:
-    # V = sum_a pi(a|s) Q(s, a), and the mean return of the policy itself is V of the start.
+    # V = sum_a pi(a|s) Q(s, a), and the policy's mean return is V of the start.
     assert pytest.approx((EVALUATED * TRUE_Q).sum(1)) == TRUE_V
     own = play(EVALUATED, episodes=20_000, seed=0)
     returns = own.rewards @ own.discounts

@@ -1,4 +1,4 @@
-"""Estimates from a log alone: against true values, on-policy, and when they must refuse."""
+"""Off-policy estimates: against true values, on-policy, and refused verdicts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NO_MODEL = FQEConfig(updates=1, batch_size=2, target_interval=1, hidden=(2,), ga
 
 
 class Table:
-    """A policy of the two-state task, from its probabilities (states, actions)."""
+    """A policy of the two-state task with probabilities (states, actions)."""
 
     def __init__(self, probabilities: NDArray[np.float64]) -> None:
         self._probabilities = probabilities
@@ -39,7 +39,7 @@ class Table:
 
 
 def log(episodes: int, seed: int = 0, acting: NDArray[np.float64] = task.BEHAVIOR) -> Dataset:
-    """Episodes of the task, as a dataset with one-hot observations."""
+    """Return episodes of the task as a dataset with one-hot observations."""
     random = np.random.default_rng(seed)
     columns: list[tuple[int, int, int, float, bool, float]] = []
     for _ in range(episodes):
@@ -116,7 +116,7 @@ def test_every_estimator_converges_to_the_true_value() -> None:
     assert widths["DR"] < widths["PDIS"] < widths["TIS"]
 
 
-def test_on_policy_they_agree_with_the_logged_returns() -> None:
+def test_on_policy_estimates_agree_with_the_logged_returns() -> None:
     evaluator = OffPolicyEvaluator(log(400), FAST)
     found = by_name(evaluator.evaluate(Table(task.BEHAVIOR), "behavior"))
     for name in ("TIS", "WIS", "PDIS", "WPDIS"):
@@ -141,13 +141,13 @@ def test_a_log_of_other_actions_has_no_verdict() -> None:
 
 
 def test_a_mean_weight_far_from_one_has_no_verdict() -> None:
-    """Half of the log never does what is asked about: an unbiased mean is half of what it is."""
+    """Half of the log never takes the policy's actions, so the mean weight is about 1/2."""
     always_one = np.array([[1e-6, 1 - 1e-6], [1e-6, 1 - 1e-6]])
     data = Dataset.concatenate([log(60), log(60, seed=1, acting=always_one)])
     found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Table(task.BEHAVIOR), "half"))
     for name in ("TIS", "PDIS", "DR"):
         assert found[name].effective_sample_size > 10
-        assert found[name].verdict.startswith("refused: weights of 0.")
+        assert found[name].verdict.startswith("refused: mean importance weight 0.")
     for name in ("WIS", "WPDIS"):
         assert found[name].trusted, "these divide by the weights"
 
@@ -164,7 +164,7 @@ def test_unknown_probabilities_leave_only_the_model_estimate() -> None:
         )
 
 
-def test_a_model_with_a_short_horizon_warns() -> None:
+def test_too_few_target_syncs_refuse_the_verdict() -> None:
     config = FQEConfig(updates=100, target_interval=25, hidden=(4,), gamma=0.9)
     estimate = OffPolicyEvaluator(log(200), config).evaluate(Table(task.BEHAVIOR), "same")
     assert estimate.estimates[0].verdict.startswith(
@@ -185,7 +185,7 @@ def test_epsilon_mixes_in_random_actions() -> None:
     assert mixed.value == pytest.approx(by_name(evaluator.evaluate(half, "half"))["PDIS"].value)
 
 
-def test_the_same_seed_gives_the_same_estimates() -> None:
+def test_the_same_seed_has_the_same_estimates() -> None:
     first, second = (
         OffPolicyEvaluator(log(50), NO_MODEL, seed=3).evaluate(None, "random") for _ in range(2)
     )

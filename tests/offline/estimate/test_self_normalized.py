@@ -1,4 +1,4 @@
-"""Intervals of off-policy estimates: by hand, against SciPy, and how often they hold the truth."""
+"""Intervals of off-policy estimates: by hand, against SciPy, and their coverage."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def resamplings(episodes: int, count: int, seed: int) -> NDArray[np.float64]:
 
 
 def test_a_ratio_by_hand() -> None:
-    # a is 2 and 6, b is 1 and 3: 8 / 4, the same for both episodes, so nothing can be off.
+    # a is 2 and 6, b is 1 and 3: both ratios are 2, so the standard error is 0.
     same = RatioEstimate(np.array([0.5]), ((np.array([[2.0], [6.0]]), np.array([[1.0], [3.0]])),))
     # Twice the second: 12 / 6.
     assert same.values(np.array([[1.0, 1.0], [0.0, 2.0]])) == pytest.approx([1.0, 1.0])
     assert same.errors(np.ones((1, 2))) == pytest.approx([0.0])
     assert same.interval(resamplings(2, 50, 0)) == pytest.approx((1.0, 1.0))
-    # a is 2 and 2: 4 / 4 = 1. They move it by (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
+    # a is 2 and 2: 4 / 4 = 1. The changes are (2 - 1) / 4 and (2 - 3) / 4: sqrt(2 / 16).
     other = RatioEstimate(np.ones(1), ((np.array([[2.0], [2.0]]), np.array([[1.0], [3.0]])),))
     assert other.errors(np.ones((1, 2))) == pytest.approx([np.sqrt(1 / 8)])
-    # Counted twice each, it is as if there were four: half of the variance.
+    # Each counted twice is like four episodes: half of the variance.
     assert other.errors(np.full((1, 2), 2.0)) == pytest.approx([np.sqrt(1 / 16)])
 
 
@@ -68,7 +68,7 @@ def test_an_interval_shifts_and_scales_with_its_values(
 
 
 def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
-    """Over 150 logs of 200 episodes, within what chance makes of a standard deviation."""
+    """Agreement over 150 logs of 200 episodes, within four standard errors."""
     once, logs = np.ones((1, 200)), 150
     tables = [task.play(None, episodes=200, seed=seed) for seed in range(logs)]
     for name in ("WPDIS", "DR", "WDR"):
@@ -79,7 +79,7 @@ def test_the_standard_error_is_the_spread_of_the_estimates() -> None:
 
 
 def test_intervals_have_their_nominal_coverage() -> None:
-    """95 % within two points and twice the error of 200 logs; of 50 episodes, which is few."""
+    """Coverage of 95 % within two points and two standard errors, over 200 logs of 50 episodes."""
     logs, episodes = 200, 50
     margin = 0.02 + 2 * np.sqrt(0.95 * 0.05 / logs)
     held = dict.fromkeys(ESTIMATORS, 0)
@@ -94,19 +94,19 @@ def test_intervals_have_their_nominal_coverage() -> None:
 
 
 def test_degrees_of_freedom_by_hand() -> None:
-    # 0 and 2 lie as far from 1: two episodes tell alike, one degree. 0 0 0 4 lie 1 1 1 3 from it:
-    # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) = 144 / 84 is less than two, and one the least.
+    # 0 and 2 have equal deviations from 1: one degree. 0 0 0 4 have deviations 1 1 1 3:
+    # (1 + 1 + 1 + 9)^2 / (1 + 1 + 1 + 81) - 1 = 144 / 84 - 1 is below the minimum of one.
     assert RatioEstimate.mean(np.array([0.0, 2.0])).degrees_of_freedom() == 1.0
     assert RatioEstimate.mean(np.array([0.0, 0.0, 0.0, 4.0])).degrees_of_freedom() == 1.0
     alike = RatioEstimate.mean(np.array([-1.0, 1.0] * 10))
     assert alike.degrees_of_freedom() == pytest.approx(19.0)
-    # 0 0 0 2 2 4 4 4 lie 2 2 2 0 0 2 2 2 from their mean: six of eight tell, five degrees.
+    # 0 0 0 2 2 4 4 4 have deviations 2 2 2 0 0 2 2 2: six are not 0, so five degrees.
     some = RatioEstimate.mean(np.array([0.0, 0, 0, 2, 2, 4, 4, 4]))
     assert some.degrees_of_freedom() == pytest.approx(5.0)
 
 
 def test_students_t_quantile_by_the_table() -> None:
-    # 97.5 % of Student's t: 12.706 of one degree, 2.228 of ten; of the normal distribution 1.960.
+    # 97.5 % of Student's t: 12.706 for one degree, 2.228 for ten; normal distribution: 1.960.
     assert student_factor(1.0) == pytest.approx(12.706 / 1.960, rel=1e-3)
     assert student_factor(10.0) == pytest.approx(2.228 / 1.960, rel=1e-3)
     assert student_factor(1e9) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Learning from a log that another process is still writing."""
+"""Training on a log that another process is still writing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SMALL = CQLConfig(
 
 
 class Recorder:
-    """A log that is being written, one random CartPole episode after the other."""
+    """A recorder of random CartPole episodes into one log."""
 
     def __init__(self, path: Path) -> None:
         self.env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
@@ -55,7 +55,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
     assert logs.grow()
     assert not logs.grow()
     recorder.env.close()
-    # The episode that `record` broke off has one transition.
+    # The episode that `record` ended early has one transition.
     assert not logs.grow()
     whole = mcaprl.open(tmp_path / "log.mcap")
     assert [len(e.rewards) for e in logs.dataset.episodes] == [
@@ -66,7 +66,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
 
 
 def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
-    """At its end, a recorder replaces its log by a file of another size, with all its episodes."""
+    """A recorder that closes replaces its log by a smaller file with the same episodes."""
     path = tmp_path / "log.mcap"
     recorder = Recorder(path)
     recorder.record(6)
@@ -99,7 +99,7 @@ def test_new_files_are_read(tmp_path: Path) -> None:
     first.record(1)
     assert logs.grow()
     assert len(logs.dataset.episodes) == 4
-    # What was there keeps its place.
+    # Episodes read earlier keep their numbers.
     assert logs.dataset.episodes[0].rewards.sum() == before
     first.env.close()
     second.env.close()

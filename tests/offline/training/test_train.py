@@ -1,4 +1,4 @@
-"""Training runs: what is in the folder, and what a stop or a kill leaves of it."""
+"""Training runs: the files of a run folder, also after a stop or a kill."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def rows(run: Path, seed: int = 0) -> list[dict[str, str]]:
 
 
 def assert_same_result(run: Path, expected: Path, seed: int = 0) -> None:
-    """Weights, moments, generators and curve, bit for bit."""
+    """Check that weights, moments, generators and curve are equal bit for bit."""
     for name in ("policy.safetensors", "checkpoint.safetensors"):
         found, wanted = (load_file(folder / f"seed-{seed}" / name) for folder in (run, expected))
         assert found.keys() == wanted.keys()
@@ -138,7 +138,7 @@ def test_progress_is_reported_at_each_log_interval(tmp_path: Path) -> None:
     "config",
     [DQNConfig(**SHORT, gamma=0.5), DoubleDQNConfig(**SHORT, gamma=0.5), BCConfig(**SHORT)],
 )
-def test_the_same_seed_gives_the_same_curve_and_weights(tmp_path: Path, config: Any) -> None:
+def test_the_same_seed_has_the_same_curve_and_weights(tmp_path: Path, config: Any) -> None:
     for name in ("a", "b"):
         train(corridor(), config, tmp_path / name, seed=0, progress=silent)
     assert_same_result(tmp_path / "a", tmp_path / "b")
@@ -242,8 +242,8 @@ def test_an_incomplete_row_after_a_kill_is_dropped(tmp_path: Path) -> None:
 
 
 def test_the_checkpoint_is_written_after_the_policy(tmp_path: Path) -> None:
-    # The other way round, a kill between the two at the last update would leave an old policy
-    # beside a checkpoint that says all is done.
+    # In the opposite order, a kill between the two at the last update would leave an old policy
+    # beside the checkpoint of a finished run.
     train(corridor(), SHORT_CQL, tmp_path / "run", progress=silent)
     folder = tmp_path / "run" / "seed-0"
     names = ("policy.safetensors", "policy.json", "checkpoint.safetensors")
@@ -320,7 +320,7 @@ def test_resuming_a_missing_run_starts_it(tmp_path: Path) -> None:
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path: Path) -> None:
-    # One step of 1e15 in each of four layers, and the next output is beyond float32.
+    # After a step of 1e15 in each of four layers, outputs exceed float32.
     wild = {"learning_rate": 1e15, "hidden": (16, 16, 16), "checkpoint_interval": 1}
     with pytest.raises(TrainingError) as caught:
         train(
@@ -412,7 +412,7 @@ def test_other_data_are_accepted_on_request(tmp_path: Path) -> None:
     )
     assert summary.resumed_at == 40
     assert json.loads((tmp_path / "run" / "config.json").read_text())["data"] == other.fingerprint
-    # The weights fit the old normalization.
+    # The weights were trained with the old normalization.
     after = read_policy(tmp_path / "run" / "seed-0").encoder
     assert np.array_equal(before.shift, after.shift)
     train(other, config, tmp_path / "run", resume=True, progress=silent)

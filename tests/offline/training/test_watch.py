@@ -1,4 +1,4 @@
-"""What is watched while learning: held-out episodes, short horizons, values that run away."""
+"""Validation while training: held-out episodes, short horizons, diverging values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.offline_tasks import corridor, crossing
 
 
 def test_held_out_episodes_are_evaluated_but_not_trained_on(tmp_path: Path) -> None:
-    # Rewards are 1 in twelve episodes out of 24, chosen to be those held out.
+    # Rewards are 1 in the held-out episodes only: 12 of 24.
     held_out = choose_held_out(24, 0.5)
     data = crossing((10,) * 24)
     paid = np.isin(np.arange(24), held_out).repeat(10)
@@ -51,7 +51,7 @@ def test_returns_of_short_truncated_episodes_are_unknown() -> None:
         next_observations=observations,
     )
     returns = monte_carlo_returns(data, np.array([0]), 0.5)
-    # Five steps before the cut, what is missing counts for 1/32 of its worth; four, for 1/16.
+    # Five steps before the truncation, missing rewards have weight 1/32; four before, 1/16.
     assert np.isnan(returns).tolist() == [False, False, True, True, True, True]
 
 
@@ -69,21 +69,21 @@ def test_too_few_target_syncs_for_the_horizon_are_reported(tmp_path: Path) -> No
 
 
 def test_diverging_values_are_reported_once(tmp_path: Path) -> None:
-    # The second action is never seen, and chased by its own value.
+    # The second action is never logged, and its target is its own value.
     data = crossing((50,), n_actions=2)
     config = DQNConfig(**{**SHORT, "updates": 400, "learning_rate": 0.01}, gamma=0.99)
     with pytest.warns(UserWarning, match="values diverge") as caught:
         train(data, replace(config, target_interval=1), tmp_path / "run", progress=silent)
     (warning,) = caught
-    # Every step pays 1, so no return is above 1 / (1 - .99).
+    # Every reward is 1, so no return is above 1 / (1 - .99).
     assert "exceed 100;" in str(warning.message)
 
 
 @pytest.mark.parametrize(
-    ("before", "value", "tells"),
+    ("before", "value", "warns"),
     [(10.0, 21.0, True), (10.0, 19.0, False), (30.0, 25.0, False), (-10.0, -21.0, True)],
 )
 def test_values_beyond_twice_the_possible_return_diverge(
-    before: float, value: float, tells: bool
+    before: float, value: float, warns: bool
 ) -> None:
-    assert (divergence_warning(before, value, 10.0) is not None) == tells
+    assert (divergence_warning(before, value, 10.0) is not None) == warns
