@@ -1,6 +1,7 @@
 """Measure updates per second of Double DQN and CQL relative to d3rlpy's and SB3's DQN.
 
     python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
+    python -m benchmarks.learning --only gradients
 
 One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
 time on one thread, the best of several turns. The last row covers the whole path: a log of LOG_ROWS
@@ -9,12 +10,16 @@ mcap with mcap-ros2-support, and d3rlpy. The alternative does a part of the work
 scaled up: a tenth of the log, and as many updates as fit into the turns. Prints the ratios, writes
 them to benchmarks/learning.json, and writes the table to docs/results.md. With --only 256, 32 or
 whole, the other rows keep the values of an earlier run.
+
+--only gradients compares updates with autograd and the same updates with closed-form gradients,
+which are written here. It prints the ratios of their speeds, and needs none of the libraries.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -24,21 +29,25 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import d3rlpy
 import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3 import DQN
 from stable_baselines3.common.logger import configure
+from torch.nn import functional
 
 import mcaprl
 from benchmarks import rivals
 from benchmarks.page import write_section
 from benchmarks.workloads import EPISODE_STEPS, vectors
 from mcaprl.files import write_json
-from mcaprl.offline import ALGORITHMS, TransitionBuffer
+from mcaprl.offline.algorithms.dqn import DoubleDQN
+from mcaprl.offline.algorithms.learner import Learner
+from mcaprl.offline.algorithms.registry import ALGORITHMS
+from mcaprl.offline.batches.buffer import TransitionBuffer
 
+CHECKED_UPDATES = 10
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9
 LOG_ROWS, LOG_SHARE, LOG_UPDATES = 1_000_000, 0.1, 8_000
 HIDDEN = [256, 256]
@@ -76,13 +85,20 @@ def transitions() -> mcaprl.Dataset:
 
 def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Update:
     """Return a function that makes one update of this number of seeds."""
+    return learner_of(data, algo, batch_size, seeds).update
+
+
+def learner_of(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Learner:
+    """Return a learner of this number of seeds with default settings."""
     config = ALGORITHMS[algo].config_type(batch_size=batch_size)
     buffer = TransitionBuffer.from_dataset(data, config.packing)
-    return ALGORITHMS[algo](config, buffer, range(seeds)).update
+    return ALGORITHMS[algo](config, buffer, range(seeds))
 
 
 def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
     """Return a function that makes one update of d3rlpy, with a batch from its buffer."""
+    import d3rlpy
+
     log = d3rlpy.dataset.MDPDataset(
         data.observations,
         data.actions,
@@ -116,6 +132,82 @@ def sb3s(data: mcaprl.Dataset, batch_size: int) -> Update:
             observation[None], following[None], action[None, None], reward[None], np.zeros(1), [{}]
         )
     return lambda: model.train(gradient_steps=10, batch_size=batch_size)
+
+
+def closed_form(learner: Learner, alpha: float) -> Update:
+    """Return a function that makes the update of a learner's only seed without autograd.
+
+    The gradient of the loss with respect to Q(s, a) is clip(Q - target, -1, 1) for the action
+    taken, plus alpha (softmax(Q) - onehot) for the penalty of CQL. The rest is the chain rule for
+    linear layers and ReLU.
+
+    Args:
+        learner: Double DQN with an alpha of 0, or CQL; its network is an MLP on vectors.
+        alpha: Weight of the penalty.
+    """
+    assert isinstance(learner, DoubleDQN)
+    config, model = learner.config, learner.models["q"]
+    parameters = [parameter.detach() for parameter in model.networks[0].parameters()]
+    sizes = [parameter.numel() for parameter in parameters]
+    model.weights.grad = torch.zeros_like(model.weights)
+    parts = model.weights.grad[0, : sum(sizes)].split(sizes)
+    gradients = [part.view_as(own) for part, own in zip(parts, parameters, strict=True)]
+    matrices, biases, d_matrices, d_biases = (
+        tensors[first::2] for tensors in (parameters, gradients) for first in (0, 1)
+    )
+
+    @torch.no_grad()
+    def update() -> None:
+        rows = learner.buffer.sample_rows(config.batch_size, learner.samplers[0])
+        batch = learner.buffer.batch(rows)
+        actions = batch.actions.unsqueeze(1)
+        target = learner.targets(batch)
+        activations = [batch.observations.vector]
+        for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):
+            activations.append(functional.linear(activations[-1], matrix, bias).relu_())
+        q = functional.linear(activations[-1], matrices[-1], biases[-1])
+        value = q.gather(1, actions).squeeze(1)
+        loss = functional.huber_loss(value, target, reduction="none")
+        step = (value - target).clamp_(-1, 1)
+        if alpha:
+            loss += alpha * (q.logsumexp(1) - value)
+            delta = q.softmax(1).mul_(alpha)
+            step -= alpha
+        else:
+            delta = torch.zeros_like(q)
+        assert math.isfinite(loss.sum().item())
+        delta.scatter_add_(1, actions, step.unsqueeze(1)).div_(config.batch_size)
+        for layer in reversed(range(len(matrices))):
+            torch.mm(delta.T, activations[layer], out=d_matrices[layer])
+            torch.sum(delta, 0, out=d_biases[layer])
+            if layer:
+                delta = (delta @ matrices[layer]).mul_(activations[layer] > 0)
+        learner.optimizer.param_groups[0]["lr"] = config.learning_rate_at(learner.step)
+        learner.optimizer.step()
+        learner.step += 1
+        if learner.step % config.target_interval == 0:
+            learner.target_network.sync(model)
+
+    return update
+
+
+def gradient_rows(size: int, turns: Turns) -> dict[str, float]:
+    """Return the speed of autograd relative to closed-form gradients at one batch size."""
+    data = transitions()
+    results = {}
+    for algo, label in (("double-dqn", "Double DQN"), ("cql", "CQL")):
+        alpha = float(getattr(ALGORITHMS[algo].config_type(), "alpha", 0.0))
+        learners = [learner_of(data, algo, size) for _ in range(2)]
+        by_autograd, by_hand = learners[0].update, closed_form(learners[1], alpha)
+        for _ in range(CHECKED_UPDATES):
+            by_autograd()
+            by_hand()
+        first, second = (learner.models["q"].weights.detach() for learner in learners)
+        assert torch.allclose(first, second, atol=1e-4), "the gradients differ"
+        rates = best_rates({"autograd": (by_autograd, 1), "closed form": (by_hand, 1)}, turns)
+        name = f"{label}, autograd / closed-form gradients, batch {size}"
+        results[name] = rates["autograd"] / rates["closed form"]
+    return results
 
 
 @dataclass(frozen=True)
@@ -198,10 +290,14 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--turn-s", type=float, default=1.0)
-    parser.add_argument("--only", choices=("256", "32", "whole"))
+    parser.add_argument("--only", choices=("256", "32", "whole", "gradients"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     turns = Turns(arguments.rounds, arguments.turn_s)
+    if arguments.only == "gradients":
+        for name, ratio in (gradient_rows(256, turns) | gradient_rows(32, turns)).items():
+            print(f"{name}: {ratio:.2f}")
+        return
     results: dict[str, float] = {}
     if arguments.only and RESULTS.exists():
         results = json.loads(RESULTS.read_text())

@@ -200,7 +200,7 @@ class TransitionBuffer:
         return self.batch(self.sample_rows(batch_size, generator).to(self.device))
 
     def observe(self, places: Tensor) -> Observations:
-        """Return the network inputs at frames (R,), stacked with the frames before if configured."""
+        """Return the network inputs at frames (R,), stacked with earlier frames if configured."""
         count = self.packing.frame_stack
         if count == 1:
             return self.frames.rows(places)

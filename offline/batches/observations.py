@@ -75,7 +75,7 @@ class Observations:
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return B / count stacks of successive observations, each with the mask of its last one."""
+        """Return stacks of `count` successive observations, each with the mask of its last."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count

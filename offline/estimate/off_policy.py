@@ -199,7 +199,7 @@ class OffPolicyEvaluator:
         """Return Q of the actions taken, V of the states, and V of the next states, (N,) each.
 
         Cross-fitting: the model that evaluates an episode was trained on the other half of the log,
-        because values of its own training episodes are biased.
+        because its values of training episodes are biased.
         """
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()

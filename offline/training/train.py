@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import time
 import warnings
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -185,11 +185,11 @@ class _Run:
         warned = False
         with ExitStack() as stack:
             metrics = [
-                MetricsWriter(seed_folder(self.folder, seed), learner.step + 1)
+                stack.enter_context(
+                    closing(MetricsWriter(seed_folder(self.folder, seed), learner.step + 1))
+                )
                 for seed in (seeds if learner.step < updates else ())
             ]
-            for writer in metrics:
-                stack.callback(writer.close)
             while learner.step < updates:
                 learner = self._with_new_episodes(learner)
                 before, terms = terms, self._train_to_next_stop(learner, metrics)
