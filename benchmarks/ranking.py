@@ -28,8 +28,12 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.files import write_json
-from mcaprl.offline import FQEConfig, OffPolicyEvaluator, rank_correlation, regret_at_1
-from mcaprl.online import Agent, OnlinePolicy, Scale, Task, describe_run, read_policy, save_policy
+from mcaprl.offline.estimate.fqe import FQEConfig
+from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
+from mcaprl.online.agent import Agent
+from mcaprl.online.evaluation import Scale
+from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
+from mcaprl.online.task import Task
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import episode_seed, make_sims
 
@@ -136,6 +140,42 @@ def show(sim: str, by_seed: list[list[dict[str, Any]]]) -> None:
     spread = [row["discounted"] for rows in by_seed for row in rows]
     print(f"true discounted values {min(spread):.2f} to {max(spread):.2f};", end=" ")
     print(f"FQE errs by {np.mean(np.abs(errors)):.2f} in the mean, bias {np.mean(errors):.2f}")
+
+
+def rank_correlation(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> float:
+    """Return Spearman's correlation: 1 if the estimates have the policies in their true order.
+
+    Equal values share the mean of their ranks. NaN if all estimates or all true values are equal.
+
+    >>> rank_correlation(np.array([1.0, 2.0, 3.0]), np.array([10.0, 30.0, 20.0]))
+    0.5
+    """
+    first, second = _ranks(estimated), _ranks(true)
+    if np.ptp(first) == 0 or np.ptp(second) == 0:
+        return float("nan")
+    return round(float(np.corrcoef(first, second)[0, 1]), 12)
+
+
+def regret_at_1(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> float:
+    """Return the loss of choosing the highest estimate, as a fraction of the range of values.
+
+    (max V - V of the choice) / (max V - min V): 0 for the best policy, 1 for the worst.
+
+    >>> regret_at_1(np.array([1.0, 5.0, 3.0]), np.array([10.0, 15.0, 20.0]))
+    0.5
+    """
+    spread = float(np.ptp(true))
+    if spread == 0:
+        return 0.0
+    return float(true.max() - true[estimated.argmax()]) / spread
+
+
+def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return ranks (N,) from 0; equal values share their mean."""
+    below = (values[:, None] > values).sum(1)
+    equal = (values[:, None] == values).sum(1)
+    ranks: NDArray[np.float64] = below + (equal - 1) / 2
+    return ranks
 
 
 def _mean_and_range(column: NDArray[np.float64]) -> str:

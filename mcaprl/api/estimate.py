@@ -89,7 +89,7 @@ def estimate(
     """
     from mcaprl.offline.estimate.fqe import FQEConfig
     from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
-    from mcaprl.offline.estimate.ranking import ranking
+    from mcaprl.offline.estimate.off_policy import ranking
 
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(1, updates=updates)

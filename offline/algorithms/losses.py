@@ -1,11 +1,18 @@
 """The equations of offline learning: pure functions of a batch, without networks or state.
 
 `_tm1` marks what belongs to the state in which an action was taken, `_t` what belongs to the next
-state. B is the batch size, A the number of actions, N the number of quantiles. `discount_t` is
-gamma, to the power of n for n-step returns, or 0 where the episode terminated. Outputs of actions
-that are not allowed are minus infinity.
+state. B is the batch size, A the number of actions, N the number of quantiles.
 
-A loss returns one value per transition; its gradient comes from autograd.
+    r_t             rewards (B,)
+    discount_t      gamma (B,), to the power of n for n-step returns, or 0 after termination
+    q_t             values (B, A) of the target network, or quantiles (B, A, N)
+    q_tm1, z_tm1    values (B, A) or quantiles (B, A, N) of the learning network
+    a_tm1           actions taken (B,), int64
+    target_tm1      targets (B,) of Q(s, a), or samples (B, N) of them
+    logits_tm1      unnormalized log probabilities (B, A)
+
+Outputs of actions that are not allowed are minus infinity. A loss returns one value per transition;
+its gradient comes from autograd.
 """
 
 from __future__ import annotations
@@ -20,12 +27,6 @@ def q_learning_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor) -> Tensor:
 
     See "Human-level control through deep reinforcement learning",
     https://doi.org/10.1038/nature14236.
-
-    Args:
-        r_t: Rewards (B,).
-        discount_t: Discounts (B,).
-        q_t: Values (B, A) of the target network, or quantiles (B, A, N). With quantiles, the target
-            is (B, N): the quantiles of the action with the largest mean.
     """
     return bellman_target(r_t, discount_t, q_t, best_actions(q_t))
 
@@ -40,9 +41,6 @@ def double_q_learning_target(
     https://arxiv.org/abs/1509.06461.
 
     Args:
-        r_t: Rewards (B,).
-        discount_t: Discounts (B,).
-        q_t_value: Values (B, A) of the target network, or quantiles (B, A, N) as above.
         q_t_selector: Values or quantiles of the learning network, of the same shape.
     """
     _check_shape("q_t_selector", q_t_selector, q_t_value.shape)
@@ -53,9 +51,6 @@ def bellman_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, a_t: Tensor) ->
     """Return the target (B,) for given next actions: r + discount Q'(s', a').
 
     Args:
-        r_t: Rewards (B,).
-        discount_t: Discounts (B,).
-        q_t: Values (B, A) of the target network, or quantiles (B, A, N); then the target is (B, N).
         a_t: Next actions (B,), int64.
     """
     _check_actions(q_t, a_t)
@@ -74,9 +69,6 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
     https://doi.org/10.1109/ADPRL.2009.4927542.
 
     Args:
-        r_t: Rewards (B,).
-        discount_t: Discounts (B,).
-        q_t: Values (B, A) of the target network.
         pi_t: Probabilities (B, A) of the policy in the next states.
     """
     _check_shape("r_t", r_t, (len(q_t),))
@@ -86,13 +78,7 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
 
 def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error of Q(s, a) (B,); its minimum is the mean target.
-
-    Args:
-        q_tm1: Values (B, A) of the learning network.
-        a_tm1: Actions taken (B,), int64.
-        target_tm1: Targets (B,) of Q(s, a).
-    """
+    """Return half the squared error of Q(s, a) (B,); its minimum is the mean target."""
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
     return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
@@ -109,11 +95,6 @@ def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor
 
     The gradient of a rare, large error (a crash, a new target network) is no larger than that of an
     error of 1: the clipped error of the DQN paper, as a loss.
-
-    Args:
-        q_tm1: Values (B, A) of the learning network.
-        a_tm1: Actions taken (B,), int64.
-        target_tm1: Targets (B,) of Q(s, a).
     """
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
@@ -126,11 +107,6 @@ def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Ten
     Quantile i, at tau_i = (i + 1/2) / N, has weight tau_i for samples above it and weight
     1 - tau_i for samples below. See "Distributional Reinforcement Learning with Quantile
     Regression", equation 10, https://arxiv.org/abs/1710.10044.
-
-    Args:
-        z_tm1: Quantiles (B, A, N) of the learning network.
-        a_tm1: Actions taken (B,), int64.
-        target_tm1: Samples (B, N) of the target.
     """
     _check_actions(z_tm1, a_tm1)
     n_quantiles = z_tm1.shape[2]
@@ -151,21 +127,13 @@ def cross_entropy(logits_tm1: Tensor, a_tm1: Tensor) -> Tensor:
     negative: minimizing it lowers all values and raises that of the logged action. See
     "Conservative Q-Learning for Offline Reinforcement Learning", equation 4,
     https://arxiv.org/abs/2006.04779.
-
-    Args:
-        logits_tm1: Unnormalized log probabilities (B, A), or values.
-        a_tm1: Actions of the data (B,), int64.
     """
     _check_actions(logits_tm1, a_tm1)
     return functional.cross_entropy(logits_tm1, a_tm1, reduction="none")
 
 
 def square_penalty(logits_tm1: Tensor) -> Tensor:
-    """Return the mean square (B,) of the logits of allowed actions, which keeps them bounded.
-
-    Args:
-        logits_tm1: Logits (B, A).
-    """
+    """Return the mean square (B,) of the logits of allowed actions, which keeps them bounded."""
     return logits_tm1.masked_fill(logits_tm1.isinf(), 0).square().mean(1)
 
 
@@ -178,7 +146,6 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
 
     Args:
         v_tm1: Values (B, 1) of states.
-        target_tm1: Values (B,) of the actions taken there.
         expectile: Number between 0 and 1.
     """
     _check_shape("v_tm1", v_tm1, (len(target_tm1), 1))
@@ -190,7 +157,6 @@ def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
     """Return outputs (B, A) or (B, A, N) with minus infinity for actions that are not allowed.
 
     Args:
-        outputs: Outputs of a network.
         mask: Allowed actions (B, A), bool, or None if all are allowed.
     """
     if mask is None:
@@ -205,7 +171,6 @@ def likely_actions(logits: Tensor, threshold: float) -> Tensor:
     algorithm 1, https://arxiv.org/abs/1910.01708.
 
     Args:
-        logits: Logits (B, A).
         threshold: Number from 0, which admits all actions, to 1, which admits the most likely only.
     """
     return (logits - logits.amax(1, keepdim=True)).exp() >= threshold

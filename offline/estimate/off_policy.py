@@ -6,7 +6,7 @@ have received are included by the estimators with a model (FQE, DR, WDR) and not
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -33,6 +33,8 @@ LEAST_SAMPLE_SIZE: Final = 10.0
 RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
+PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS", "FQE")
+"""Estimators from the most to the least reliable."""
 _ROWS_AT_ONCE = 4096
 _STANDARD_ERRORS = 4.0
 """Deviation of the mean weight from 1 above which the verdict is refused."""
@@ -290,6 +292,26 @@ class OffPolicyEvaluator:
     def _discounts(self) -> Floats:
         discounts: Floats = self.gamma ** np.arange(int(self._lengths.max()) + 1, dtype=np.float64)
         return discounts
+
+
+def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
+    """Rank policies by the first estimator of `PREFERENCE` that has a verdict on all of them.
+
+    Returns:
+        `estimator`; `policies`, best first; and `trusted`: false if no estimator has a verdict on
+        all policies and the ranking is that of FQE.
+    """
+    for estimator in PREFERENCE:
+        own = [estimate for estimate in estimates if estimate.estimator == estimator]
+        if all(estimate.trusted for estimate in own):
+            return {"estimator": estimator, "policies": _best_first(own), "trusted": True}
+    own = [estimate for estimate in estimates if estimate.estimator == "FQE"]
+    return {"estimator": "FQE", "policies": _best_first(own), "trusted": False}
+
+
+def _best_first(estimates: Sequence[Estimate]) -> list[str]:
+    ordered = sorted(estimates, key=lambda estimate: -(estimate.value or 0.0))
+    return [estimate.policy for estimate in ordered]
 
 
 def _verdict(size: float) -> str:

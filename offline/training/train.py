@@ -107,7 +107,10 @@ def train(
     open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
     if message := horizon_warning(config):
         warnings.warn(message, stacklevel=2)
-    run = _Run.create(folder, identity, dataset, buffer, held_out, follow)
+    gamma = buffer.packing.gamma
+    validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
+    limit = largest_return(dataset, gamma)
+    run = _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
     with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
         return run.train(learner_type, config, range(seed, seed + seeds), report)
 
@@ -135,22 +138,6 @@ class _Run:
     limit: float
     never_drawn: NDArray[np.int64]
     follow: GrowingLogs | None
-
-    @classmethod
-    def create(
-        cls,
-        folder: Path,
-        identity: RunIdentity,
-        dataset: Dataset,
-        buffer: TransitionBuffer,
-        held_out: NDArray[np.int64],
-        follow: GrowingLogs | None,
-    ) -> _Run:
-        """Create a run that holds out the episodes with these numbers."""
-        gamma = buffer.packing.gamma
-        watched = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
-        limit = largest_return(dataset, gamma)
-        return cls(folder, identity, dataset, buffer, watched, limit, held_out, follow)
 
     def train(
         self,
