@@ -38,16 +38,7 @@ FORMAT_VERSION = 2
 _WEIGHTS_NAME = "policy.safetensors"
 _IMAGE_SHIFT = "observation.image_{}.shift"
 _IMAGE_SCALE = "observation.image_{}.scale"
-_BROKEN_FILE_ERRORS = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    RuntimeError,
-    SafetensorError,
-    SpaceError,
-)
+_BAD_CONTENT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, SpaceError)
 
 
 class Scores(nn.Module):
@@ -247,7 +238,7 @@ def read_policy(folder: Path) -> Policy:
             f"{folder} has no policy: no {POLICY_NAME} and {_WEIGHTS_NAME}; "
             "training writes them with its first checkpoint"
         ) from error
-    except _BROKEN_FILE_ERRORS as error:
+    except (OSError, SafetensorError, *_BAD_CONTENT) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise PolicyError(f"cannot load the policy in {folder}: {reason}") from error
 

@@ -6,13 +6,18 @@ state. B is the batch size, A the number of actions, N the number of quantiles.
     r_t             rewards (B,)
     discount_t      gamma (B,), to the power of n for n-step returns, or 0 after termination
     q_t             values (B, A) of the target network, or quantiles (B, A, N)
+    q_t_value       q_t where a second network, of output q_t_selector, selects the action
+    a_t             next actions (B,), int64
+    pi_t            probabilities (B, A) of the evaluated policy in the next states
     q_tm1, z_tm1    values (B, A) or quantiles (B, A, N) of the learning network
     a_tm1           actions taken (B,), int64
     target_tm1      targets (B,) of Q(s, a), or samples (B, N) of them
+    v_tm1           values (B, 1) of states
     logits_tm1      unnormalized log probabilities (B, A)
 
-Outputs of actions that are not allowed are minus infinity. A loss returns one value per transition;
-its gradient comes from autograd.
+Targets of quantiles are (B, N), those of the action with the largest mean. Outputs of actions that
+are not allowed are minus infinity. A loss returns one value per transition; its gradient comes
+from autograd.
 """
 
 from __future__ import annotations
@@ -39,20 +44,13 @@ def double_q_learning_target(
     One network selects the next action and the other evaluates it, so an overestimate counts only
     where both make it. See "Deep Reinforcement Learning with Double Q-learning",
     https://arxiv.org/abs/1509.06461.
-
-    Args:
-        q_t_selector: Values or quantiles of the learning network, of the same shape.
     """
     _check_shape("q_t_selector", q_t_selector, q_t_value.shape)
     return bellman_target(r_t, discount_t, q_t_value, best_actions(q_t_selector))
 
 
 def bellman_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, a_t: Tensor) -> Tensor:
-    """Return the target (B,) for given next actions: r + discount Q'(s', a').
-
-    Args:
-        a_t: Next actions (B,), int64.
-    """
+    """Return the target (B,) for given next actions: r + discount Q'(s', a')."""
     _check_actions(q_t, a_t)
     _check_shape("r_t", r_t, (len(q_t),))
     _check_shape("discount_t", discount_t, (len(q_t),))
@@ -67,9 +65,6 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
     See "A theoretical and empirical analysis of expected Sarsa",
     https://doi.org/10.1109/ADPRL.2009.4927542.
-
-    Args:
-        pi_t: Probabilities (B, A) of the policy in the next states.
     """
     _check_shape("r_t", r_t, (len(q_t),))
     _check_shape("discount_t", discount_t, (len(q_t),))
@@ -143,10 +138,6 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
     With 0.5 its minimum is the mean target; toward 1 it approaches the largest target in the data.
     See "Offline Reinforcement Learning with Implicit Q-Learning", equation 5,
     https://arxiv.org/abs/2110.06169.
-
-    Args:
-        v_tm1: Values (B, 1) of states.
-        expectile: Number between 0 and 1.
     """
     _check_shape("v_tm1", v_tm1, (len(target_tm1), 1))
     error = target_tm1 - v_tm1.squeeze(1)
@@ -156,8 +147,7 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
 def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
     """Return outputs (B, A) or (B, A, N) with minus infinity for actions that are not allowed.
 
-    Args:
-        mask: Allowed actions (B, A), bool, or None if all are allowed.
+    `mask` is the allowed actions (B, A), bool, or None if all are allowed.
     """
     if mask is None:
         return outputs
@@ -168,10 +158,8 @@ def likely_actions(logits: Tensor, threshold: float) -> Tensor:
     """Return whether pi(a|s) / max_a pi(a|s) >= threshold (B, A), with pi = softmax(logits).
 
     The filter of discrete BCQ. See "Benchmarking Batch Deep Reinforcement Learning Algorithms",
-    algorithm 1, https://arxiv.org/abs/1910.01708.
-
-    Args:
-        threshold: Number from 0, which admits all actions, to 1, which admits the most likely only.
+    algorithm 1, https://arxiv.org/abs/1910.01708. A threshold of 0 admits all actions, 1 only
+    the most likely one.
     """
     return (logits - logits.amax(1, keepdim=True)).exp() >= threshold
 

@@ -127,6 +127,7 @@ class TransitionBuffer:
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
+        counts = lengths + 1
         places, returns = _n_step(dataset, packing)
         frames = encoder.encode(dataset.frames)
         actions = _counted_from_zero(dataset.actions, action_space)
@@ -137,7 +138,7 @@ class TransitionBuffer:
             action_space=action_space,
             packing=packing,
             frames=frames,
-            starts=torch.from_numpy(_starts(lengths + 1)),
+            starts=torch.from_numpy(np.repeat(np.cumsum(counts) - counts, counts)),
             places=torch.from_numpy(places),
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
@@ -268,10 +269,6 @@ def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDAr
     places = np.stack([here, here + ahead])
     with np.errstate(over="ignore"):
         return places, np.stack([rewards, discounts]).astype(np.float32)
-
-
-def _starts(frame_counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.repeat(np.cumsum(frame_counts) - frame_counts, frame_counts)
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:

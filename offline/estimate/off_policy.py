@@ -129,7 +129,8 @@ class OffPolicyEvaluator:
             np.float64
         )
         self._fold = random.permutation(len(self._lengths)) % FOLDS
-        returns = self._padded(dataset.rewards, 0.0) @ self._discounts()
+        rewards = self._padded(dataset.rewards, 0.0)
+        returns = rewards @ self.gamma ** np.arange(rewards.shape[1], dtype=np.float64)
         self.behavior_return = float(returns.mean())
         self.behavior_interval = RatioEstimate.mean(returns).interval(self._counts)
 
@@ -289,10 +290,6 @@ class OffPolicyEvaluator:
         table[steps] = column
         return table
 
-    def _discounts(self) -> Floats:
-        discounts: Floats = self.gamma ** np.arange(int(self._lengths.max()) + 1, dtype=np.float64)
-        return discounts
-
 
 def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
     """Rank policies by the first estimator of `PREFERENCE` that has a verdict on all of them.
@@ -301,17 +298,15 @@ def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
         `estimator`; `policies`, best first; and `trusted`: false if no estimator has a verdict on
         all policies and the ranking is that of FQE.
     """
-    for estimator in PREFERENCE:
-        own = [estimate for estimate in estimates if estimate.estimator == estimator]
-        if all(estimate.trusted for estimate in own):
-            return {"estimator": estimator, "policies": _best_first(own), "trusted": True}
-    own = [estimate for estimate in estimates if estimate.estimator == "FQE"]
-    return {"estimator": "FQE", "policies": _best_first(own), "trusted": False}
-
-
-def _best_first(estimates: Sequence[Estimate]) -> list[str]:
-    ordered = sorted(estimates, key=lambda estimate: -(estimate.value or 0.0))
-    return [estimate.policy for estimate in ordered]
+    by_estimator = {
+        name: [estimate for estimate in estimates if estimate.estimator == name]
+        for name in PREFERENCE
+    }
+    trusted = [name for name, own in by_estimator.items() if all(one.trusted for one in own)]
+    chosen = trusted[0] if trusted else "FQE"
+    ordered = sorted(by_estimator[chosen], key=lambda estimate: -(estimate.value or 0.0))
+    policies = [estimate.policy for estimate in ordered]
+    return {"estimator": chosen, "policies": policies, "trusted": bool(trusted)}
 
 
 def _verdict(size: float) -> str:

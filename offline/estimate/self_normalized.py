@@ -125,9 +125,5 @@ def student_factor(degrees_of_freedom: float) -> float:
 
 def divide(numerators: Floats, denominators: Floats) -> Floats:
     """Return the ratios, and 0 where the denominator is 0."""
-    return np.divide(
-        numerators,
-        denominators,
-        out=np.zeros(denominators.shape),
-        where=denominators > 0,
-    )
+    zeros = np.zeros(denominators.shape)
+    return np.divide(numerators, denominators, out=zeros, where=denominators > 0)

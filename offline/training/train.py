@@ -24,11 +24,7 @@ from mcaprl.offline.algorithms.registry import choose_algorithm
 from mcaprl.offline.batches.buffer import TransitionBuffer, choose_device
 from mcaprl.offline.batches.observations import ObservationEncoder
 from mcaprl.offline.policy import read_policy, save_policy
-from mcaprl.offline.training.checkpoint import (
-    Checkpoint,
-    read_checkpoint,
-    save_checkpoint,
-)
+from mcaprl.offline.training.checkpoint import Checkpoint, read_checkpoint, save_checkpoint
 from mcaprl.offline.training.follow import CHECK_INTERVAL, GrowingLogs, with_more_data
 from mcaprl.offline.training.metrics import MetricsWriter, OfflineSummary
 from mcaprl.offline.training.watch import (
