@@ -143,7 +143,7 @@ class TransitionBuffer:
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
         )
-        return buffer if weights is None else buffer.drawn_by(np.repeat(weights, lengths))
+        return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
     def __len__(self) -> int:
         """Return the number of transitions."""
@@ -180,7 +180,7 @@ class TransitionBuffer:
         actions = self.actions.index_select(0, rows)
         return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
 
-    def drawn_by(self, weights: NDArray[np.float64]) -> TransitionBuffer:
+    def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
         """Return the same transitions, with relative frequencies (N,) of being drawn.
 
         Raises:

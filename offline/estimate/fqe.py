@@ -86,7 +86,7 @@ class FQE(Learner):
         self.target_network = self.add_target_network("q", config.target_interval)
         rewards, _ = buffer.returns
         drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
-        self.low, self.high = reachable(drawn, config.gamma)
+        self.low, self.high = return_bounds(drawn, config.gamma)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return one value per action."""
@@ -107,7 +107,7 @@ class FQE(Learner):
         return outputs[: len(self.buffer)].clamp(self.low, self.high)
 
 
-def reachable(rewards: Tensor, gamma: float) -> tuple[float, float]:
+def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
     """Return the bounds of the discounted sum of such rewards, over one step or more."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())

@@ -209,7 +209,7 @@ class OffPolicyEvaluator:
         q, v, v_next = (np.zeros(len(fold)) for _ in range(3))
         for held_out in range(FOLDS):
             evaluated = fold == held_out
-            training = self._buffer.drawn_by((~evaluated).astype(np.float64))
+            training = self._buffer.with_weights((~evaluated).astype(np.float64))
             learner = FQE(
                 self._config,
                 training,

@@ -83,16 +83,18 @@ def _state_of(path: Path) -> tuple[int, int, int]:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def with_more_data(learner: Learner, dataset: Dataset, never_drawn: NDArray[np.int64]) -> Learner:
+def with_more_data(
+    learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
+) -> Learner:
     """Return the same learner at the same step, on a dataset that has grown.
 
     Args:
         learner: Learner to continue.
         dataset: Its dataset with more episodes appended.
-        never_drawn: Numbers of the held-out episodes.
+        held_out_episodes: Numbers of the held-out episodes.
     """
     weights = np.ones(len(dataset.episodes))
-    weights[never_drawn] = 0.0
+    weights[held_out_episodes] = 0.0
     buffer = TransitionBuffer.from_dataset(
         dataset, learner.config.packing, encoder=learner.buffer.encoder, weights=weights
     ).to(learner.buffer.device)

@@ -122,7 +122,7 @@ class _Run:
         buffer: The same data as tensors.
         held_out: Transitions for validation, if any.
         limit: Upper bound on the absolute value of a return.
-        never_drawn: Numbers of the held-out episodes.
+        held_out_episodes: Numbers of the held-out episodes.
         follow: Growing logs from which the data were read, if any.
     """
 
@@ -132,7 +132,7 @@ class _Run:
     buffer: TransitionBuffer
     held_out: HeldOut | None
     limit: float
-    never_drawn: NDArray[np.int64]
+    held_out_episodes: NDArray[np.int64]
     follow: GrowingLogs | None
 
     def train(
@@ -215,7 +215,7 @@ class _Run:
         """Return the learner, with newly logged episodes every `CHECK_INTERVAL` updates."""
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
-        return with_more_data(learner, self.follow.dataset, self.never_drawn)
+        return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
 
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.

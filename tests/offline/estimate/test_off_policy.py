@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.offline.batches.buffer import TransitionBuffer
-from mcaprl.offline.estimate.fqe import FQE, FQEConfig, reachable
+from mcaprl.offline.estimate.fqe import FQE, FQEConfig, return_bounds
 from mcaprl.offline.estimate.importance import ESTIMATORS
 from mcaprl.offline.estimate.off_policy import (
     Estimate,
@@ -81,10 +81,10 @@ def by_name(found: PolicyEstimates) -> dict[str, Estimate]:
         ([0.5, 1.0], 0.0, (0.5, 1.0)),
     ],
 )
-def test_reachable_returns_by_hand(
+def test_return_bounds_by_hand(
     rewards: list[float], gamma: float, bounds: tuple[float, float]
 ) -> None:
-    assert reachable(torch.tensor(rewards), gamma) == pytest.approx(bounds)
+    assert return_bounds(torch.tensor(rewards), gamma) == pytest.approx(bounds)
 
 
 def test_fitted_q_evaluation_learns_the_true_values() -> None:

@@ -66,7 +66,7 @@ def test_each_finished_episode_is_read_once(tmp_path: Path) -> None:
 
 
 def test_a_compacted_log_is_not_read_twice(tmp_path: Path) -> None:
-    """A recorder that closes replaces its log by a smaller file with the same episodes."""
+    """A recorder that closes replaces its log by a file of another size with the same episodes."""
     path = tmp_path / "log.mcap"
     recorder = Recorder(path)
     recorder.record(6)
