@@ -32,8 +32,6 @@ __all__ = [
     "OffPolicyEvaluator",
     "Scores",
     "TransitionBuffer",
-    "rank_correlation",
-    "regret_at_1",
     "train",
 ]
 
@@ -49,7 +47,6 @@ __getattr__ = lazy_attributes(
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),
         "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
         "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
-        "mcaprl.offline.estimate.ranking": ("rank_correlation", "regret_at_1"),
         "mcaprl.offline.policy": ("Scores",),
         "mcaprl.offline.training.train": ("train",),
     },

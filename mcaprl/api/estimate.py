@@ -88,8 +88,7 @@ def estimate(
         LogError: The logs cannot be read.
     """
     from mcaprl.offline.estimate.fqe import FQEConfig
-    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
-    from mcaprl.offline.estimate.off_policy import ranking
+    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator, ranking
 
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(1, updates=updates)
