@@ -42,10 +42,7 @@ from benchmarks import rivals
 from benchmarks.page import write_section
 from benchmarks.workloads import EPISODE_STEPS, vectors
 from mcaprl.files import write_json
-from mcaprl.offline.algorithms.dqn import DoubleDQN
-from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.algorithms.registry import ALGORITHMS
-from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline import ALGORITHMS, DoubleDQN, Learner, TransitionBuffer
 
 CHECKED_UPDATES = 10
 ROWS, EPISODE, WIDTH, ACTIONS = 20_000, 1_000, 19, 9

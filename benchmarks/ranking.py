@@ -28,12 +28,8 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl.files import write_json
-from mcaprl.offline.estimate.fqe import FQEConfig
-from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator
-from mcaprl.online.agent import Agent
-from mcaprl.online.evaluation import Scale
-from mcaprl.online.policy import OnlinePolicy, describe_run, read_policy, save_policy
-from mcaprl.online.task import Task
+from mcaprl.offline import FQEConfig, OffPolicyEvaluator
+from mcaprl.online import Agent, OnlinePolicy, Scale, Task, describe_run, read_policy, save_policy
 from mcaprl.progress import TrainingProgress
 from mcaprl.sims import episode_seed, make_sims
 
