@@ -110,7 +110,7 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
         (gym.make("CartPole-v1"), {"step_duration_s": 0.5}, "its step_duration_ns is 20000000"),
         (gym.make("MountainCar-v0"), {}, "cannot be appended to"),
         (gym.make("CartPole-v1"), {"start_time_ns": 1_000}, "must be later"),
-        (gym.make("CartPole-v1"), {"overwrite": True}, "choose one of the two"),
+        (gym.make("CartPole-v1"), {"overwrite": True}, "mutually exclusive"),
     ],
 )
 def test_incompatible_recordings_are_not_appended(
