@@ -5,12 +5,55 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mcaprl.errors import McaprlError
+from mcaprl.errors import LogError, McaprlError
+
+if sys.platform != "win32":
+    import fcntl
+
+
+def try_lock(descriptor: int) -> bool:
+    """Lock an open file or folder for this process; return False if another one has locked it.
+
+    The lock is advisory and ends when the file is closed. Systems without `flock`, such as Windows
+    and some network file systems, have no locks.
+    """
+    if sys.platform != "win32":
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:
+            pass
+    return True
+
+
+@contextmanager
+def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Iterator[None]:
+    """Create a folder if it is missing, and lock it against other writers.
+
+    Raises:
+        McaprlError: Another process is writing to the folder, or it cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise error_type(f"cannot write {folder}: {error.strerror or error}") from error
+    try:
+        if not try_lock(descriptor):
+            raise error_type(
+                f"{folder} is being written by another process: wait for its end, or choose another"
+                " folder"
+            )
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager
