@@ -1,20 +1,34 @@
-"""Atomic replacement of files: after a kill, `path` has either its old or its new content."""
+"""Locks on files and folders, and atomic replacement of files.
+
+A file is written in a hidden work folder beside its target, `.NAME.part`, which is locked while its
+writer runs. When the file is complete and synced to disk, it replaces the target atomically. If the
+writer is killed, the target has either its old or its new content, and the next writer removes the
+work folder.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
+import shutil
+import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from mcaprl.errors import LogError, McaprlError
+from mcaprl.errors import LogError, McaprlError, OutputExistsError
 
 if sys.platform != "win32":
     import fcntl
+
+_MAX_NAME_BYTES = 255
+_MAX_JSON_DEPTH = 100
+_TAKEN = "{} is being written by another process; wait until it ends, or choose another path"
 
 
 def try_lock(descriptor: int) -> bool:
@@ -40,63 +54,233 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
     Raises:
         McaprlError: Another process is writing to the folder, or it cannot be created.
     """
+    descriptor = -1
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY)
+        if sys.platform != "win32":
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise error_type(f"cannot write {folder}: {error.strerror or error}") from error
     try:
-        if not try_lock(descriptor):
+        if descriptor >= 0 and not try_lock(descriptor):
             raise error_type(
-                f"{folder} is being written by another process: wait for its end, or choose another"
-                " folder"
+                f"{folder} is being written by another process: wait until it ends, or choose"
+                " another folder"
             )
         yield
     finally:
-        os.close(descriptor)
+        if descriptor >= 0:
+            os.close(descriptor)
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Check that a file can be written: the path is new or that of a regular file to replace.
+
+    Raises:
+        OutputExistsError: The file exists, and `overwrite` is not set; or the path is that of a
+            symbolic link, folder, device or FIFO.
+        LogError: Another writer has locked the file.
+    """
+    try:
+        mode = path.lstat().st_mode
+    except OSError:
+        # Nothing is there, or the folder cannot be read; creating the file reports the latter.
+        return
+    if stat.S_ISLNK(mode):
+        raise OutputExistsError(f"{path} is a symbolic link: choose the path of a regular file")
+    if not stat.S_ISREG(mode):
+        raise OutputExistsError(f"{path} is not a regular file: choose another path")
+    if not overwrite:
+        raise OutputExistsError(
+            f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
+        )
+    with locked_file(path):
+        pass
+
+
+@contextmanager
+def locked_file(path: Path) -> Iterator[None]:
+    """Lock a file against other writers, unless it does not exist or cannot be read.
+
+    Raises:
+        LogError: Another writer has locked the file.
+    """
+    while True:
+        try:
+            file = FileIO(open_at_once(path))
+        except OSError:
+            yield
+            return
+        with file:
+            if not try_lock(file.fileno()):
+                raise LogError(_TAKEN.format(path))
+            # A writer that has just finished may have replaced the file before its lock was free.
+            if is_at(file.fileno(), path):
+                yield
+                return
+
+
+def open_at_once(path: Path) -> int:
+    """Open a file for reading; unlike `open`, do not wait for the writer of a FIFO."""
+    return os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+
+
+def is_at(descriptor: int, path: Path) -> bool:
+    """Return whether an open file or folder is the one at a path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
+    """Create and lock the work folder of a target; remove it at the end.
+
+    Files that a killed writer left there are removed first.
+
+    Args:
+        path: Target, which this function neither reads nor writes.
+        concurrent: Whether several processes may write files for the target at the same time.
+
+    Raises:
+        LogError: Another process is writing the target.
+        OSError: The folder cannot be created.
+    """
+    folder = _work_path(path, f".{os.getpid()}.part" if concurrent else ".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if concurrent:
+        _remove_unlocked(path.parent, f".{path.name}.")
+    while True:
+        folder.mkdir(exist_ok=True)
+        descriptor = -1 if sys.platform == "win32" else os.open(folder, os.O_RDONLY)
+        try:
+            if descriptor >= 0 and not try_lock(descriptor):
+                raise LogError(_TAKEN.format(path))
+            # A writer that has just finished may have removed the folder before its lock was free.
+            if descriptor >= 0 and not is_at(descriptor, folder):
+                continue
+            _empty(folder)
+            try:
+                yield folder
+            finally:
+                shutil.rmtree(folder, ignore_errors=True)
+            return
+        finally:
+            if descriptor >= 0:
+                os.close(descriptor)
+
+
+def remove_leftover(path: Path) -> None:
+    """Remove the work folder of a killed writer of this target, if there is one."""
+    if _work_path(path).is_dir():
+        with suppress(OSError, LogError), work_folder(path):
+            pass
+
+
+def _remove_unlocked(parent: Path, prefix: str) -> None:
+    """Remove the work folders of killed writers that shared a target."""
+    for folder in parent.iterdir():
+        if folder.name.startswith(prefix) and folder.name.endswith(".part"):
+            with suppress(OSError, LogError), locked_folder(folder):
+                shutil.rmtree(folder)
+
+
+def _work_path(path: Path, suffix: str = ".part") -> Path:
+    name = f".{path.name}{suffix}"
+    if len(os.fsencode(name)) > _MAX_NAME_BYTES:
+        name = f".{hashlib.sha256(os.fsencode(name)).hexdigest()[:32]}{suffix}"
+    return path.with_name(name)
+
+
+def _empty(folder: Path) -> None:
+    for leftover in folder.iterdir():
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
 
 
 @contextmanager
 def replacing(
-    path: Path, error_type: type[McaprlError] | None = None, *, concurrent: bool = False
+    path: Path,
+    error_type: type[McaprlError] | None = None,
+    *,
+    overwrite: bool = True,
+    concurrent: bool = False,
 ) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; move the file written there to `path` at the end.
+    """Yield a path in a work folder; move the file written there to `path` at the end.
 
-    The folder is created, and the content is on the disk before the move. If the body raises,
-    `path` is left as it was. The temporary file is removed in either case.
+    The content is synced to disk before the move. If the body raises, or the file was locked or
+    created by another writer in the meantime, `path` is left as it was.
 
     Args:
-        path: File to create or replace.
+        path: File to create or replace; missing folders are created.
         error_type: Type raised in place of an OSError; None lets the OSError pass.
+        overwrite: Whether an existing file is replaced.
         concurrent: Whether several processes may replace `path` at the same time.
 
     Raises:
+        OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
+        LogError: Another process is writing the file.
         McaprlError: The file cannot be written, and `error_type` is given.
         OSError: The file cannot be written, and `error_type` is None.
     """
-    process = f".{os.getpid()}" if concurrent else ""
-    unfinished = path.with_name(f"{path.name}{process}.tmp")
+    check_target(path, overwrite=overwrite)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with work_folder(path, concurrent=concurrent) as folder:
+            unfinished = folder / path.name
             yield unfinished
             with unfinished.open("rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(unfinished, path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+            _move(unfinished, path, overwrite=overwrite)
     except OSError as error:
         if error_type is None:
             raise
         raise error_type(f"cannot write {path}: {error.strerror or error}") from error
 
 
+def _move(source: Path, path: Path, *, overwrite: bool) -> None:
+    """Move a complete file to its target, which no other writer has locked, atomically."""
+    if not overwrite:
+        # Unlike a rename, a link does not replace a file that was created in the meantime. Some
+        # file systems have no links.
+        with suppress(OSError):
+            os.link(source, path)
+            return
+    check_target(path, overwrite=overwrite)
+    with locked_file(path):
+        if path.exists():
+            os.chmod(source, stat.S_IMODE(path.stat().st_mode))
+        os.replace(source, path)
+
+
 def write_atomically(
     path: Path, content: bytes, error_type: type[McaprlError] | None = None
 ) -> None:
-    """Write a file with `replacing`."""
+    """Write a file atomically with `replacing`."""
     with replacing(path, error_type) as unfinished:
         unfinished.write_bytes(content)
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON whose nesting is no deeper than a file of this package can need.
+
+    Raises:
+        ValueError: The text is not JSON, or is nested too deeply.
+    """
+    too_deep = f"JSON is nested more than {_MAX_JSON_DEPTH} levels deep"
+    try:
+        found = json.loads(text)
+    except RecursionError as error:
+        raise ValueError(too_deep) from error
+    level = [found] if isinstance(found, dict | list) else []
+    for _ in range(_MAX_JSON_DEPTH):
+        inner = [part.values() if isinstance(part, dict) else part for part in level]
+        level = [part for parts in inner for part in parts if isinstance(part, dict | list)]
+        if not level:
+            return found
+    raise ValueError(too_deep)
 
 
 def json_text(value: Any) -> str:

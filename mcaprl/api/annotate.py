@@ -14,7 +14,7 @@ from mcaprl.errors import UsageError
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
-from mcaprl.recorder.viewer.annotate import AnnotatedCopy, values_topics
+from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
 from mcaprl.recorder.viewer.verify import Verification
 
 
@@ -44,6 +44,7 @@ def annotate(
     scene: bool = False,
     camera: bool = False,
     sim: str | None = None,
+    trust_env: bool = False,
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Annotation:
@@ -52,19 +53,21 @@ def annotate(
     Args:
         file: Path of the log.
         out: Path of the copy.
-        policy: Path of a trained run, or several of them.
-        gamma: Discount of the TD errors; None for the run's.
-        scene: Whether the sim is stepped again to add its scene.
-        camera: Whether the scene has metric depth images, too.
-        sim: Short name or Gymnasium id that replaces the log's.
+        policy: Path of a trained run, or several paths.
+        gamma: Discount of the TD errors; None for that of the run.
+        scene: Whether to step the sim again and add its scene.
+        camera: Whether to add metric depth images to the scene.
+        sim: Short name or Gymnasium id to use instead of the logged one.
+        trust_env: Whether to import the module that the logged id names, and to pass the logged
+            arguments to any environment.
         overwrite: Whether an existing file is replaced.
-        progress: Opens the progress bar.
+        progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: There is nothing to add, the log has it already, or `gamma` is out of its range.
+        UsageError: Nothing is requested, the log already has it, or `gamma` is out of range.
         UnknownNameError: There is no such policy.
-        PolicyError: A policy was trained on other spaces than the log's.
-        LogError: The log cannot be read, or the sim does not repeat it.
+        PolicyError: A policy was trained on spaces other than the log's.
+        LogError: The log cannot be read, or the sim does not reproduce it.
         OutputExistsError: `out` exists.
     """
     check_fraction(gamma=gamma)
@@ -74,11 +77,11 @@ def annotate(
     dataset = open_logs(path)
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))
-    with AnnotatedCopy(path, Path(out), overwrite=overwrite) as copy:
+    with annotated_copy(path, Path(out), overwrite=overwrite) as copy:
         for name, topic in topics.items():
             copy.add_values(topic, _values(dataset, name, gamma, progress))
         if scene:
-            with closing(sim_of(dataset, path, sim)) as env:
+            with closing(sim_of(dataset, path, sim, trust_env=trust_env)) as env:
                 added = copy.add_scene(dataset, env, camera=camera)
     return Annotation(Path(out), len(dataset), topics, added)
 

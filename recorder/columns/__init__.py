@@ -1,4 +1,4 @@
-"""MCAP topics as NumPy columns. This package knows nothing about reinforcement learning.
+"""MCAP topics as NumPy columns, independent of reinforcement learning.
 
 Reading: `reader` (summary, positions of messages), `topic` (columns), `decoder` and `cdr` (fields).
 Writing: `writer` (chunks, top-level records), `output` (file), `compact` (merges small chunks at

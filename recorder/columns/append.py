@@ -1,4 +1,4 @@
-"""State of a finished MCAP file, from which a writer can append to it."""
+"""State of a finished MCAP file that a writer needs to append to the file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DATA_END = struct.Struct("<BQI")
 
 @dataclass
 class WrittenState:
-    """State of the writer of a finished file.
+    """Final state of the writer of a finished file.
 
     Attributes:
         summary: Summary of the file.
@@ -40,7 +40,7 @@ class WrittenState:
 
 
 def written_state(path: Path) -> WrittenState:
-    """Read the state that the writer of a file had at its end.
+    """Read the final state of the writer of a file.
 
     Raises:
         LogError: The file is damaged or not finished, or has messages outside of chunks.
@@ -49,7 +49,7 @@ def written_state(path: Path) -> WrittenState:
         reader = McapReader(path)
         end = reader.summary_start - _DATA_END.size
         if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
-            raise CorruptLogError("its writer did not finish it")
+            raise CorruptLogError("the file is not finished")
         (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
         summary = Summary(chunks=list(reader.chunks))
         written = WrittenState(summary, end, crc or crc32(reader.view[:end]))
@@ -58,7 +58,7 @@ def written_state(path: Path) -> WrittenState:
     except CorruptLogError as error:
         what = str(error).removeprefix(f"{path}: ")
         raise LogError(
-            f"{path} cannot be appended to, since {what}: run `mcaprl recover {path} OUT` and"
+            f"{path} cannot be appended to: {what}; run `mcaprl recover {path} OUT` and"
             " append to OUT"
         ) from error
     return written

@@ -1,13 +1,12 @@
 """Field positions in CDR messages of any ROS 2 type.
 
-Messages of one type and one length nearly always have equal string and sequence lengths. The
-`Layout` of an example is a NumPy structured dtype together with these lengths, which are compared
-with those of every other message. Messages with equal lengths are read as one array; all others are
-decoded by rosbags, with the same values.
+Messages of the same type and length nearly always have equal string and sequence lengths. The
+`Layout` of an example message combines a NumPy structured dtype with these lengths. Messages that
+match the layout are read as one array; rosbags decodes all others, with the same values.
 
-CDR starts with an encapsulation header of 4 bytes, of which the second is the byte order. After it,
-each number is aligned to its own size, counted from the end of the header. A string is a uint32
-length and this number of bytes, of which the last is 0; a sequence is a uint32 count and its
+A CDR message starts with a 4-byte encapsulation header, whose second byte is the byte order. After
+the header, each number is aligned to its size, relative to the end of the header. A string is a
+uint32 length and that number of bytes, the last of which is 0; a sequence is a uint32 count and its
 elements. Up to three bytes of padding may follow.
 """
 
@@ -48,9 +47,9 @@ ROS_TO_NUMPY = {
 """NumPy type code of each ROS primitive type."""
 
 MAX_PADDING_BYTES = 3
-# The encapsulation headers of plain CDR; the two bytes after them are options without effect.
+# First two bytes of the encapsulation header of plain CDR; the last two have no effect.
 BIG_ENDIAN, LITTLE_ENDIAN = b"\0\0", b"\0\1"
-# Messages with more nested parts than this are decoded one by one.
+# Messages with more fields than this, nested ones included, are decoded one by one.
 _MAX_PARTS = 256
 _MAX_LAYOUTS = 64
 
@@ -60,9 +59,9 @@ class Layout:
     """Positions of the wanted fields in messages with equal string and sequence lengths.
 
     Attributes:
-        dtype: Structured dtype of a message with its padding: wanted fields and `constants`.
-        constants: Values that all these messages share: byte order, and the length of each string
-            and sequence.
+        dtype: Structured dtype of a message with padding: wanted fields and `constants`.
+        constants: Values that all messages of the layout share: byte order, and the length of each
+            string and sequence.
     """
 
     dtype: np.dtype[Any]
@@ -74,7 +73,7 @@ class Layout:
 
 
 class MessageType:
-    """Message type that is parsed from a schema of a log."""
+    """Message type parsed from a schema."""
 
     def __init__(self, name: str, text: str) -> None:
         """Parse a ROS 2 message definition with its nested types.
@@ -142,7 +141,7 @@ class MessageType:
         return walk.layout()
 
     def _pass(self, walk: _Walk, description: Any, name: str | None) -> None:
-        """Skip one field; record its position if it has a name."""
+        """Skip one field; record its position under `name` unless that is None."""
         kind, what = description
         match kind:
             case Nodetype.BASE if what[0] == "string":
@@ -167,7 +166,7 @@ class MessageType:
     def _refuse(self, name: str | None) -> None:
         """Raise LogError for a wanted field that is a nested message or a list of strings."""
         if name is not None:
-            raise LogError(f"field {name} of {self.name} is neither a number, array nor text")
+            raise LogError(f"field {name} of {self.name} is not a number, array or string")
 
 
 class _Walk:
@@ -183,7 +182,7 @@ class _Walk:
         self._fields: dict[str, tuple[Any, int]] = {"_encapsulation": ("<u2", 0)}
 
     def take(self, code: str, count: int, name: str | None, *, scalar: bool = False) -> None:
-        """Skip `count` numbers, or a string."""
+        """Skip `count` numbers or one string; record the position under `name`."""
         self._parts += 1
         if self._parts > _MAX_PARTS:
             raise _NoLayout
@@ -199,10 +198,12 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def length(self) -> int:
-        """Skip the length of a string or sequence; messages of this layout have the same length."""
+        """Read the length of a string or sequence, and make it a constant of the layout."""
         name = f"_length_{len(self._constants)}"
         self.take("u4", 1, name, scalar=True)
         (value,) = struct.unpack_from(f"{self._order}I", self._data, self.position - 4)
+        if value > len(self._data):
+            raise _NoLayout
         self._constants[name] = value
         return int(value)
 
@@ -221,7 +222,7 @@ class _Walk:
 
 
 class _NoLayout(Exception):
-    """Error for a message that is too short for its type or has too many parts."""
+    """Error for a message that is too short for its type or has too many fields."""
 
 
 def message_type(schema: Schema) -> MessageType:
@@ -231,7 +232,7 @@ def message_type(schema: Schema) -> MessageType:
         LogError: The encoding is not `ros2msg`, or the definition does not parse.
     """
     if schema.encoding != "ros2msg":
-        raise LogError(f"its schema {schema.name} is {schema.encoding!r}; known is 'ros2msg'")
+        raise LogError(f"schema {schema.name} has encoding {schema.encoding!r}, not 'ros2msg'")
     return _parsed(schema.name, schema.data.decode(errors="replace"))
 
 

@@ -56,14 +56,14 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
     if times:
         first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
         if (first, last) != (header.start_time, header.end_time):
-            found.append("the times of the chunk are not those of its messages")
+            found.append("the times of the chunk do not match its messages")
     return [Problem(what, place(reader, chunk)) for what in found]
 
 
 def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Return whether a chunk has the messages of its indexes and no other records.
+    """Return whether a chunk contains exactly the messages of its indexes.
 
-    Chunks with other records can be valid, too, but are compared record by record.
+    A chunk with other records can be valid, too; the caller compares it record by record.
     """
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
     if not len(ids):
@@ -119,7 +119,7 @@ def check_statistics(reader: McapReader) -> list[Problem]:
             if id_ in counts
         ]
         found += [
-            Problem(f"the summary counts {wrong} {name}, there are {count}", "the summary")
+            Problem(f"the summary counts {wrong} {name}, the file {count}", "the summary")
             for name, wrong, count in triples
             if wrong != count
         ]

@@ -18,23 +18,23 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 
-# 32 KB of zstd can decompress to 1 GiB; no ordinary writer makes chunks of this size.
+# 32 KB of zstd data can decompress to 1 GiB; ordinary writers stay below this limit.
 MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
-# The fields of a ChunkIndex record: these, the map, these, the compression's name, these.
+# Parts of a ChunkIndex record: start, map entries, middle, name of the compression, end.
 _INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
 _INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # A record of numbers is most similar to the records just before it, so a small hash table is faster
-# than that of zstd's level 1 and finds more matches. The last digits of floats are noise without
-# matches, which the fast strategy stores as they are if a target length is set. Files are 2 to 9 %
-# larger, written in 20 to 50 % less time and read in 33 to 50 % less.
+# than the one of zstd level 1 and finds more matches. The low bits of floats are noise, which the
+# fast strategy stores uncompressed if a target length is set. Files are 2 to 9 % larger than at
+# level 1, are written in 20 to 50 % less time, and are read in 33 to 50 % less.
 SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
-# Images are similar to earlier images far back, and their bytes are not noise.
+# Images resemble images far back in the chunk, and their bytes are not noise.
 LONG_RECORDS = _ZSTD(1)
-# Messages of different lengths are mostly for viewers and so repetitive that a slower search halves
-# their size.
+# Messages of different lengths are mostly display messages, so repetitive that a slower search
+# halves their size.
 MIXED_RECORDS = _ZSTD(12)
 # Longer messages are mostly images.
 LONG_MESSAGE_BYTES = 2**11
@@ -53,7 +53,7 @@ def _compressor(
 
 
 class Compressors:
-    """Functions that compress the records of chunks. They share memory: use them in one thread.
+    """Compression functions for chunk records; not thread-safe, since they share memory.
 
     Attributes:
         chunk_name: Name of the compression in Chunk records.
@@ -63,14 +63,14 @@ class Compressors:
     """
 
     def __init__(self, compression: str) -> None:
-        """Create the functions for `zstd`, `lz4` or `none`."""
+        """Create the compressors for `zstd`, `lz4` or `none`."""
         self.chunk_name = "" if compression == "none" else compression
         self.short = _compressor(compression, SHORT_RECORDS)
         self.long = _compressor(compression, LONG_RECORDS)
         self.mixed = _compressor(compression, MIXED_RECORDS)
 
     def of(self, records: memoryview, count: int) -> Callable[[Any], bytes]:
-        """Return the function for a chunk of `count` messages."""
+        """Return the compressor for a chunk of `count` messages."""
         if len(records) > LONG_MESSAGE_BYTES * count:
             return self.long
         first_bytes = RECORD_HEADER_BYTES + int.from_bytes(records[1:RECORD_HEADER_BYTES], "little")
@@ -97,7 +97,7 @@ class ChunkHeader(NamedTuple):
     data: slice
 
     def to_record(self) -> bytes:
-        """Return the Chunk record without its data, which follows it."""
+        """Return the Chunk record up to its data."""
         name, data_bytes = self.compression.encode(), int(self.data.stop - self.data.start)
         length = _CHUNK_START.size - RECORD_HEADER_BYTES + len(name) + 8 + data_bytes
         start: bytes = _CHUNK_START.pack(
@@ -112,7 +112,7 @@ class ChunkHeader(NamedTuple):
         return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
     def to_index(self, offset: int, content_bytes: int) -> ChunkIndex:
-        """Return the ChunkIndex of the chunk without message indexes.
+        """Return a ChunkIndex of the chunk that lists no message indexes.
 
         Args:
             offset: First byte of the Chunk record.
@@ -147,16 +147,16 @@ def chunk_header(file: memoryview, offset: int) -> ChunkHeader:
         raise CorruptLogError(f"no chunk at byte {offset}") from error
     record_end = offset + RECORD_HEADER_BYTES + length
     if opcode != Opcode.CHUNK or data_start + data_bytes > min(record_end, len(file)):
-        raise CorruptLogError(f"no whole chunk at byte {offset}")
+        raise CorruptLogError(f"no complete chunk at byte {offset}")
     if size > MAX_CHUNK_BYTES:
         raise CorruptLogError(
-            f"the chunk at byte {offset} claims {size} bytes; at most {MAX_CHUNK_BYTES} are read"
+            f"the chunk at byte {offset} declares {size} bytes; the limit is {MAX_CHUNK_BYTES}"
         )
     return ChunkHeader(start, end, size, crc, name, slice(data_start, data_start + data_bytes))
 
 
 def chunk_index_record(chunk: ChunkIndex) -> bytes:
-    """Return a ChunkIndex record; twenty times as fast as the `mcap` library."""
+    """Serialize a ChunkIndex record, twenty times as fast as the `mcap` library."""
     offsets, name = chunk.message_index_offsets, chunk.compression.encode()
     start = _INDEX_START.pack(
         chunk.message_start_time,
@@ -191,7 +191,7 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
     offsets = dict(pairs)
     if len(offsets) < len(pairs):
         raise CorruptLogError("a chunk_index record has several indexes of one channel")
-    # Positional, in the order of the fields: keywords take twice as long.
+    # Positional arguments: keywords take twice as long.
     return ChunkIndex(
         length,
         offset,
@@ -219,7 +219,7 @@ class Scratch:
     """
 
     def __init__(self) -> None:
-        """Start without memory."""
+        """Create empty scratch memory."""
         self._memory = np.empty(0, np.uint8)
         self.kept = _NOTHING
 
@@ -247,14 +247,14 @@ def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None)
         scratch: Memory for the records, which are valid until its next use. Default: new memory.
 
     Raises:
-        CorruptLogError: The chunk is damaged, or its decompressed size is not that of its header.
+        CorruptLogError: The chunk is damaged, or its decompressed size does not match its header.
     """
     header = chunk_header(file, offset)
     records = _decompress(file[header.data], header, offset, scratch or Scratch())
     if len(records) != header.uncompressed_bytes:
         raise CorruptLogError(
             f"the chunk at byte {offset} has {len(records)} bytes of records,"
-            f" not the {header.uncompressed_bytes} it claims"
+            f" not the {header.uncompressed_bytes} of its header"
         )
     if header.crc and crc32(records) != header.crc:
         raise CorruptLogError(f"the chunk at byte {offset} does not match its CRC")
@@ -262,7 +262,7 @@ def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None)
 
 
 def _decompress(data: memoryview, header: ChunkHeader, offset: int, scratch: Scratch) -> memoryview:
-    """Decompress at most one byte more than the header says, so that a bomb is refused."""
+    """Decompress at most one byte more than the header declares, to stop compression bombs."""
     limit = header.uncompressed_bytes + 1
     try:
         match header.compression:
@@ -277,12 +277,12 @@ def _decompress(data: memoryview, header: ChunkHeader, offset: int, scratch: Scr
         raise CorruptLogError(f"the chunk at byte {offset} cannot be decompressed") from error
     raise CorruptLogError(
         f"the chunk at byte {offset} is compressed with {header.compression!r};"
-        " known are zstd, lz4 and none"
+        " supported: zstd, lz4, none"
     )
 
 
 def _inflate_zstd(data: memoryview, scratch: Scratch, limit: int) -> memoryview:
-    """Decompress the first `limit` bytes; in a single call if the frame header has the size."""
+    """Decompress at most `limit` bytes, in one call if the frame header states the size."""
     memory, count = scratch.take(limit), 0
     with scratch.zstd.stream_reader(data) as reader:
         while count < limit:

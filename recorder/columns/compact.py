@@ -1,11 +1,11 @@
-"""Compaction of a finished MCAP file: small chunks become few large ones.
+"""Compaction of a finished MCAP file: small chunks are merged into larger ones.
 
-A writer that flushes often leaves many small chunks, and visiting a chunk costs as much as reading
-hundreds of its messages. The compacted file is written beside the original, and replaces it only
+A writer that flushes often leaves many small chunks, and each costs a reader as much as hundreds
+of its messages. The compacted file is written beside the original, and replaces it only
 when it is complete and on disk: until then, the original is a valid file with all messages.
 
-Only chunks of one kind are merged: channels that share a chunk are of one kind. All other bytes are
-copied as they are, so that the messages of each kind stay in their order.
+Only chunks of the same kind are merged; channels that share a chunk are of the same kind. All other
+bytes are copied unchanged, so that the messages of each kind keep their order.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from mcap.records import ChunkIndex
 from mcap.writer import MCAP0_MAGIC
 
 from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.files import is_at, work_folder
 from mcaprl.recorder.columns.chunks import Compressors, Scratch, chunk_records
-from mcaprl.recorder.columns.file_lock import create, is_at
+from mcaprl.recorder.columns.file_lock import create
 from mcaprl.recorder.columns.output import OutputFile
 from mcaprl.recorder.columns.reader import end_of
 from mcaprl.recorder.columns.records import contents_of, map_file, records_of
@@ -33,11 +34,11 @@ from mcaprl.recorder.columns.summary import Summary
 SMALL_CHUNK_BYTES = 2**16
 """Chunks with fewer bytes of records are merged."""
 _MERGED_BYTES = 2**20
-# Rewriting a file that has hardly any more chunks than necessary is not worth its time.
+# Saving fewer chunks than this is not worth the time of rewriting the file.
 _MIN_CHUNKS_SAVED = 8
-# Copying more bytes than this for each chunk that is saved takes longer than it saves readers.
+# Copying more bytes than this per saved chunk costs more time than readers gain.
 _MAX_BYTES_PER_CHUNK = 2**20
-# In the gaps between chunks; the chunks of such files are not all listed in their summary.
+# Records that lie between listed chunks only if the summary does not list all chunks.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 
@@ -46,7 +47,7 @@ def compact(
 ) -> None:
     """Replace a finished file by one with larger chunks, if it has many small ones.
 
-    An error while writing leaves the original as it is.
+    An error while writing leaves the original unchanged.
 
     Args:
         path: Path of the file.
@@ -60,37 +61,25 @@ def compact(
     saved = len(summary.chunks) - len(groups)
     if saved < _MIN_CHUNKS_SAVED or data_end > saved * _MAX_BYTES_PER_CHUNK:
         return
-    if not path.is_file() or not is_at(file, path):
+    if not is_at(file.fileno(), path):
         return
     target = path.resolve()
-    unfinished = _unfinished_path(target)
-    # The log is complete without the compaction: a full disk must not look like lost messages.
-    with contextlib.suppress(OSError, LogError):
-        out = _CompactedFile(unfinished, create(unfinished, overwrite=True))
+    # The log is complete without compaction, so an error such as a full disk is ignored.
+    with contextlib.suppress(OSError, LogError), work_folder(target) as folder:
+        unfinished = folder / target.name
+        out = _CompactedFile(unfinished, create(unfinished, overwrite=False))
         try:
             out.copy(map_file(target), summary, data_end, groups, compressors)
             out.replace(target, stat.S_IMODE(target.stat().st_mode))
-        except BaseException:
-            unfinished.unlink(missing_ok=True)
-            raise
         finally:
             out.abandon()
 
 
-def remove_leftover(path: Path) -> None:
-    """Remove the unfinished compacted file of a writer that was killed.
-
-    The caller holds the lock of the file at `path`, so no other process writes the leftover.
-    """
-    with contextlib.suppress(OSError):
-        _unfinished_path(path.resolve()).unlink(missing_ok=True)
-
-
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
-    """Return the chunks of each chunk of the compacted file, in the order of the new file.
+    """Return the source chunks of each chunk of the compacted file, in the order of that file.
 
-    A merged chunk takes the place of its last part, so that no top-level record that it needs comes
-    after it.
+    A merged chunk takes the place of its last source chunk, so that all top-level records that it
+    needs come before it.
     """
     chunks = list(chunks)
     kinds = _kinds(chunks)
@@ -121,10 +110,6 @@ def _kinds(chunks: Iterable[ChunkIndex]) -> dict[int, int]:
         for channel_id in {*ids, *(id_ for id_, kind in kinds.items() if kind in connected)}:
             kinds[channel_id] = min(connected)
     return kinds
-
-
-def _unfinished_path(path: Path) -> Path:
-    return path.with_name(f"{path.name}.compact.part")
 
 
 class _CompactedFile(OutputFile):
@@ -160,10 +145,10 @@ class _CompactedFile(OutputFile):
         self._finish()
 
     def replace(self, target: Path, mode: int) -> None:
-        """Move the finished copy to the place of the original.
+        """Replace the original with the finished copy.
 
         Raises:
-            OSError: The copy is not on disk, or cannot be moved.
+            OSError: The copy cannot be flushed to disk or moved.
         """
         self._file.flush()
         os.fsync(self._file.fileno())
@@ -171,7 +156,7 @@ class _CompactedFile(OutputFile):
         os.replace(self.path, target)
 
     def _copy_top_level(self, view: memoryview, part: slice, summary: Summary) -> None:
-        """Copy the bytes between two chunks, of which there are mostly none."""
+        """Copy the bytes between two chunks, usually none."""
         if part.start == part.stop:
             return
         first_record = part.start or len(MCAP0_MAGIC)
@@ -210,7 +195,7 @@ class _CompactedFile(OutputFile):
         compressors: Compressors,
         scratch: Scratch,
     ) -> None:
-        """Write the messages of several chunks as one."""
+        """Write the messages of several chunks as one chunk."""
         joined = bytearray()
         for chunk in group:
             joined += chunk_records(view, chunk.chunk_start_offset, scratch)

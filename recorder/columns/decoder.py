@@ -1,4 +1,4 @@
-"""Decoder of the messages of one channel: arrays where layouts are equal, else one by one."""
+"""Decoder of the messages of one channel: as arrays if layouts are equal, else one by one."""
 
 from __future__ import annotations
 
@@ -72,13 +72,13 @@ class Decoder:
         for entry, row in zip(index, rows.tolist(), strict=True):
             for name, value in self._values(records, entry, columns).items():
                 self._check_shape(name, value, columns[name], entry)
-                # A string instead of an array that holds it.
+                # `[()]` turns a 0-d array into its element.
                 columns[name][row] = value[()]
 
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Copy messages length by length; return index and rows of those that are left."""
+        """Copy messages of equal length together; return index and rows of the other messages."""
         if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
             return index, rows
         lengths = gather(records, index, MESSAGE_HEADER)["length"]
@@ -92,7 +92,7 @@ class Decoder:
     def _put_alike(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
-        """Copy messages with the layout of the first; return False if there are others."""
+        """Copy the messages and return True if they share one layout; else return False."""
         found = self.alike(records, index, columns)
         if found is None:
             return False
@@ -161,7 +161,7 @@ class Decoder:
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
-            # Often all are equal.
+            # Often all strings are equal.
             if (values == values[0]).all():
                 return [bytes(values[0]).decode()] * len(values)
             return [text.decode() for text in values.tolist()]
@@ -176,7 +176,7 @@ class Decoder:
         if value.shape != column.shape[1:]:
             raise LogError(
                 f"{self._reader.path}: {name} of {self.channel.topic} has shape {value.shape} at"
-                f" log_time {entry['log_time']} and {column.shape[1:]} elsewhere; all must have one"
+                f" log_time {entry['log_time']} and {column.shape[1:]} elsewhere; all must be equal"
             )
 
 
@@ -191,8 +191,8 @@ def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
 def _type_of(reader: McapReader, channel: Channel) -> MessageType:
     if channel.message_encoding != "cdr":
         raise LogError(
-            f"{reader.path}: messages of {channel.topic} are {channel.message_encoding!r};"
-            " known is 'cdr'"
+            f"{reader.path}: messages of {channel.topic} have encoding"
+            f" {channel.message_encoding!r}, not 'cdr'"
         )
     schema = reader.schema_of(channel)
     try:

@@ -15,7 +15,7 @@ from mcaprl.recorder.columns.records import is_intact_attachment
 
 
 def check_file(reader: McapReader) -> list[Problem]:
-    """Check that there is a summary, and the CRCs of the data section and of attachments."""
+    """Check the presence of a summary and the CRCs of the data section and attachments."""
     found = []
     if not reader.complete:
         found.append(
@@ -34,7 +34,7 @@ def check_file(reader: McapReader) -> list[Problem]:
             break
     if reader.complete and end is None:
         where = "the records between header and summary"
-        found.append(Problem("the data section has no end", where))
+        found.append(Problem("the data section has no DataEnd record", where))
     return found
 
 

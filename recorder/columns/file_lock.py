@@ -1,21 +1,26 @@
-"""Files that are opened by one writer at a time.
+"""Files that are written in place, by one writer at a time, while others read them.
 
-The lock is advisory: it keeps out other writers of this library, on systems with `flock`. Readers
-need no lock, since a file only grows by whole records or is replaced as a whole.
+Readers need no lock, since a file only grows by whole records or is replaced as a whole: a writer
+never changes or cuts off bytes that a reader may have mapped.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import sys
 from io import FileIO
 from pathlib import Path
 
-from mcaprl.errors import LogError, OutputExistsError
+from mcaprl.errors import LogError
+from mcaprl.files import check_target, is_at, try_lock, work_folder
 
 if sys.platform != "win32":
     import fcntl
+
+_COPIED_BYTES = 2**20
 
 
 def create(path: Path, *, overwrite: bool) -> FileIO:
@@ -26,37 +31,43 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
         overwrite: Whether to replace an existing file; its readers keep the old contents.
 
     Raises:
-        OutputExistsError: The file exists, and `overwrite` is not set.
+        OutputExistsError: The file exists, and `overwrite` is not set; or it is not a regular file.
         LogError: The file cannot be created, or another writer has locked it.
     """
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+    check_target(path, overwrite=overwrite)
     try:
+        if path.exists():
+            return replaced(path, reopen(path), 0)
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_file():
-            refuse_if_taken(path)
-            path.resolve().unlink()
-            return _locked(FileIO(path.resolve(), "x"), path)
-        return _locked(FileIO(path, "w" if path.exists() else "x"), path)
+        file = _locked(FileIO(path, "x"), path)
     except OSError as error:
-        raise LogError(f"cannot write {path}: {error.strerror}") from error
+        # Another process may have created the file since it was looked for.
+        check_target(path, overwrite=overwrite)
+        raise LogError(f"cannot write {path}: {error.strerror or error}") from error
+    if not is_at(file.fileno(), path):
+        release(file)
+        raise _taken(path)
+    return file
 
 
 def reopen(path: Path) -> FileIO:
-    """Open a file for reading and writing, and lock it.
+    """Open and lock an existing file.
 
     Raises:
         LogError: The file cannot be written, or another writer has locked it.
     """
     try:
         while True:
-            file = _locked(FileIO(path, "r+"), path)
-            # A writer that has just finished may have replaced the file before its lock was free.
-            if is_at(file, path):
+            file = FileIO(path, "r+")
+            if not try_lock(file.fileno()):
+                file.close()
+                break
+            if is_at(file.fileno(), path):
                 return file
             release(file)
     except OSError as error:
-        raise LogError(f"cannot write {path}: {error.strerror}") from error
+        raise LogError(f"cannot write {path}: {error.strerror or error}") from error
+    raise _taken(path)
 
 
 def release(file: FileIO) -> None:
@@ -67,37 +78,59 @@ def release(file: FileIO) -> None:
     file.close()
 
 
-def is_at(file: FileIO, path: Path) -> bool:
-    """Return whether an open file is the one at a path.
+def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
+    """Replace a file with a locked copy of its start; current readers keep the old file.
+
+    The old file is released once the copy is in place; an error leaves the old file unchanged.
+
+    Args:
+        path: Path of the file; a symbolic link is followed.
+        locked: The file, locked by the caller.
+        length: Number of bytes to copy; the copy is positioned after them.
 
     Raises:
-        OSError: There is no file at the path.
+        LogError: Another process is writing the file.
+        OSError: The copy cannot be written.
     """
-    return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    path = path.resolve()
+    with work_folder(path) as folder:
+        unfinished = folder / path.name
+        file = _locked(FileIO(unfinished, "x+"), path)
+        try:
+            copy_start(locked, file, length)
+            os.chmod(unfinished, stat.S_IMODE(os.fstat(locked.fileno()).st_mode))
+            os.replace(unfinished, path)
+        except BaseException:
+            release(file)
+            raise
+    release(locked)
+    return file
 
 
-def refuse_if_taken(path: Path) -> None:
-    """Raise an error if another writer has locked the file.
+def copy_start(source: FileIO, target: FileIO, length: int) -> None:
+    """Copy the first bytes of a file.
 
     Raises:
-        LogError: Another writer has locked it.
+        OSError: The source is shorter, or the target cannot be written.
     """
-    if path.is_file():
-        with contextlib.suppress(OSError):
-            release(_locked(FileIO(path, "r"), path))
+    source.seek(0)
+    while length:
+        part = memoryview(source.read(min(length, _COPIED_BYTES)))
+        if not part:
+            raise OSError(errno.EIO, "the file to copy is shorter than before")
+        length -= len(part)
+        while part:
+            part = part[target.write(part) :]
 
 
 def _locked(file: FileIO, path: Path) -> FileIO:
-    if sys.platform != "win32":
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.close()
-            raise LogError(
-                f"{path} is being written by another recording; wait for its end, or choose"
-                " another path"
-            ) from error
-        # Some network file systems have no locks.
-        except OSError:
-            pass
+    if not try_lock(file.fileno()):
+        file.close()
+        raise _taken(path)
     return file
+
+
+def _taken(path: Path) -> LogError:
+    return LogError(
+        f"{path} is being written by another recording; wait for its end, or choose another path"
+    )

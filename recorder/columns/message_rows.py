@@ -1,8 +1,8 @@
 """Message records and message indexes as NumPy structured arrays.
 
 In an MCAP chunk each message is a record: opcode 0x05, record length, channel, sequence number,
-log_time, publish_time, payload. Consecutive messages with payloads of one length form a structured
-array of `record_dtype(payload)`; the entries of a MessageIndex form one of `INDEX_ENTRY`.
+log_time, publish_time, payload. Consecutive messages with equal payload lengths form a structured
+array of `record_dtype(payload)`; the entries of a MessageIndex form an array of `INDEX_ENTRY`.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
 
 @lru_cache(maxsize=64)
 def _words(size: int) -> np.dtype[Any]:
-    """View the first bytes of a record as two overlapping words, which compare faster."""
+    """Return a dtype of the first bytes of a record as two words, which compare faster."""
     formats, offsets = ["<u8", "<u8"], [0, _HEAD.size - 8]
     return np.dtype(
         {"names": ["front", "back"], "formats": formats, "offsets": offsets, "itemsize": size}
@@ -82,7 +82,7 @@ def _words(size: int) -> np.dtype[Any]:
 
 
 def message_index_head(channel_id: int, entries_bytes: int) -> bytes:
-    """Return the MessageIndex record of a channel without its entries, which follow it."""
+    """Return the MessageIndex record of a channel up to its entries."""
     length = _INDEX_START.size - RECORD_HEADER_BYTES + entries_bytes
     head: bytes = _INDEX_START.pack(Opcode.MESSAGE_INDEX, length, channel_id, entries_bytes)
     return head
@@ -96,7 +96,7 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
     """
     try:
         opcode, _, channel, entries_bytes = _INDEX_START.unpack_from(file, offset)
-    # Offsets from 2**63 on overflow.
+    # Offsets of 2**63 and above overflow.
     except (struct.error, OverflowError):
         opcode = None
     if opcode == Opcode.MESSAGE_INDEX and channel == channel_id:
@@ -142,8 +142,8 @@ class MessageRange:
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the messages of index entries as one structured array.
 
-    Adjacent messages are not copied. Others are copied by a fancy index of void items, which runs
-    at the speed of memcpy; one of structured items takes twenty times as long.
+    Adjacent messages are not copied. Others are copied by fancy indexing of void items, at the
+    speed of memcpy; fancy indexing of structured items takes twenty times as long.
 
     Args:
         records: Uncompressed records of a chunk.
@@ -158,14 +158,14 @@ def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> ND
         return np.empty(0, dtype)
     if _are_adjacent(offsets, size, len(records)):
         return np.frombuffer(records, dtype, len(offsets), int(offsets[0]))
-    # Subtract instead of adding: an offset near 2**64 would wrap around.
+    # Subtract instead of adding: a sum above 2**64 would wrap around.
     if len(records) < size or offsets.max() > len(records) - size:
         raise CorruptLogError("a message index points outside its chunk")
     return windows(records, offsets, dtype)
 
 
 def windows(data: memoryview, offsets: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy structures that start at offsets; each of them must end within the data."""
+    """Copy the structures at the offsets; each must end within the data."""
     size = dtype.itemsize
     first = np.frombuffer(data, np.dtype((np.void, size)), 1)
     every = np.lib.stride_tricks.as_strided(first, (len(data) - size + 1,), (1,))
@@ -182,5 +182,5 @@ def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
 
 @lru_cache(maxsize=2)
 def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """Return the offsets of adjacent messages; all full chunks of a topic have the same."""
+    """Return the offsets of adjacent messages; all full chunks of a topic share these."""
     return np.arange(first, last + 1, size, dtype=np.uint64)

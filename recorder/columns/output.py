@@ -19,7 +19,7 @@ from mcaprl.recorder.columns.message_rows import message_index_head
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.summary import Summary
 
-# Copying up to this size is faster than several calls of the operating system.
+# Joining parts up to this total size is faster than several system calls.
 _JOINED_BYTES = 2**16
 
 
@@ -37,7 +37,7 @@ class OutputFile:
         self.position, self._crc, self._summary, self._data_end = 0, 0, Summary(), 0
 
     def abandon(self) -> None:
-        """Close the file without a summary; nothing if it is closed."""
+        """Close the file without a summary; do nothing if it is closed."""
         with contextlib.suppress(OSError):
             release(self._file)
 
@@ -62,7 +62,7 @@ class OutputFile:
         header = ChunkHeader(
             *times, len(records), crc32(records), compression, data=slice(0, len(data))
         )
-        # The data are written as they are: a copy would take as long as all the rest.
+        # `data` is not copied: a copy would take as long as everything else here.
         head = header.to_record()
         offset, chunk_bytes = self.position, len(head) + len(data)
         index_offsets, index_bytes = {}, 0
@@ -115,7 +115,7 @@ class OutputFile:
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> NoReturn:
-        """Cut the file off after its last whole record, close it, and raise LogError."""
+        """Truncate the file after its last complete record, close it, and raise LogError."""
         with contextlib.suppress(OSError):
             self._file.truncate(self.position)
         self.abandon()

@@ -3,13 +3,14 @@
 The file is mapped into memory, and only the chunks of requested topics are read. Each chunk is
 checked against its CRC, each message against its index entry.
 
-Files of any writer are read. Records that the summary does not list are searched for: chunks and
-messages between the listed chunks, and schemas, channels and messages inside of chunks. A file
-without a summary, whose writer was killed or is still at work, is scanned from the start.
+Files of any writer are supported. Records that the summary does not list are searched for: chunks
+and messages between the listed chunks, and schemas, channels and messages inside chunks. A file
+without a summary, whose writer was killed or is still running, is scanned from the start.
 """
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,7 +46,7 @@ from mcaprl.recorder.columns.records import (
     attachment_of,
     contents_of,
     footer_of,
-    map_file,
+    map_unchanged,
     parse_record,
     records_of,
 )
@@ -64,11 +65,11 @@ class McapReader:
         view: Bytes of the file.
         complete: Whether the file ends with a footer; if not, it was cut off or is being written.
         summary_start: First byte of the summary; 0 if there is none.
-        data_end: First byte after the records that were read before the summary.
+        data_end: First byte after the last record that was read from the data section.
         chunks: Indexes of all chunks, in file order.
         schemas: Schemas by id.
         channels: Channels by id.
-        metadata: Metadata records by name; the first of several with one name.
+        metadata: Metadata records by name; the first of several with the same name.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -80,7 +81,7 @@ class McapReader:
             LogError: The file cannot be opened.
         """
         self.path = Path(path)
-        self.view = map_file(self.path)
+        self.view, self._state = map_unchanged(self.path)
         if bytes(self.view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
             raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
         self.schemas: dict[int, Schema] = {}
@@ -107,8 +108,31 @@ class McapReader:
             self._check_data_crc()
         self._find_topics_in_chunks()
 
+    def check_unchanged(self) -> None:
+        """Check that the file was not changed in place since it was opened.
+
+        Reading beyond the end of a truncated file would kill the process. The writers of this
+        library replace finished files instead, and readers keep the old content; an unfinished file
+        may grow.
+
+        Raises:
+            LogError: The file was truncated or written to.
+        """
+        try:
+            now, before = os.stat(self.path), self._state
+        except OSError:
+            # The path was removed; the mapped content remains.
+            return
+        if not os.path.samestat(now, before):
+            return
+        is_same = (now.st_size, now.st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+        if not is_same and (self.complete or now.st_size < before.st_size):
+            raise LogError(
+                f"{self.path} was changed by another program while it was open: reopen it"
+            )
+
     def channels_of(self, topic: str) -> list[Channel]:
-        """Return the channels of a topic, sorted by id; several writers have one channel each."""
+        """Return the channels of a topic, sorted by id; each writer may have its own channel."""
         found = [channel for channel in self.channels.values() if channel.topic == topic]
         return sorted(found, key=lambda channel: channel.id)
 
@@ -121,7 +145,7 @@ class McapReader:
         found = self.channels_of(topic)
         if len(found) > 1:
             raise LogError(
-                f"{self.path}: {len(found)} channels are called {topic}; one is expected"
+                f"{self.path}: {len(found)} channels have the topic {topic}; expected one"
             )
         return found[0] if found else None
 
@@ -139,9 +163,9 @@ class McapReader:
     def message_ranges(self, channel: Channel) -> list[MessageRange]:
         """Return the positions of the messages of a channel, in file order.
 
-        Chunks with an index are not read, and neither is the index of a chunk of one channel if the
-        summary confirms the number of messages: reading a few rows of a large file then needs only
-        a few indexes.
+        Only chunks without an index are decompressed. If the summary confirms the number of
+        messages, the index of a chunk with a single channel is read at its first access: reading a
+        few rows of a large file then needs only a few indexes.
 
         Raises:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.
@@ -153,8 +177,8 @@ class McapReader:
             found = sum(map(len, ranges))
             if count not in (None, found):
                 raise CorruptLogError(
-                    f"{self.path}: the summary counts {count} messages of {channel.topic}, its"
-                    f" indexes {found}"
+                    f"{self.path}: the summary counts {count} messages of {channel.topic}, the"
+                    f" message indexes {found}"
                 )
             self._ranges[channel.id] = ranges
         return self._ranges[channel.id]
@@ -182,20 +206,23 @@ class McapReader:
         return ranges
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
-        """Return the bytes that the offsets of an index refer to; see `chunk_records`.
+        """Return the bytes to which the offsets of an index refer; see `chunk_records`.
 
         Raises:
             CorruptLogError: The chunk is damaged.
         """
-        return self.view if messages.chunk is None else self.chunk_records(messages.chunk, scratch)
+        if messages.chunk is not None:
+            return self.chunk_records(messages.chunk, scratch)
+        self.check_unchanged()
+        return self.view
 
     def chunk_records(self, chunk: ChunkIndex, scratch: Scratch | None = None) -> memoryview:
         """Return the records of a chunk, decompressed and checked against their CRC.
 
         Args:
             chunk: Element of `chunks`.
-            scratch: Memory for the records, which are valid until its next use. It must not be used
-                for other files.
+            scratch: Memory for the records, which are valid until its next use; each file needs its
+                own.
 
         Raises:
             CorruptLogError: The chunk is damaged.
@@ -204,6 +231,7 @@ class McapReader:
         last, kept = self._last_chunk if scratch is None else scratch.kept
         if last == start:
             return kept
+        self.check_unchanged()
         with self._named():
             records = chunk_records(self.view, start, scratch)
         if scratch is None:
@@ -243,22 +271,24 @@ class McapReader:
         )
 
     def attachment(self, name: str) -> bytes | None:
-        """Return the data of the last attachment with a name; None if there is none.
+        """Return the data of the last attachment with this name; None if there is none.
 
         Raises:
             CorruptLogError: The attachment is damaged.
         """
+        self.check_unchanged()
         with self._named():
             return attachment_of(self.view, name)
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.
 
-        Stops before a record that ends after the file.
+        Stops before a record that extends beyond the end of the file.
         """
         return records_of(self.view, start)
 
     def _index_at(self, channel_id: int, offset: int, count: int | None = None) -> NDArray[Any]:
+        self.check_unchanged()
         with self._named():
             entries = message_index(self.view, offset, channel_id)
             if count not in (None, len(entries)):
@@ -316,11 +346,11 @@ class McapReader:
         Args:
             start: First byte.
             stop: First byte after the part; None for the end of the section.
-            chunk: Chunk before the part, to which message indexes at its start belong.
+            chunk: Chunk before the part; message indexes at the start of the part belong to it.
             unchunked: Collection to which messages outside of chunks are added.
 
         Raises:
-            CorruptLogError: A file with a summary has an incomplete record here.
+            CorruptLogError: A file with a summary has an incomplete record in this part.
         """
         self.data_end, found = start, []
         for offset, opcode, content in records_of(self.view, start, stop):
@@ -365,14 +395,14 @@ class McapReader:
         return channel is not None and channel.schema_id in self.schemas
 
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
-        """Return whether the summary has this schema or channel; both begin with an id."""
+        """Return whether the summary has this schema or channel; both records begin with an id."""
         number = int.from_bytes(content[:2], "little")
         return (opcode == Opcode.SCHEMA and number in self.schemas) or (
             opcode == Opcode.CHANNEL and number in self.channels
         )
 
     def _keep(self, record: McapRecord) -> None:
-        """Store a record unless the summary, which has its own CRC, had one with its id or name."""
+        """Store a record unless one with its id or name is stored; summary records come first."""
         match record:
             case Schema():
                 self.schemas.setdefault(record.id, record)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import mmap
+import os
+import stat
 import struct
 from array import array
 from collections.abc import Iterator, Mapping
@@ -28,6 +30,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
+from mcaprl.files import open_at_once
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
@@ -52,19 +55,34 @@ _PARSERS: dict[int, Any] = {
 
 
 def map_file(path: Path) -> memoryview:
-    """Map a file into memory.
+    """Map a file into memory; see `map_unchanged`."""
+    return map_unchanged(path)[0]
+
+
+def map_unchanged(path: Path) -> tuple[memoryview, os.stat_result]:
+    """Map a regular file into memory; return its bytes and its current `stat` result.
 
     Raises:
         NotMcapError: The file is empty.
-        LogError: The file cannot be read.
+        LogError: The file cannot be read, or is a folder, device or FIFO.
     """
     try:
-        with path.open("rb") as file:
-            if not file.seek(0, io.SEEK_END):
+        descriptor = open_at_once(path)
+        try:
+            state = os.fstat(descriptor)
+            if not stat.S_ISREG(state.st_mode):
+                raise LogError(f"cannot read {path}: it is not a regular file")
+            if not state.st_size:
                 raise NotMcapError(f"{path} is not an MCAP file: it is empty")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror}") from error
+            found = mmap.mmap(descriptor, state.st_size, access=mmap.ACCESS_READ)
+        finally:
+            os.close(descriptor)
+    # ValueError: The file was truncated after `fstat`.
+    except (OSError, ValueError) as error:
+        raise LogError(
+            f"cannot read {path}: {getattr(error, 'strerror', None) or error}"
+        ) from error
+    return memoryview(found), state
 
 
 def records_of(
@@ -72,7 +90,7 @@ def records_of(
 ) -> Iterator[tuple[int, int, memoryview]]:
     """Yield offset, opcode and content of each record from `start` on.
 
-    Stops before a record that ends after `stop`, by default the end of the view.
+    Stops before a record that extends beyond `stop`, by default the end of the view.
     """
     offset, stop = start, len(view) if stop is None else stop
     while offset + RECORD_HEADER.size <= stop:
@@ -98,7 +116,7 @@ def parse_record(opcode: int, content: memoryview) -> Any:
 
 
 def attachment_of(view: memoryview, name: str) -> bytes | None:
-    """Return the data of the last attachment with a name; None if there is none.
+    """Return the data of the last attachment with this name; None if there is none.
 
     Raises:
         CorruptLogError: The attachment is damaged.
@@ -117,14 +135,14 @@ def attachment_of(view: memoryview, name: str) -> bytes | None:
 
 
 def is_intact_attachment(content: memoryview) -> bool:
-    """Return whether an Attachment record has no CRC or matches it."""
+    """Return whether an Attachment record matches its CRC or has none."""
     (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
     return not crc or crc32(content[:-4]) == crc
 
 
 @dataclass
 class UnindexedMessages:
-    """Messages that a scan found, by channel id, in file order."""
+    """Messages found by a scan, by channel id, in file order."""
 
     _times: dict[int, array[int]] = field(default_factory=dict)
     _offsets: dict[int, array[int]] = field(default_factory=dict)
@@ -168,7 +186,7 @@ def contents_of(chunk: memoryview) -> ChunkContents:
     """Scan the records of a chunk.
 
     Raises:
-        CorruptLogError: A record is damaged, or ends after the chunk.
+        CorruptLogError: A record is damaged, or extends beyond the end of the chunk.
     """
     uniform = _uniform_indexes(chunk)
     if uniform is not None:

@@ -1,9 +1,9 @@
 """Search for the valid records of a damaged MCAP file.
 
-MCAP has no synchronization marks. The record after a damaged one is found by the length of the
-damaged one if that leads to a valid record, else byte by byte over a limited distance, else by the
-layout of a chunk, in which two lengths must agree. A valid record has the bytes that its writer
-would have written; the CRC of a chunk is not checked here, but when it is decompressed.
+MCAP has no synchronization markers. The search for the record after a damaged one skips the length
+of the damaged one; if no valid record follows, it tries each byte over a limited distance, then
+looks for chunks, in which two lengths must agree. A record is valid if its lengths agree and if
+serializing its parsed content reproduces its bytes. Chunk CRCs are checked at decompression only.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
+from mcaprl.recorder.columns.chunks import parse_chunk_index
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 from mcaprl.recorder.columns.records import RECORD_HEADER, parse_record, records_of
 
@@ -32,7 +33,7 @@ _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _SEARCHED = (*_REWRITTEN, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _CHUNK_NAME = struct.Struct("<QQQII")
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-# Distance over which every byte is tried; after it, only chunks are searched for.
+# Distance over which every byte is tried; beyond it, only chunks are searched for.
 _NEAR_BYTES = 2**16
 _BLOCK_BYTES = 2**22
 
@@ -61,7 +62,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
     """
     offset = len(MCAP0_MAGIC)
     if bytes(view[:offset]) != MCAP0_MAGIC:
-        damages.append(Damage(0, min(offset, len(view)), "no magic"))
+        damages.append(Damage(0, min(offset, len(view)), "no magic bytes"))
     while offset < len(view):
         content = _valid_record(view, offset)
         if content is None:
@@ -79,7 +80,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
             damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # The length is checked first: copying the rest at each record would take quadratic time.
+        # The length is compared first: copying the rest at each record would take quadratic time.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 
@@ -136,7 +137,7 @@ def _repeats(opcode: int, content: memoryview) -> bool:
     except (CorruptLogError, struct.error):
         return False
     again, original = bytes(builder.end()[RECORD_HEADER_BYTES:]), bytes(content)
-    # A writer can leave out the CRC of an attachment.
+    # Writers may omit the CRC of an attachment.
     without_crc = opcode == Opcode.ATTACHMENT and original[-4:] == bytes(4)
     return again == original or (without_crc and again[:-4] == original[:-4])
 
@@ -189,7 +190,7 @@ def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
 
 
 def intact_summary(view: memoryview) -> list[Any]:
-    """Return schemas and channels of the summary; none if it is missing or fails its CRC."""
+    """Return the schemas, channels and chunk indexes of an intact summary; else []."""
     end = len(view) - len(MCAP0_MAGIC)
     start = end - RECORD_HEADER_BYTES - 20
     if start < len(MCAP0_MAGIC) or bytes(view[end:]) != MCAP0_MAGIC:
@@ -202,7 +203,9 @@ def intact_summary(view: memoryview) -> list[Any]:
     if not crc or crc32(view[summary_start : end - 4]) != crc:
         return []
     return [
-        parse_record(opcode, content)
+        parse_chunk_index(content)
+        if opcode == Opcode.CHUNK_INDEX
+        else parse_record(opcode, content)
         for _, opcode, content in records_of(view, summary_start, start)
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL)
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX)
     ]

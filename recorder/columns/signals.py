@@ -1,4 +1,4 @@
-"""Delay of Ctrl-C, SIGTERM and SIGHUP during writes that belong together."""
+"""Delay of SIGINT, SIGTERM and SIGHUP during writes that must not be interrupted."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 class HoldSignals:
     """Context manager that delays signals; they are handled as usual at its end.
 
-    Only the main thread delays them, since handlers run in no other thread. A nested context has no
-    effect.
+    Only a context in the main thread, where Python runs all handlers, has an effect; a nested one
+    has none.
     """
 
     _is_held: ClassVar[bool] = False
@@ -41,7 +41,7 @@ class HoldSignals:
             HoldSignals._is_held = True
             for number in _HELD:
                 handler = getsignal(number)
-                # None: not installed from Python, so it cannot be restored.
+                # A handler that was not installed from Python (None) cannot be restored.
                 if handler is not None:
                     self._handlers[number] = handler
                     set_handler(number, self._note)

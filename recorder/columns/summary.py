@@ -33,7 +33,7 @@ class Summary:
     Attributes:
         schemas: Schemas by id.
         channels: Channels by id.
-        counts: Numbers of messages by channel id.
+        counts: Message counts by channel id.
         chunks: Chunk indexes in file order.
         metadata: Metadata indexes in file order.
         attachments: Attachment indexes in file order.
@@ -70,7 +70,7 @@ class Summary:
                 )
 
     def to_bytes(self, start: int) -> bytes:
-        """Return all records after the data section, which will be written at `start`."""
+        """Serialize the summary section and footer, which will be written at `start`."""
         builder = RecordBuilder()
         groups: list[SummaryOffset] = []
         for opcode, records in self._groups():

@@ -1,7 +1,7 @@
 """Messages of a topic as columns: one array for each wanted field, in the order of log_time.
 
-Messages of one length in a chunk are read as one array, whatever is stored between them; all others
-are decoded one by one, with the same values.
+Messages of equal length in a chunk are read as one array, even if other records lie between them;
+all others are decoded one by one, with the same values.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Topic:
     """
 
     def __init__(self, reader: McapReader, name: str) -> None:
-        """Find the messages. No chunk with an index is read.
+        """Find the messages without reading chunks that have an index.
 
         Raises:
             CorruptLogError: An index is damaged.
@@ -57,7 +57,7 @@ class Topic:
         self.parts = [(decoder, part) for decoder, ranges in by_decoder for part in ranges]
         self._counts = np.array([len(part) for _, part in self.parts], np.int64)
         self._stops = np.cumsum(self._counts)
-        # The scratch memory still has the last chunk, of which another column may be read next.
+        # The scratch memory retains the last chunk, whose other columns may be read next.
         self._scratch, self._reading = Scratch(), threading.Lock()
 
     def __len__(self) -> int:
@@ -125,9 +125,9 @@ class Topic:
 
         Args:
             wanted: Names of fields.
-            order: Places of the messages in `times`; default: all. Chunks without any of them are
-                not read.
-            threads: Number of threads that decompress and copy.
+            order: Positions in `times` of the messages to read; default: all. Other chunks are not
+                read.
+            threads: Number of threads that decompress chunks and copy messages.
 
         Raises:
             CorruptLogError: A chunk is damaged, or a message does not fit its type.

@@ -27,7 +27,7 @@ from mcaprl.recorder.columns.writer import COMPRESSIONS, McapWriter
 _UNCHUNKED_BYTES = 2**20
 
 RestoreMetadata = Callable[[list[Metadata], Iterable[Channel]], list[Metadata]]
-"""Function that corrects the metadata records of a damaged file with the help of its channels."""
+"""Function that corrects the metadata records of a damaged file, given its channels."""
 
 DROP, KEEP = 0, 1
 
@@ -40,7 +40,7 @@ def recover_file(
     Args:
         source: Path of the damaged file.
         target: Path of the new file; an existing one is replaced.
-        damages: List to which places and records that cannot be copied are added.
+        damages: List to which damaged places and records that cannot be copied are added.
         restore: Function that returns the metadata records to write.
 
     Raises:
@@ -73,8 +73,8 @@ def copy_messages(
         target: Path of the new file; an existing one is replaced.
         actions_of: Function that returns the action for each message of one channel in one chunk,
             given their index: `DROP`, `KEEP`, or a larger number for a message to edit.
-        edit: Function that changes a message in place, given its channel, its data (and what
-            follows it in the chunk), and the action.
+        edit: Function that changes a message in place, given its channel, the bytes of the chunk
+            from its data on, and the action.
 
     Yields:
         The writer, for more messages.
@@ -108,7 +108,7 @@ def copy_messages(
 def _writer_like(
     view: memoryview, records: Iterable[ValidRecord], target: Path
 ) -> Iterator[McapWriter]:
-    """Write a file with the profile of another one and the compression of its first chunk."""
+    """Open a writer with the profile and the compression (of the first chunk) of a file."""
     profile, compression = "ros2", "zstd"
     for offset, opcode, content in records:
         if opcode == Opcode.HEADER:
@@ -138,9 +138,10 @@ class _Topics:
         self._damages = damages
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        # Records of the summary have a CRC; those of the data section share one with all others.
+        # The summary has its own CRC; the CRC of the data section fails at any damage.
         for record in intact_summary(view):
-            self.take(record, 0)
+            if not isinstance(record, ChunkIndex):
+                self.take(record, 0)
         self.metadata: list[Metadata] = []
         for offset, opcode, content in records:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -149,7 +150,7 @@ class _Topics:
                 self.metadata.append(parse_record(opcode, content))
 
     def take(self, record: Schema | Channel, offset: int) -> None:
-        """Add a schema or channel; of two with one id, the first is kept."""
+        """Add a schema or channel; report a second definition of an id as damage."""
         known: dict[int, Any] = self.schemas if isinstance(record, Schema) else self.channels
         if known.setdefault(record.id, record) != record:
             what = f"{type(record).__name__.lower()} {record.id} has two definitions"
@@ -179,7 +180,14 @@ class _Copy:
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
-        self._seen: set[tuple[int, int]] = set()
+        # Offsets of the chunks with a CRC and length. Chunks listed in an intact
+        # summary are never repeated ones, even if their records are equal.
+        self._seen: dict[tuple[int, int], list[int]] = {}
+        self._listed = {
+            record.chunk_start_offset
+            for record in intact_summary(view)
+            if isinstance(record, ChunkIndex)
+        }
         self._unchunked, self._scratch = bytearray(), Scratch()
 
     def take(self, offset: int, opcode: int, content: memoryview) -> None:
@@ -195,7 +203,7 @@ class _Copy:
             self._writer.announce(parse_record(opcode, content))
 
     def flush(self) -> None:
-        """Write the unchunked messages so far as a chunk."""
+        """Write the collected unchunked messages as one chunk."""
         if self._unchunked:
             self._write(memoryview(bytes(self._unchunked)), 0, len(self._unchunked))
             self._unchunked = bytearray()
@@ -206,12 +214,16 @@ class _Copy:
         except CorruptLogError as error:
             self._damages.append(Damage(offset, size, str(error)))
             return
-        key = (crc32(records), len(records))
-        if key in self._seen:
-            self._damages.append(Damage(offset, size, "a chunk that is in the file twice"))
+        earlier = self._seen.setdefault((crc32(records), len(records)), [])
+        if offset not in self._listed and any(self._is_equal(one, records) for one in earlier):
+            self._damages.append(Damage(offset, size, "a repeated chunk"))
             return
-        self._seen.add(key)
+        earlier.append(offset)
         self._write(records, offset, size)
+
+    def _is_equal(self, offset: int, records: memoryview) -> bool:
+        """Return whether an earlier chunk has the same records."""
+        return bytes(chunk_records(self._view, offset)) == records
 
     def _write(self, records: memoryview, offset: int, size: int) -> None:
         try:

@@ -1,15 +1,16 @@
 """Writer of MCAP files, chunk by chunk.
 
-Each call writes one whole chunk with its CRC and the MessageIndex of each channel, and passes it to
-the operating system, so that it outlives the process. Schemas, channels, metadata and
-attachments are top-level records before the chunks that need them, so that a file that was cut off
-is readable from its start. When a file is closed, its small chunks are merged.
+Each call writes one complete chunk with its CRC and the MessageIndex of each channel, and passes it
+to the operating system, so that the chunk survives the process. Schemas, channels, metadata and
+attachments are top-level records before the chunks that need them, so that a truncated file is
+readable from its start. Closing a file merges its small chunks.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ from numpy.typing import NDArray
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
-from mcaprl.recorder.columns.append import TopLevelRecord, written_state
+from mcaprl.files import remove_leftover
+from mcaprl.recorder.columns.append import TopLevelRecord, WrittenState, written_state
 from mcaprl.recorder.columns.chunks import LONG_MESSAGE_BYTES, Compressors
-from mcaprl.recorder.columns.compact import compact, remove_leftover
-from mcaprl.recorder.columns.file_lock import create, release, reopen
+from mcaprl.recorder.columns.compact import compact
+from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     adjacent_offsets,
@@ -52,6 +54,7 @@ class McapWriter(OutputFile):
         compression: str = "zstd",
         overwrite: bool = False,
         append: bool = False,
+        source: Path | None = None,
         profile: str = "ros2",
     ) -> None:
         """Create the file, or open it to append.
@@ -61,6 +64,7 @@ class McapWriter(OutputFile):
             compression: Compression of chunks: `zstd`, `lz4` or `none`.
             overwrite: Whether to replace an existing file.
             append: Whether to write after the last record of an existing file.
+            source: Finished file whose records are copied to the start of a new file.
             profile: Profile of a new file.
 
         Raises:
@@ -74,6 +78,8 @@ class McapWriter(OutputFile):
         self._top_level: list[TopLevelRecord] = []
         if append and Path(path).exists():
             self._continue(Path(path))
+        elif source is not None:
+            self._copy(source, Path(path), overwrite)
         else:
             self._begin(Path(path), overwrite)
 
@@ -126,7 +132,7 @@ class McapWriter(OutputFile):
         return channel_id
 
     def metadata(self, name: str) -> dict[str, str] | None:
-        """Return the metadata record with a name; None if there is none."""
+        """Return the metadata record with this name; None if there is none."""
         found = [r for r in self._top_level if isinstance(r, Metadata) and r.name == name]
         return found[0].metadata if found else None
 
@@ -141,7 +147,7 @@ class McapWriter(OutputFile):
             self.announce(Attachment(time_ns, time_ns, name, media_type, data))
 
     def announce(self, record: TopLevelRecord) -> None:
-        """Write a top-level record to this file and to all files after it."""
+        """Write a top-level record to this file and to all later files."""
         self._write_top_level(record)
         self._top_level.append(record)
 
@@ -206,7 +212,7 @@ class McapWriter(OutputFile):
         """Write a chunk of complete records.
 
         Args:
-            records: Message records, with their sequence numbers, of channels of the file.
+            records: Message records with sequence numbers, of channels of the file.
             indexes: Arrays of `message_rows.INDEX_ENTRY` by channel id.
         """
         for channel_id, index in indexes.items():
@@ -221,7 +227,7 @@ class McapWriter(OutputFile):
         )
 
     def close(self) -> None:
-        """Write the summary, merge small chunks, and close the file; nothing if it is closed."""
+        """Write the summary, merge small chunks, and close the file; do nothing if it is closed."""
         if self.closed:
             return
         try:
@@ -238,23 +244,42 @@ class McapWriter(OutputFile):
         self._write_record(Header(self._profile, f"mcaprl {__version__}"))
 
     def _continue(self, path: Path) -> None:
-        """Open a file to append; it does not change before the first write."""
+        """Open a file to append; the file stays unchanged until the first write."""
         self._file, self.path, self.untouched = reopen(path), path, True
         try:
-            remove_leftover(path)
-            written = written_state(path)
+            remove_leftover(path.resolve())
+            self._set_state(written_state(path))
         except BaseException:
             release(self._file)
             raise
+
+    def _copy(self, source: Path, path: Path, overwrite: bool) -> None:
+        """Create a file with the data of another one."""
+        written = written_state(source)
+        self._file, self.path, self.untouched = create(path, overwrite=overwrite), path, False
+        try:
+            with FileIO(source) as original:
+                copy_start(original, self._file, written.end)
+        except OSError as error:
+            self.position = 0
+            self._give_up(error)
+        self._set_state(written)
+
+    def _set_state(self, written: WrittenState) -> None:
         self._summary, self._top_level = written.summary, written.top_level
         self.position, self._crc = written.end, written.crc
 
-    def _cut_off_summary(self) -> None:
+    def _replace_summary(self) -> None:
+        """Replace the file, which readers may have mapped, with a copy without the summary.
+
+        Raises:
+            LogError: The copy cannot be written; the file stays unchanged.
+        """
         try:
-            self._file.truncate(self.position)
-            self._file.seek(self.position)
+            self._file = replaced(self.path, self._file, self.position)
         except OSError as error:
-            self._give_up(error)
+            release(self._file)
+            raise LogError(f"cannot write {self.path}: {error.strerror or error}") from error
         self.untouched = False
 
     def _store(
@@ -284,5 +309,5 @@ class McapWriter(OutputFile):
     def _write(self, *parts: bytes | memoryview) -> None:
         with HoldSignals():
             if self.untouched:
-                self._cut_off_summary()
+                self._replace_summary()
             super()._write(*parts)

@@ -1,4 +1,4 @@
-"""Image observations: the images of a topic that belong to the records of `/rl/step`."""
+"""Reader of image observations: the images of the records of `/rl/step`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def read_images(
     storage: Storage,
     threads: int = 1,
 ) -> Frames:
-    """Read the (F, *shape) images of an image leaf, one for each of `times`.
+    """Read the (F, *shape) images of a leaf at these log_times.
 
     Raises:
-        CorruptLogError: one is missing, or is of another size or encoding.
+        CorruptLogError: An image is missing, or has another size or encoding.
     """
     images = _Images(reader, leaf)
     if not is_mapped(storage, len(times) * leaf.size):
@@ -57,19 +57,19 @@ class _Images:
         if not len(self.topic):
             raise CorruptLogError(f"{reader.path}: no images on {leaf.topic}")
         if not set(_FIELDS) <= set(self.topic.fields):
-            raise CorruptLogError(f"{reader.path}: messages of {leaf.topic} are no {IMAGE_TYPE}")
+            raise CorruptLogError(f"{reader.path}: messages of {leaf.topic} are not {IMAGE_TYPE}")
 
     @property
     def are_mappable(self) -> bool:
-        """Whether all images are stored uncompressed."""
+        """Whether all images are in uncompressed chunks."""
         chunks = [messages.chunk for _, messages in self.topic.parts]
         return all(chunk is not None and not chunk.compression for chunk in chunks)
 
     def order_at(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Which message is that of each time.
+        """Return the row of the message at each time.
 
         Raises:
-            CorruptLogError: there is none, or there are several.
+            CorruptLogError: A time has no message, or two messages have the same time.
         """
         by_time = time_order(self.topic)
         rising = self.topic.times if by_time is None else self.topic.times[by_time]
@@ -83,7 +83,7 @@ class _Images:
                 f" log_time {missing[0]}"
             )
         if (rising[1:] == rising[:-1]).any():
-            raise CorruptLogError(f"{where} has two images of one log_time")
+            raise CorruptLogError(f"{where} has two images with the same log_time")
         return place if by_time is None else by_time[place]
 
     def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
@@ -94,7 +94,7 @@ class _Images:
         return columns["data"].reshape(-1, *self._leaf.shape)
 
     def blocks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-        """Yield the times and images of blocks of messages, in the order of log_time."""
+        """Yield the times and images of blocks of messages, in log_time order."""
         order = time_order(self.topic)
         order = np.arange(len(self.topic)) if order is None else order
         for start in range(0, len(order), IMAGES_PER_CHUNK):
@@ -102,7 +102,7 @@ class _Images:
             yield self.topic.times[part], self.read(part)
 
     def mapped(self, order: NDArray[np.int64]) -> MappedImages:
-        """Return the images (F, *shape) on disk; each chunk is checked when it is first read."""
+        """Return the images (F, *shape) on disk; a chunk is validated when first read."""
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()
@@ -116,7 +116,9 @@ class _Images:
             checks.append(self._check_of(decoder, messages, first))
             start = stop
         name = str(self._reader.path)
-        file = ImageFile(name, self._reader.view, self._leaf.size, checks)
+        file = ImageFile(
+            name, self._reader.view, self._leaf.size, checks, self._reader.check_unchanged
+        )
         return MappedImages([file], self._leaf.shape, places[order])
 
     def _data_offset(self) -> int:
@@ -134,7 +136,7 @@ class _Images:
             found = decoder.alike(self._reader.records_of(messages), messages.index, _FIELDS)
             if found is None or _offset_of_data(found.dtype) != data_offset:
                 raise CorruptLogError(
-                    f"{self._reader.path}: images on {self.topic.name} are not all of one form;"
+                    f"{self._reader.path}: images on {self.topic.name} differ in message layout;"
                     " open the log with images='memory'"
                 )
             self._check({name: found[name] for name in _FIELDS})
@@ -145,7 +147,7 @@ class _Images:
         """Check the size and encoding of images against the leaf.
 
         Raises:
-            CorruptLogError: one is not.
+            CorruptLogError: An image differs.
         """
         height, width = self._leaf.shape[:2]
         encoding = self._leaf.encoding or ""
@@ -160,7 +162,7 @@ class _Images:
             )
             raise CorruptLogError(
                 f"{self._reader.path}: an image on {self.topic.name} has {found_text} and"
-                f" {columns['data'].shape[1]} bytes; the space says {height}x{width} {encoding}"
+                f" {columns['data'].shape[1]} bytes; its space is {height}x{width} {encoding}"
             )
 
 

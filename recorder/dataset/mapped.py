@@ -1,7 +1,7 @@
-"""Images that stay on disk: an array-like object that reads its rows when they are indexed.
+"""Images on disk: an array-like object that reads its rows when they are indexed.
 
-Uncompressed chunks contain each image's bytes, so a batch is gathered from the memory-mapped file
-at the speed of memory. The CRC of a chunk is checked when one of its images is read first.
+In uncompressed chunks, images are stored as plain bytes, so a batch is gathered from the
+memory-mapped file at memory speed. The CRC of a chunk is checked at the first read of its images.
 """
 
 from __future__ import annotations
@@ -21,17 +21,23 @@ class ImageFile:
     """
 
     def __init__(
-        self, name: str, view: memoryview, image_bytes: int, checks: Sequence[Callable[[], None]]
+        self,
+        name: str,
+        view: memoryview,
+        image_bytes: int,
+        checks: Sequence[Callable[[], None]],
+        check_unchanged: Callable[[], None],
     ) -> None:
-        """Refer to the images of a file.
+        """Create a view of the file's images without reading them.
 
         Args:
             name: Name of the file.
-            view: All bytes of the file.
+            view: Bytes of the whole file.
             image_bytes: Size of one image in bytes.
-            checks: For each chunk, a function that raises an error if the chunk is damaged.
+            checks: Function of each chunk that raises an error if the chunk is damaged.
+            check_unchanged: Function that raises an error if the file was changed in place.
         """
-        self.name = name
+        self.name, self._check_unchanged = name, check_unchanged
         bytes_ = np.frombuffer(view, np.uint8)
         # A window at each byte offset; indexing a void dtype copies as fast as memcpy.
         self._windows = np.lib.stride_tricks.as_strided(
@@ -43,7 +49,7 @@ class ImageFile:
         self._is_checked = np.zeros(len(checks), bool)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Copy the images at some byte offsets, one after the other.
+        """Copy the images at these byte offsets.
 
         Args:
             offsets: (K,) byte offsets in the file.
@@ -52,6 +58,7 @@ class ImageFile:
         Raises:
             CorruptLogError: A chunk is damaged.
         """
+        self._check_unchanged()
         checked = self._is_checked[chunks]
         if not checked.all():
             for chunk in np.unique(chunks[~checked]).tolist():
@@ -61,7 +68,7 @@ class ImageFile:
 
 
 class MappedImages:
-    """(F, *shape) uint8 images on disk. Indexing reads images; `rows` does not.
+    """An array of (F, *shape) uint8 images on disk; indexing reads images, `rows` does not.
 
     Attributes:
         shape: Shape of the corresponding array.
@@ -76,12 +83,12 @@ class MappedImages:
         shape: tuple[int, ...],
         places: NDArray[np.int64],
     ) -> None:
-        """Refer to images.
+        """Create an array of images without reading them.
 
         Args:
             files: Files that contain the images.
             shape: Shape of one image.
-            places: (F, 3) index of each image's file, index of its chunk there, and byte offset.
+            places: (F, 3) index of the file, index of the chunk in the file, and byte offset.
         """
         self._files, self._places = tuple(files), places
         self.shape = (len(places), *shape)
@@ -119,7 +126,7 @@ class MappedImages:
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, key: Any) -> NDArray[Any]:
-        """Read images, or parts of them, indexed like an array."""
+        """Read images or parts of images, as NumPy indexing."""
         first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
         places = self._places[first]
         if places.ndim == 1:
@@ -131,7 +138,7 @@ class MappedImages:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Read all images."""
         if copy is False:
-            raise ValueError("images on disk cannot become an array without a copy")
+            raise ValueError("images on disk cannot be converted to an array without a copy")
         return self[:] if dtype is None else self[:].astype(dtype, copy=False)
 
     def _read(self, places: NDArray[np.int64]) -> NDArray[np.uint8]:
@@ -152,12 +159,12 @@ Frames = NDArray[Any] | MappedImages
 
 
 def rows_of(frames: Frames, rows: Any) -> Frames:
-    """Select rows: a view or copy of an array; images on disk are not read."""
+    """Select rows of an array, or of images on disk without reading them."""
     return frames.rows(rows) if isinstance(frames, MappedImages) else frames[rows]
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """Concatenate the frames of several logs; they stay on disk if all of them are on disk."""
+    """Concatenate the frames of several logs; the result is on disk if all frames are."""
     mapped = [part for part in parts if isinstance(part, MappedImages)]
     if len(mapped) < len(parts):
         return np.concatenate([np.asarray(part) for part in parts])

@@ -1,4 +1,4 @@
-"""Writes a dataset as one log, in whole chunks."""
+"""Writer of a dataset as one log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaprl.errors import LogError, OutputExistsError
+from mcaprl.errors import LogError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.mapped import Frames
@@ -16,7 +16,6 @@ from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
-from mcaprl.recorder.format.writing import refuse_if_taken
 
 
 def save_log(
@@ -29,25 +28,22 @@ def save_log(
 ) -> None:
     """Write columns as a log.
 
-    Times are kept where they rise from the first frame to the last, else counted from now on.
-    Episodes are numbered from 0.
+    Times that do not increase from frame to frame are replaced by times from now on. Episodes are
+    numbered from 0.
 
     Raises:
-        OutputExistsError: there is a file, and `overwrite` is not set.
-        LogError: it cannot be written, or there are no episodes.
+        OutputExistsError: The file exists and `overwrite` is not set.
+        LogError: The file cannot be written, or there are no episodes.
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
-    # Arrays that never were in a log have times from 0 on.
+    # Data from arrays has times from 0.
     if columns.log_time_ns[0] == 0 or (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists: choose another path, or pass overwrite=True")
-    refuse_if_taken(path)
-    # The log that is replaced may be the one that is being saved.
-    with replacing(path, LogError) as unfinished:
-        log = LogWriter(unfinished, metadata, compression=compression, overwrite=True)
+    # The dataset may be read from the log that is replaced.
+    with replacing(path, LogError, overwrite=overwrite) as unfinished:
+        log = LogWriter(unfinished, metadata, compression=compression)
         try:
             _write_images(log, columns)
             log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
@@ -65,7 +61,7 @@ def _write_images(log: LogWriter, columns: Transitions) -> None:
 
 
 def _write_steps(log: LogWriter, columns: Transitions) -> None:
-    """Write frames in order, chunk by chunk, and the transitions that start at them."""
+    """Write the rows of `/rl/step` chunk by chunk."""
     count = len(columns.log_time_ns)
     frames_per_episode = columns.lengths + 1
     episode = np.repeat(np.arange(len(columns.episodes)), frames_per_episode)

@@ -1,4 +1,4 @@
-"""Writer of logs of format version 1, which this text, `schema` and `metadata` specify.
+"""Writer of logs of format version 1, specified by this text, `schema` and `metadata`.
 
 A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, all schemas `ros2msg`.
 
@@ -10,16 +10,16 @@ A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, al
     /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy version is known
     all others                                       display topics, see `record/display.py`
 
-Episodes. An episode of T transitions has T + 1 consecutive records of `/rl/step`. Record k < T has
-observation k, the action taken there, and the reward of that action; record T is `final` and has
-only the last observation. `episode` counts from 0 in the recording, `step` from 0 in the episode.
-The last transition is `terminated`, `truncated` or both. An episode that the recorder ends is
-truncated with the reason `interrupted`. Episodes of a vector environment are written one after the
-other, in the order of their ends.
+Episodes. An episode of T transitions has T + 1 consecutive records of `/rl/step`. Record k < T
+contains observation k, the action taken at it, and the reward of that action; record T is `final`
+and contains only the last observation. `episode` counts from 0 in the recording, `step` from 0 in
+the episode. The last transition is `terminated`, `truncated` or both. An episode that the recorder
+ends is truncated with the reason `interrupted`. Episodes of a vector environment are written one
+after the other, in the order of their ends.
 
-Times. log_time is the start of the recording since the Unix epoch plus simulated time, in integer
-nanoseconds; publish_time equals it. It increases strictly from record to record of `/rl/step`,
-across episodes. All messages of one observation have its log_time, which joins the topics.
+Times. log_time and publish_time are the Unix time at the start of the recording plus the simulated
+time, in integer nanoseconds. log_time increases strictly from record to record of `/rl/step`, also
+across episodes. All messages of one observation have the same log_time, which joins the topics.
 `/rl/episode` has the log_time of the final record.
 
 Chunks. Each chunk contains one kind of topic, one line of the table above (`/rosout` is in the
@@ -30,15 +30,15 @@ everything else. All CRCs of MCAP are present. When a log is closed, chunks belo
 into chunks of about 1 MiB of the same kind, if there are many; the messages of each channel keep
 their order.
 
-Order. The metadata record `mcaprl.dataset` comes first. Of each episode, `/rl/step` is written
-last: if its `final` record is in the file, so is the rest of the episode. A file without a summary
-is still being written, or its writer was killed; its finished episodes are complete. The attachment
+Order. The metadata record `mcaprl.dataset` comes first. `/rl/step` is written last in each episode:
+a file with the `final` record contains the whole episode. A file without a summary is still being
+written, or its writer was killed; its finished episodes are complete. The attachment
 `foxglove-layout.json` comes with the first episode.
 
-Growth. An appended recording continues the episode numbers and starts later than the file ended;
-its environment has the same id, arguments, spaces, names and step duration. A recording can
-continue in further files, `NAME-00000.mcap`, `NAME-00001.mcap` and so on: each is a log of whole
-episodes, and episode numbers and times continue from one file to the next.
+Appending. An appended recording continues the episode numbers and starts after the last log_time of
+the file; its environment has the same id, arguments, spaces, names and step duration. A recording
+can continue in further files, `NAME-00000.mcap`, `NAME-00001.mcap` and so on: each is a log of
+whole episodes, and episode numbers and times continue from one file to the next.
 """
 
 from __future__ import annotations
@@ -53,7 +53,12 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.metadata import METADATA_NAME, SAME_WHEN_APPENDED, LogMetadata
+from mcaprl.recorder.format.metadata import (
+    METADATA_NAME,
+    SAME_WHEN_APPENDED,
+    LogMetadata,
+    same_env,
+)
 from mcaprl.recorder.format.rows import ImageRows, StepRows, TopicRows
 from mcaprl.recorder.format.schema import LEARNER_TEXT, LEARNER_TYPE, step_schema, values_schema
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
@@ -68,15 +73,15 @@ from mcaprl.recorder.format.topics import (
 
 
 class MessageSink(Protocol):
-    """Where a log's topics and messages go: a file, or the viewers of a running environment."""
+    """Receiver of a log's topics and messages: a file, or viewers of a running environment."""
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Store what the log is of."""
+        """Store the metadata of the log."""
 
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Announce a topic; returns its channel id."""
+        """Announce a topic and return its channel id."""
 
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write message records of one channel."""
@@ -86,12 +91,12 @@ class MessageSink(Protocol):
 
 
 class LogTopics:
-    """The topics of a log, announced to a sink and written to it.
+    """Topics of a log, which are announced and written to a sink.
 
     Attributes:
         sink: Receiver of the messages.
         metadata: Metadata of the log.
-        action: Description of an action's values.
+        action: Shape and dtype of an action.
         image_leaves: Parts of the observation that are images.
     """
 
@@ -113,11 +118,11 @@ class LogTopics:
         self._log_channel: int | None = None
 
     def add_channel(self, topic: str, type_name: str) -> int:
-        """Announce a topic of a known ROS type; returns its channel id."""
+        """Announce a topic of a known ROS type and return its channel id."""
         return self.sink.add_channel(topic, type_name, messages.definition(type_name))
 
     def step_rows(self, most: int = STEPS_PER_CHUNK) -> StepRows:
-        """Preallocate rows of `/rl/step`: `most`, or fewer where those exceed a chunk's size."""
+        """Preallocate at most `most` rows of `/rl/step`, as many as fit into a chunk."""
         return StepRows.of_text(self._step_text, self._step_channel, most, self.sink.write_rows)
 
     def learner_rows(self, most: int = STEPS_PER_CHUNK) -> TopicRows:
@@ -140,14 +145,14 @@ class LogTopics:
             topic: Name of the topic.
             shape: (height, width) or (height, width, channels).
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
-            most: Number of rows; fewer are returned where those exceed a chunk's size.
+            most: Maximum number of rows; all rows also have to fit into a chunk.
         """
         assert encoding is not None, f"{topic} has no images"
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
         return ImageRows.of_shape(shape, encoding, channel, most, self.sink.write_rows)
 
     def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
-        """Write summaries to `/rl/episode`, each at its episode's end.
+        """Write summaries to `/rl/episode`, each with the log_time of its episode's end.
 
         Args:
             summaries: Summaries of the episodes.
@@ -160,7 +165,7 @@ class LogTopics:
         self.sink.write_messages(written + (self._lines(summaries) if log_lines else []))
 
     def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
-        """Write the starts and ends of episodes to `/rosout` alone."""
+        """Write the starts and ends of episodes to `/rosout` only."""
         self.sink.write_messages(self._lines(summaries))
 
     def _lines(self, summaries: list[EpisodeSummary]) -> list[tuple[int, int, bytes]]:
@@ -174,7 +179,7 @@ class LogTopics:
 
 
 class LogWriter(LogTopics):
-    """Writes one log of format version 1 to a file.
+    """Writer of one log of format version 1.
 
     Attributes:
         mcap: Writer of the file, which is the sink.
@@ -188,28 +193,40 @@ class LogWriter(LogTopics):
         compression: str = "zstd",
         overwrite: bool = False,
         append: bool = False,
+        source: Path | None = None,
     ) -> None:
         """Create the file, or open it to append, and announce its topics.
+
+        Args:
+            path: Path of the file.
+            metadata: Metadata of the log.
+            compression: Compression of chunks: `zstd`, `lz4` or `none`.
+            overwrite: Whether to replace an existing file.
+            append: Whether to write after the last record of an existing file.
+            source: Finished log whose records are copied to the start of a new file.
 
         Raises:
             SpaceError: A log cannot contain these spaces; no file is created then.
             OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created, or cannot be appended to and stays as it is.
+            LogError: The file cannot be created, or cannot be appended to and stays unchanged.
         """
         strings = metadata.to_strings()
-        # Refused before a file is created.
+        # Raise SpaceError before a file is created.
         step_schema(metadata.observation_space, metadata.action_space)
-        self.mcap = McapWriter(path, compression=compression, overwrite=overwrite, append=append)
+        self.mcap = McapWriter(
+            path, compression=compression, overwrite=overwrite, append=append, source=source
+        )
         if self.mcap.untouched:
             self._check_same(strings)
         super().__init__(metadata, self.mcap)
 
     def _check_same(self, strings: dict[str, str]) -> None:
-        """Make sure that a file that is appended to was recorded from such an environment."""
+        """Raise LogError unless the existing log was recorded from the same environment."""
         found = self.mcap.metadata(METADATA_NAME) or {}
         for name in SAME_WHEN_APPENDED:
             here, there = strings[name], found.get(name, "not known")
-            if here != there:
+            same = same_env(here, there) if name == "env_id" else here == there
+            if not same:
                 self.mcap.abandon()
                 raise LogError(
                     f"{self.mcap.path} cannot be appended to: its {name} is {there:.200}, the"

@@ -1,9 +1,8 @@
-"""Writing MCAP files: what the rooms above `format` use of `columns`."""
+"""Re-exports of `columns` for packages that write MCAP files."""
 
 from __future__ import annotations
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.columns.file_lock import refuse_if_taken
 from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.valid_copy import DROP, KEEP, copy_messages, recover_file
@@ -19,5 +18,4 @@ __all__ = [
     "copy_messages",
     "message_rows",
     "recover_file",
-    "refuse_if_taken",
 ]

@@ -1,4 +1,4 @@
-"""A log that grows by whole episodes, as recorders of one environment and of many write it."""
+"""A log of numbered episodes, written by the recorders of single and vector environments."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.files import check_target, locked_file
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.topics import LOG_TOPIC, STEP_TOPIC
-from mcaprl.recorder.format.writing import refuse_if_taken
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
+from mcaprl.texts import encodable
 
 
 @dataclass
@@ -29,7 +30,7 @@ class OpenEpisode:
 
     Attributes:
         policy: Name of the policy.
-        epsilon: Exploration of the policy.
+        epsilon: Exploration rate of the policy.
         seed: Seed given to reset().
         options: Options given to reset().
         steps: Number of complete transitions.
@@ -43,13 +44,13 @@ class OpenEpisode:
 
 
 class EpisodeLog:
-    """A log whose episodes are numbered, and whose times rise from one to the next.
+    """A log of numbered episodes with increasing times.
 
     Attributes:
         log: Writer of the file.
-        step_ns: Simulated time between two records.
-        next_start_ns: log_time of the next episode's first record.
-        episodes: Number of episodes, which is the number of the next one.
+        step_ns: Simulated time between two observations.
+        next_start_ns: log_time of the next episode's first message.
+        episodes: Number of finished episodes, which is also the index of the next one.
     """
 
     def __init__(
@@ -63,10 +64,10 @@ class EpisodeLog:
         max_file_bytes: int | None,
         start_time_ns: int | None,
     ) -> None:
-        """Create the file, or open it to append; see `RecordMcap`, whose arguments these are.
+        """Create the file or open it to append; arguments are those of `RecordMcap`.
 
         Raises:
-            UsageError: The timestamps would not increase, or `max_file_bytes` is too small.
+            UsageError: Timestamps would not increase, or `max_file_bytes` is too small.
             SpaceError, OutputExistsError, LogError: As for `LogWriter`.
         """
         self._description = description
@@ -74,8 +75,8 @@ class EpisodeLog:
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
         if self.step_ns < 1 or first_ns < 0:
             raise UsageError(
-                f"a step of {self.step_ns} ns from {first_ns} ns on: timestamps must increase"
-                " from 0 or later; give step_duration_s and start_time_ns"
+                f"step of {self.step_ns} ns, start at {first_ns} ns: the step must be positive and"
+                " the start 0 or later; set step_duration_s and start_time_ns"
             )
         if append and overwrite:
             raise UsageError("append and overwrite are mutually exclusive: pass only one")
@@ -87,6 +88,8 @@ class EpisodeLog:
             path, description, compression=compression, overwrite=overwrite, append=append
         )
         try:
+            if self._parts is not None:
+                self._parts.remove_replaced()
             self.episodes = _episodes_in(self.log) if append else 0
             end_ns = self.log.mcap.end_time_ns
             if start_time_ns is not None and first_ns <= end_ns:
@@ -97,7 +100,7 @@ class EpisodeLog:
             self.log.mcap.abandon()
             raise
         self._has_layout = False
-        # Number of the first episode that is recorded into this file.
+        # Index of the first episode in this file.
         self._first_in_file = 0
         follows = start_time_ns is None and end_ns >= 0
         self.next_start_ns = max(first_ns, end_ns + self.step_ns) if follows else first_ns
@@ -108,19 +111,19 @@ class EpisodeLog:
         return self.log.mcap.closed
 
     def check_can_begin(self, seeds: Iterable[int | None]) -> None:
-        """Make sure that episodes with these seeds can be recorded.
+        """Check that episodes with these seeds can be recorded.
 
         Raises:
             UsageError: The recording is closed, or a seed does not fit 63 bits.
         """
         if self.closed:
-            raise UsageError(f"{self.log.mcap.path} is closed; record another episode elsewhere")
+            raise UsageError(f"{self.log.mcap.path} is closed; record to another file")
         for seed in seeds:
             if seed is not None and not 0 <= seed < 2**63:
-                raise UsageError(f"seed {seed}: a log holds seeds from 0 to 2**63 - 1")
+                raise UsageError(f"seed {seed}: a seed must be from 0 to 2**63 - 1")
 
     def begin(self, display: Display) -> None:
-        """Begin the next episode for viewers, in a new file if the current one is full.
+        """Begin the next episode's display messages, in a new file if the current one is full.
 
         The first episode adds the layout.
         """
@@ -140,7 +143,7 @@ class EpisodeLog:
             self._has_layout = True
 
     def close(self) -> None:
-        """Finish the log. A last file without an episode is removed."""
+        """Finish the log, and remove its last file if that has no episode."""
         self.log.close()
         if self.episodes == self._first_in_file > 0 and self._parts is not None:
             self.log.mcap.path.unlink()
@@ -154,7 +157,7 @@ class EpisodeLog:
         truncated: bool,
         reason: str,
     ) -> EpisodeSummary:
-        """Return the summary of an episode that ends now, as the next one of the log."""
+        """Return the summary of the log's next episode, which ends now."""
         return EpisodeSummary(
             episode=self.episodes,
             length=episode.steps,
@@ -171,17 +174,17 @@ class EpisodeLog:
         )
 
     def advance(self, summary: EpisodeSummary) -> None:
-        """Count an episode that is completely written."""
+        """Count an episode after it is completely written."""
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1
 
 
 class _Parts:
-    """Names of files that follow each other: `lane.mcap` becomes `lane-00000.mcap` and so on."""
+    """The numbered files of a recording: `lane.mcap` becomes `lane-00000.mcap` and so on."""
 
     def __init__(self, family: Path, max_file_bytes: int, *, overwrite: bool, append: bool) -> None:
         if max_file_bytes < 1:
-            raise UsageError(f"max_file_bytes {max_file_bytes}: a file has at least one byte")
+            raise UsageError(f"max_file_bytes is {max_file_bytes}, expected at least 1")
         self.max_file_bytes, self._family = max_file_bytes, family
         pattern = re.escape(family.stem) + r"-(\d{5})" + re.escape(family.suffix)
         old = [path for path in family.parent.glob("*") if re.fullmatch(pattern, path.name)]
@@ -189,11 +192,9 @@ class _Parts:
             raise OutputExistsError(
                 f"{min(old)} exists: choose another path, append, or pass --overwrite"
             )
-        if overwrite:
-            for path in old:
-                refuse_if_taken(path)
-            for path in old:
-                path.unlink()
+        for path in old if overwrite else ():
+            check_target(path, overwrite=True)
+        self._replaced = old if overwrite else []
         last = max((path.stem for path in old), default="0") if append else "0"
         self._number = int(last[-5:])
 
@@ -208,9 +209,20 @@ class _Parts:
         self._number += 1
         return self.current
 
+    def remove_replaced(self) -> None:
+        """Remove the files of the overwritten recording, except the current file.
+
+        Raises:
+            LogError: Another process is writing one of these files.
+        """
+        for path in self._replaced:
+            if path != self.current:
+                with locked_file(path):
+                    path.unlink(missing_ok=True)
+
 
 def _episodes_in(log: LogWriter) -> int:
-    """Return the number of episodes in a log that is appended to.
+    """Return the number of episodes in a log to append to.
 
     Raises:
         LogError: The last episode is not finished.
@@ -229,10 +241,10 @@ def _episodes_in(log: LogWriter) -> int:
 
 
 def reason_of(given: Any, terminated: bool) -> str:
-    """Return why an episode ended: the environment's reason if it gave one."""
-    return (
-        given if isinstance(given, str) and given else "terminated" if terminated else "time_limit"
-    )
+    """Return why an episode ended: the environment's reason, `terminated` or `time_limit`."""
+    if isinstance(given, str) and given:
+        return encodable(given)
+    return "terminated" if terminated else "time_limit"
 
 
 def _json(options: dict[str, Any]) -> str:
@@ -243,5 +255,5 @@ def _json(options: dict[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Convert NumPy numbers and arrays for json, and any other object to its repr."""
+    """Convert NumPy numbers and arrays to Python objects, and any other object to its repr."""
     return value.tolist() if isinstance(value, np.generic | np.ndarray) else repr(value)

@@ -1,1 +1,1 @@
-"""Checking and recovering whole logs."""
+"""Validation and recovery of logs."""

@@ -41,7 +41,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
         threads: Number of threads that decompress chunks.
 
     Returns:
-        Problems in the order of the file; empty if there are none.
+        Problems in file order.
     """
     path = Path(path)
     try:
@@ -59,7 +59,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
 
 
 def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Problem]:
-    """Check each chunk, then the log if all of them are valid."""
+    """Check each chunk, and then the log if all chunks are valid."""
     found: list[Problem] = []
     log = EpisodeCheck(reader) if whole else None
     for chunk, read in _decompressed(reader, threads):
@@ -88,7 +88,7 @@ def _decompressed(
     chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
         ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
-        # One for each thread and one for the caller: memory does not grow with the file.
+        # One buffer per thread and one for the caller, so that memory use is bounded.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
             for chunk in islice(chunks, threads + 1 - len(ahead)):

@@ -43,7 +43,7 @@ _Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 
 class EpisodeCheck:
-    """Check that reads the chunks of a log one after the other and validates them at the end."""
+    """Check of a log that collects values chunk by chunk and validates the episodes at the end."""
 
     def __init__(self, reader: McapReader) -> None:
         """Find the topics.
@@ -54,7 +54,7 @@ class EpisodeCheck:
         self._reader = reader
         self._steps = Topic(reader, STEP_TOPIC)
         if not reader.channels_of(STEP_TOPIC):
-            raise NoStepsError(f"no topic {STEP_TOPIC}, so no transitions")
+            raise NoStepsError(f"no topic {STEP_TOPIC}, hence no transitions")
         if not len(self._steps):
             raise NoEpisodesError("no finished episode")
         self._metadata = described(reader)
@@ -65,7 +65,7 @@ class EpisodeCheck:
             )
             if leaf.encoding is not None
         ]
-        # A log that this library did not write is read with the general reader.
+        # Logs of other writers are validated by `LogReader`.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
         self._places: dict[int, list[_Place]] = defaultdict(list)
@@ -85,7 +85,7 @@ class EpisodeCheck:
                 self._take_images(decoder.alike(records, messages.index, _IMAGE_FIELDS), where)
 
     def finish(self) -> Iterator[Problem]:
-        """Yield what is wrong with the log.
+        """Yield the problems of the log.
 
         Raises:
             LogError, SpaceError: The log cannot be read.
@@ -115,23 +115,23 @@ class EpisodeCheck:
             missing = int((~np.isin(times[:frames], topic.times)).sum())
             if missing or len(topic) != len(self._steps):
                 yield Problem(
-                    f"{len(topic)} images for {len(self._steps)} records, {missing} have none",
+                    f"{len(topic)} images for {len(self._steps)} records, {missing} without image",
                     leaf.topic,
                 )
 
     def _schema_fits(self) -> bool:
-        """Return whether `/rl/step` is one channel with the schema of the metadata's spaces."""
+        """Return whether `/rl/step` has one channel, and the schema of the metadata's spaces."""
         channels = self._reader.channels_of(STEP_TOPIC)
         assert self._metadata is not None
         name, text = step_schema(self._metadata.observation_space, self._metadata.action_space)
         schema = self._reader.schema_of(channels[0])
         fits = schema.name == name and schema.data.decode(errors="replace") == text
         if schema.name.startswith("mcaprl_msgs/msg/Step") and not fits:
-            raise CorruptLogError(f"the schema {schema.name} is not that of the metadata's spaces")
+            raise CorruptLogError(f"schema {schema.name} does not match the metadata's spaces")
         return fits and len(channels) == 1
 
     def _prepare(self) -> None:
-        """Find the destination of each message range, by chunk."""
+        """Set the destination of each message range, by chunk."""
         start = 0
         for decoder, messages in self._steps.parts:
             stop = start + len(messages)
@@ -187,7 +187,7 @@ def _check_summary(
     for name, claim, fact in pairs:
         if claim != fact and not math.isnan(fact):
             yield Problem(
-                f"{EPISODE_TOPIC} reports {name} {claim}, its records {fact}", f"episode {number}"
+                f"{EPISODE_TOPIC} has {name} {claim}, the records {fact}", f"episode {number}"
             )
 
 
@@ -195,7 +195,7 @@ def _check_return(episode: Episode) -> Iterator[Problem]:
     total = add_up(episode.rewards)
     if total != episode.total_reward and not np.isnan(total):
         yield Problem(
-            f"{EPISODE_TOPIC} reports return {episode.total_reward}, its records {total}",
+            f"{EPISODE_TOPIC} has return {episode.total_reward}, the records {total}",
             f"episode {episode.index}",
         )
 

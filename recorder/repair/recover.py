@@ -4,7 +4,7 @@
     (salvage)        (valid_copy)                                (whole_episodes)
 
 Metadata, attachments and all topics are kept; only messages of `/rl/` topics that belong to a
-dropped episode are left out. Whatever is left out is reported.
+dropped episode are omitted. All omissions are reported.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pathlib import Path
 
 from mcap.records import Channel, Metadata
 
-from mcaprl.errors import LogError, NoEpisodesError, OutputExistsError, UsageError
-from mcaprl.files import replacing
+from mcaprl.errors import LogError, NoEpisodesError, UsageError
+from mcaprl.files import locked_file, replacing
 from mcaprl.problem import Problem
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import Damage, McapReader
 from mcaprl.recorder.format.topics import STEP_TOPIC
-from mcaprl.recorder.format.writing import recover_file, refuse_if_taken
+from mcaprl.recorder.format.writing import recover_file
 from mcaprl.recorder.repair.check import check_log
 from mcaprl.recorder.repair.whole_episodes import (
     DroppedEpisode,
@@ -41,10 +41,10 @@ class Recovery:
         source: Path of the damaged file.
         messages: Number of messages in the new file.
         episodes: Number of episodes in the new file; 0 if it has no `/rl/step`.
-        damages: Places that could not be read.
-        dropped: Episodes that are not in the new file, if any of their records was read.
+        damages: Byte ranges that could not be read.
+        dropped: Episodes that are not in the new file, if any of their records were read.
         ended: Number of unfinished episodes that were kept up to their last whole transition.
-        strays: Number of messages on `/rl/` topics that belong to no kept episode.
+        strays: Number of messages on `/rl/` topics that do not belong to a kept episode.
     """
 
     source: str
@@ -57,7 +57,7 @@ class Recovery:
 
     @property
     def has_losses(self) -> bool:
-        """Whether the new file lacks anything of the old one."""
+        """Whether anything in the old file is missing in the new one."""
         return bool(self.damages or self.dropped or self.ended or self.strays)
 
     @property
@@ -65,11 +65,11 @@ class Recovery:
         """Losses of messages, in the order of the attributes."""
         found = [(one.what, f"byte {one.offset}, {one.bytes} bytes", "") for one in self.damages]
         found += [
-            (f"episode {one.number}", f"{one.records} records of it were read", one.why)
+            (f"episode {one.number}", f"{one.records} of its records were read", one.why)
             for one in self.dropped
         ]
         if self.strays:
-            found.append((f"{self.strays} messages", "/rl/ topics", "they are of dropped episodes"))
+            found.append((f"{self.strays} messages", "/rl/ topics", "part of dropped episodes"))
         return [
             Problem(f"lost: {what}", where, effect, file=self.source)
             for what, where, effect in found
@@ -83,37 +83,35 @@ def recover_log(
     keep_unfinished: bool = False,
     overwrite: bool = False,
 ) -> Recovery:
-    """Write the valid part of `source` to `target`, which is then a valid log.
+    """Write the valid part of `source` to `target` as a valid log.
 
     Args:
-        source: MCAP file, damaged or not. It is not changed.
+        source: MCAP file, damaged or not; not changed.
         target: Path of the new file.
-        keep_unfinished: Whether episodes without an end are kept, marked truncated, up to their
-            last whole transition. By default they are dropped.
-        overwrite: Whether an existing file is replaced.
+        keep_unfinished: Whether to keep episodes without an end up to their last whole transition,
+            marked as truncated. By default they are dropped.
+        overwrite: Whether to replace an existing file.
 
     Raises:
         OutputExistsError, UsageError: The target exists, or is the source.
         LogError: Nothing can be kept, or the target cannot be written.
     """
     source, target = Path(source), Path(target)
-    _check_paths(source, target, overwrite)
+    if source.exists() and target.exists() and target.samefile(source):
+        raise UsageError(f"{target} is the damaged file: recover to another path")
     recovery = Recovery(str(source))
-    with replacing(target, LogError) as result:
-        copied = result.with_name(f"{result.name}.records")
-        try:
-            restore = partial(_restore_metadata, recovery.damages)
-            recover_file(source, copied, recovery.damages, restore)
-            _keep_whole_episodes(copied, result, recovery, keep_unfinished)
-        finally:
-            copied.unlink(missing_ok=True)
+    with locked_file(source), replacing(target, LogError, overwrite=overwrite) as result:
+        copied = result.with_name("records.mcap" if result.name != "records.mcap" else "_")
+        restore = partial(_restore_metadata, recovery.damages)
+        recover_file(source, copied, recovery.damages, restore)
+        _keep_whole_episodes(copied, result, recovery, keep_unfinished)
     return recovery
 
 
 def _keep_whole_episodes(
     copied: Path, result: Path, recovery: Recovery, keep_unfinished: bool
 ) -> None:
-    """Move a valid MCAP file to `result`, or write its whole episodes there if it has others.
+    """Move a valid MCAP file to `result`, or write only its whole episodes there.
 
     Raises:
         LogError: There is nothing to keep, or the new log has a problem.
@@ -121,7 +119,7 @@ def _keep_whole_episodes(
     reader = McapReader(copied)
     recovery.messages = _count_messages(reader)
     if recovery.messages == 0:
-        raise LogError(f"{recovery.source} cannot be recovered: no message in it can be read")
+        raise LogError(f"{recovery.source} cannot be recovered: it has no readable message")
     plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
     if plan is None:
         os.replace(copied, result)
@@ -140,7 +138,7 @@ def _keep_whole_episodes(
 def _restore_metadata(
     damages: list[Damage], metadata: list[Metadata], channels: Iterable[Channel]
 ) -> list[Metadata]:
-    """Replace the metadata record with its copy in the channel of `/rl/step`, if there is one."""
+    """Replace the metadata record with its copy in the channel of `/rl/step`, if it exists."""
     for channel in channels:
         if channel.topic == STEP_TOPIC and "format_version" in channel.metadata:
             records = [record for record in metadata if record.name == METADATA_NAME]
@@ -149,15 +147,6 @@ def _restore_metadata(
             others = [record for record in metadata if record.name != METADATA_NAME]
             return [Metadata(METADATA_NAME, channel.metadata), *others]
     return metadata
-
-
-def _check_paths(source: Path, target: Path, overwrite: bool) -> None:
-    if source.exists() and target.exists() and target.samefile(source):
-        raise UsageError(f"{target} is the damaged file itself: recover to another one")
-    if target.exists() and not overwrite:
-        raise OutputExistsError(f"{target} exists: choose another path, or pass --overwrite")
-    refuse_if_taken(source)
-    refuse_if_taken(target)
 
 
 def _count_messages(reader: McapReader) -> int:
@@ -175,5 +164,5 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
     recovery.ended, recovery.strays = plan.ended, plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
-        hint = "; --keep-unfinished keeps the beginning of one" if can_end else ""
+        hint = "; pass --keep-unfinished to keep unfinished ones" if can_end else ""
         raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")

@@ -1,8 +1,8 @@
 """Copy of a log without incomplete episodes.
 
-A run is a series of records of `/rl/step` without a gap. A run that begins with step 0 and ends
-with a final record is a whole episode. If only its beginning is there, it was not finished, or its
-end is lost; it can be kept with its last record as the end. Other runs have lost their beginning.
+A run is a gapless series of records of `/rl/step`. A whole episode is a run from step 0 to a final
+record. A run from step 0 without a final record, from an unfinished episode or one that lost its
+end, can be kept with its last record as the end. Other runs have lost their beginning.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
 
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
-# Prefix of topics whose messages belong to episodes; other topics are kept as they are.
+# Prefix of topics whose messages belong to episodes; other topics are copied unchanged.
 _EPISODE_TOPICS = "/rl/"
 
 Place = tuple[int, int]
-"""Offset of a chunk and id of a channel: the messages of one message index."""
+"""Offset of a chunk and id of a channel, which identify a message index."""
 
 
 class RowAction(IntEnum):
@@ -47,7 +47,7 @@ class RowAction(IntEnum):
 
     DROP = DROP
     KEEP = KEEP
-    # For an episode whose end is missing: its last transition, and the observation after it.
+    # Actions for the last transition and the last record of an episode whose end is missing.
     TRUNCATE = 2
     MAKE_FINAL = 3
 
@@ -58,9 +58,9 @@ class DroppedEpisode:
 
     Attributes:
         number: Number of the episode in its log.
-        records: Number of its records of `/rl/step` that were read.
-        can_end: Whether it could be kept up to its last whole transition.
-        why: Reason why it is not kept.
+        records: Number of the episode's records of `/rl/step` that were read.
+        can_end: Whether the episode could be kept up to its last whole transition.
+        why: Reason why the episode is dropped.
     """
 
     number: int
@@ -74,13 +74,13 @@ class EpisodePlan:
     """Selection of the records to keep.
 
     Attributes:
-        actions: `RowAction` of each record of `/rl/step`, by place, in the order of the file.
+        actions: `RowAction` of each record of `/rl/step`, by place, in file order.
         spans: (E, 2) first and last log_time of the kept episodes, increasing.
         dropped: Episodes that are not kept.
-        ended: Number of episodes that are kept without their end.
-        new_summaries: Summaries of kept episodes that `/rl/episode` does not list.
-        strays: Number of messages on other topics that belong to no kept episode.
-        is_in_order: Whether the records are in the order of their times.
+        ended: Number of kept episodes whose end is missing.
+        new_summaries: Summaries of kept episodes that `/rl/episode` does not contain.
+        strays: Number of messages on other `/rl/` topics that do not belong to a kept episode.
+        is_in_order: Whether the records are in time order.
     """
 
     actions: dict[Place, NDArray[np.uint8]] = field(default_factory=dict)
@@ -107,10 +107,10 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
 
     Args:
         reader: Reader of a valid MCAP file with all messages in chunks.
-        keep_unfinished: Whether episodes without an end are kept if they have a whole transition.
+        keep_unfinished: Whether to keep episodes without an end if they have a whole transition.
 
     Returns:
-        None if the file is not a log: it has no `/rl/step` with the required fields.
+        None if the file is not a log, that is, has no `/rl/step` with the required fields.
 
     Raises:
         LogError: The file is a log according to its metadata, but lacks required fields.
@@ -150,7 +150,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
 
 
 def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> None:
-    """Write the kept records to another file."""
+    """Write the records that a plan keeps to another file."""
 
     def actions_of(chunk: ChunkIndex, channel: Channel, index: NDArray[Any]) -> NDArray[np.uint8]:
         place = (chunk.chunk_start_offset, channel.id)
@@ -175,14 +175,14 @@ def write_planned(reader: McapReader, target: Path, plan: EpisodePlan) -> None:
 
 @dataclass(frozen=True)
 class _Run:
-    """A series of records of one episode without a gap.
+    """A gapless series of records of one episode.
 
     Attributes:
         start: Row of the first record.
         last: Row of the last record before the first one that lacks an image.
         records: Number of records, including those that lack images.
-        begins: Whether it begins with step 0.
-        is_whole: Whether it is a whole episode.
+        begins: Whether the run begins with step 0.
+        is_whole: Whether the run is a whole episode.
     """
 
     start: int
@@ -193,7 +193,7 @@ class _Run:
 
     @property
     def can_end(self) -> bool:
-        """Whether it can be kept as an episode that ends with its last whole transition."""
+        """Whether the run can be kept as an episode that ends with its last whole transition."""
         return self.begins and not self.is_whole and self.last > self.start
 
     def dropped(self, columns: Columns, can_end: bool) -> DroppedEpisode:
@@ -218,7 +218,7 @@ class _Run:
 
 
 def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> Iterator[_Run]:
-    """Yield the runs of records that are sorted by channel and time."""
+    """Yield the runs of records, which are sorted by channel and time."""
     steps, episodes, times = columns["step"], columns["episode"], columns[LOG_TIME]
     follows = (
         (steps[1:] == steps[:-1] + 1)
@@ -237,7 +237,7 @@ def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> It
 
 
 def _is_log(reader: McapReader) -> bool:
-    """Return whether a file is or was a log; its metadata and topic names can be damaged."""
+    """Return whether a file is a log, possibly with damaged metadata or topic names."""
     topics = (STEP_TOPIC, EPISODE_TOPIC, "/rl/observation/")
     return (
         METADATA_NAME in reader.metadata
@@ -255,7 +255,7 @@ def _message_dtype(schema: Schema) -> np.dtype[Any] | None:
 
 
 def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for each record whether each topic of image observations has one image of it."""
+    """Return whether each record has exactly one image on each image topic."""
     metadata, complete = described(reader), np.ones(len(times), np.bool_)
     for leaf in observation_leaves(metadata.observation_space) if metadata else ():
         if leaf.encoding is not None:
@@ -265,7 +265,7 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
 
 
 def _listed_ends(reader: McapReader) -> set[int]:
-    """Return the last log_times of the episodes that `/rl/episode` lists."""
+    """Return the last log_times of the episodes on `/rl/episode`."""
     topic, name = Topic(reader, EPISODE_TOPIC), "end_time_ns"
     return set(topic.read([name])[name].tolist()) if name in topic.fields else set()
 
@@ -291,7 +291,7 @@ def _by_place(
 
 
 def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.bool_]:
-    """Return for each time whether it is within a kept episode."""
+    """Return whether each time is within a kept episode."""
     if not plan.episodes:
         return np.zeros(len(log_times), np.bool_)
     times = log_times.astype(np.int64)
@@ -301,7 +301,7 @@ def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.b
 
 
 def _end_episode(data: memoryview, dtype: np.dtype[Any] | None, action: RowAction) -> None:
-    """Change a message so that its episode ends with it."""
+    """Apply `TRUNCATE` or `MAKE_FINAL` to a message."""
     assert dtype is not None, "only episodes with a known message dtype are ended"
     message = np.frombuffer(data, dtype, 1)
     if action == RowAction.TRUNCATE:

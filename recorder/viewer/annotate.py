@@ -1,23 +1,23 @@
-"""Adds topics to a copy of a log: what policies think of its steps, or what there was to see.
+"""Annotation of a copy of a log: topics with policies' outputs at its steps, or with its scene.
 
-The copy has all messages of the log; new ones are written after them, with the log_times of their
-steps, and a new layout shows them.
+The copy contains all messages of the log, followed by the new messages with the log_times of their
+steps, and a layout that shows the new topics.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import gymnasium as gym
 from mcap.records import Attachment
 
-from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.errors import LogError, UsageError
+from mcaprl.files import replacing
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.log_reader import describe
@@ -30,60 +30,49 @@ from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.verify import Verification, verify
 
 
+@contextmanager
+def annotated_copy(source: Path, out: Path, *, overwrite: bool = False) -> Iterator[AnnotatedCopy]:
+    """Yield a copy of a log, which is moved to `out` if the body ends without an error.
+
+    Args:
+        source: Path of the log.
+        out: Path of the copy, which may be the log's.
+        overwrite: Whether to replace an existing file.
+
+    Raises:
+        OutputExistsError: The file exists and `overwrite` is not set.
+        LogError: The log is damaged, unfinished or not an mcaprl log; or `out` cannot be written.
+    """
+    reader = McapReader(source)
+    with replacing(out, LogError, overwrite=overwrite) as unfinished:
+        log = LogWriter(unfinished, describe(reader), source=source)
+        try:
+            copy = AnnotatedCopy(log, reader)
+            yield copy
+            copy.attach_layout()
+            log.close()
+        finally:
+            log.mcap.abandon()
+
+
 class AnnotatedCopy:
-    """A copy of a log that grows; use it as a context. An error inside removes it again."""
+    """A copy of a log to which topics are added."""
 
-    def __init__(self, source: Path, out: Path, *, overwrite: bool = False) -> None:
-        """Copy the log.
-
-        Raises:
-            OutputExistsError: there is a file, and `overwrite` is not set; or it is the log itself.
-            LogError: the log is damaged, not finished, or not one of ours; or it cannot be written.
-        """
-        if out.exists() and (not overwrite or out.samefile(source)):
-            raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
-        reader = McapReader(source)
-        self._metadata = describe(reader)
-        self._topics = {channel.topic for channel in reader.channels.values()}
-        self._out = out
-        try:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, out)
-        except OSError as error:
-            raise LogError(f"cannot write {out}: {error.strerror}") from error
-        try:
-            self._log = LogWriter(out, self._metadata, append=True)
-        except BaseException:
-            out.unlink()
-            raise
-
-    def __enter__(self) -> Self:
-        """Begin."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Attach the layout and finish; or remove what an error left unfinished."""
-        if kind is not None:
-            self._log.mcap.abandon()
-            self._out.unlink(missing_ok=True)
-            return
-        self._log.close()
-        self._attach_layout()
+    def __init__(self, log: LogWriter, source: McapReader) -> None:
+        """Add to `log`, which contains all records of `source`."""
+        self._log, self._source = log, source
+        self._topics = {channel.topic for channel in source.channels.values()}
+        self._display: Display | None = None
 
     def add_values(self, topic: str, episodes: Sequence[tuple[Episode, Mapping[str, Any]]]) -> None:
         """Write a topic of `schema.values_schema`, one message for each step.
 
         Args:
-            topic: see `values_topics`.
-            episodes: each with its columns, (T, ...) by field.
+            topic: Topic to write; see `values_topics`.
+            episodes: Episodes with their columns, (T, ...) by field.
 
         Raises:
-            UsageError: the log has the topic.
+            UsageError: The log already has the topic.
         """
         self._refuse(topic)
         rows = self._log.values_rows(topic, actions=episodes[0][1]["q"].shape[1])
@@ -91,23 +80,22 @@ class AnnotatedCopy:
             rows.write_columns(episode.log_time_ns[:-1], columns)
 
     def add_scene(self, dataset: Dataset, env: gym.Env[Any, Any], *, camera: bool) -> Verification:
-        """Step the environment through the log, and write what there is to see.
+        """Replay the log in the environment, and write the scene.
 
         Args:
-            dataset: the log's.
-            env: a new one of the same kind.
-            camera: whether to write metric depth images, too.
+            dataset: Dataset of the log.
+            env: New environment of the same kind.
+            camera: Whether to write metric depth images.
 
         Raises:
-            UsageError: the log has a scene, or the environment none.
-            LogError: the environment gives something else than the log has, or cannot be stepped
-                through it since there are no seeds.
+            UsageError: The log already has a scene, or the environment provides none.
+            LogError: The replay differs from the log, or the log lacks seeds of episodes.
         """
         self._refuse(SCENE)
         display = Display(self._log, env.unwrapped, scene=True, camera=camera)
         if not display.shows_steps:
-            raise UsageError(f"{dataset.env_id} describes no scene; nothing can be added")
-        step_ns = self._metadata.step_duration_ns
+            raise UsageError(f"{dataset.env_id} provides no scene")
+        self._display, step_ns = display, self._log.metadata.step_duration_ns
 
         def show(episode: Episode, step: int) -> None:
             if step == 0:
@@ -119,12 +107,12 @@ class AnnotatedCopy:
         found = verify(dataset, env, on_frame=show)
         if found.difference is not None:
             raise LogError(
-                f"no scene was added, for the sim is another now: {found.difference.to_problem()}"
+                f"no scene was added, since the replay differs: {found.difference.to_problem()}"
             )
         if found.unseeded:
             raise LogError(
-                f"no scene was added, for the log has no seed of {len(found.unseeded)} episodes"
-                f" (the first: {found.unseeded[0]})"
+                f"no scene was added, since the log has no seed for {len(found.unseeded)} episodes"
+                f" (first: {found.unseeded[0]})"
             )
         if LOG_TOPIC not in self._topics:
             self._log.write_log_lines([episode.summary for episode in dataset.episodes])
@@ -132,19 +120,20 @@ class AnnotatedCopy:
 
     def _refuse(self, topic: str) -> None:
         if topic in self._topics:
-            raise UsageError(f"the log has {topic} already: annotate the log that it was made of")
+            raise UsageError(f"the log already has {topic}: annotate the original log")
 
-    def _attach_layout(self) -> None:
-        layout = layout_of_log(McapReader(self._out))
-        log = LogWriter(self._out, self._metadata, append=True)
-        time_ns = log.mcap.end_time_ns
-        data = json.dumps(layout).encode()
-        log.mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
-        log.close()
+    def attach_layout(self) -> None:
+        """Attach a layout that shows the added topics."""
+        mcap = self._log.mcap
+        topics = sorted({channel.topic for channel in mcap.channels.values()})
+        shown = None if self._display is None else self._display.shown
+        layout = layout_of_log(self._source, topics, shown)
+        data, time_ns = json.dumps(layout).encode(), mcap.end_time_ns
+        mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
 
 
 def values_topics(names: Sequence[str]) -> dict[str, str]:
-    """A topic for each policy by its name: one alone has `/rl/values`, several one below it each.
+    """Return the topic of each policy: `/rl/values`, or `/rl/values/<name>` if there are several.
 
     >>> values_topics(["runs/cql", "runs/b c"])
     {'runs/cql': '/rl/values/runs_cql', 'runs/b c': '/rl/values/runs_b_c'}

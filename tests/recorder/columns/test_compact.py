@@ -179,7 +179,7 @@ def test_killed_while_compacting(log_path: Path, writes: int) -> None:
     """
     command = [sys.executable, "-c", textwrap.dedent(code), str(log_path), str(writes)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == -9
-    leftover = log_path.with_name(f"{log_path.name}.compact.part")
+    leftover = log_path.with_name(f".{log_path.name}.part")
     assert leftover.exists()
     assert check_log(log_path) == []
     assert len(mcaprl.open(log_path.parent).episodes) == 6
@@ -233,21 +233,21 @@ def test_a_writer_that_opened_the_old_file_gets_the_new_one(
 ) -> None:
     """Between its open and its lock, the file may be replaced, and the lock of the old one free."""
     write_log(log_path, 2)
-    locked = file_lock._locked
+    locked = file_lock.try_lock
     copy = log_path.read_bytes()
     once = [True]
 
-    def replaced(file: Any, path: Path) -> Any:
+    def replaced(descriptor: int) -> bool:
         if once:
             once.clear()
             other = log_path.with_name("other")
             other.write_bytes(copy)
             os.replace(other, log_path)
-        return locked(file, path)
+        return locked(descriptor)
 
-    monkeypatch.setattr(file_lock, "_locked", replaced)
+    monkeypatch.setattr(file_lock, "try_lock", replaced)
     file = file_lock.reopen(log_path)
-    assert file_lock.is_at(file, log_path)
+    assert file_lock.is_at(file.fileno(), log_path)
     file_lock.release(file)
 
 

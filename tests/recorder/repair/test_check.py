@@ -114,8 +114,8 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 3, final=False), "out of order"),
         (at(1, 1, terminated=True), "continues after its end"),
         (at(2, 5, final=False), "6 records of an unfinished episode"),
-        (at(0, 3, terminated=False), "reports terminated True, its records False"),
-        (at(1, 2, truncated=False), "reports truncated True, its records False"),
+        (at(0, 3, terminated=False), "has terminated True, the records False"),
+        (at(1, 2, truncated=False), "has truncated True, the records False"),
     ],
 )
 def test_inconsistent_episodes_are_reported(good: Path, change: Change, reported: str) -> None:
@@ -131,7 +131,7 @@ def test_rewriting_changes_no_value(good: Path) -> None:
 def test_a_wrong_return_is_reported(log_path: Path) -> None:
     write_log(log_path, 2)
     problems = check_log(rewritten(log_path, at(1, 1, reward=1e6)))
-    assert ["reports return" in problem.what for problem in problems] == [True]
+    assert ["has return" in problem.what for problem in problems] == [True]
     assert problems[0].where == "episode 1"
 
 
@@ -177,13 +177,13 @@ def test_metadata_with_other_spaces_is_reported(good: Path) -> None:
     other = spaces.Dict({**SPACE.spaces, "x": spaces.Box(-1, 1, (3,), np.float32)})
     strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
     (problem,) = check_log(rewritten(good, strings=strings))
-    assert "is not that of the metadata's spaces" in problem.what
+    assert "does not match the metadata's spaces" in problem.what
 
 
 def test_missing_images_are_reported(good: Path) -> None:
     """Images are missing, or their size differs from the metadata."""
     (problem,) = check_log(rewritten(good, leave_out="/rl/observation/eye"))
-    assert problem.what == "11 images for 15 records, 4 have none"
+    assert problem.what == "11 images for 15 records, 4 without image"
     other = spaces.Dict({**SPACE.spaces, "eye": spaces.Box(0, 255, (16, 4 + 4), np.uint8)})
     strings = LogMetadata(other, spaces.Discrete(2)).to_strings()
     (problem,) = check_log(rewritten(good, strings=strings))
