@@ -4,13 +4,13 @@
     >>> sorted(mcaprl.sims.SIMS)
     ['highway-lane', 'lane', 'powerline', 'racer']
 
-Importing this package loads no engine: numba and pygame are imported when a sim is made or drawn.
+Importing this package does not import numba or pygame; making or rendering a sim does.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import gymnasium as gym
@@ -21,10 +21,13 @@ from mcaprl.sims import highway, lane, powerline, racer
 from mcaprl.sims.spec import SimCatalog, SimSpec
 
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
-"""Gymnasium id of each sim, by its short name; sims of installed packages included."""
+"""Gymnasium id of each sim by short name, including sims of installed packages."""
+
+# The attribute that recorders look for.
+_ENV_MODULE: Final = "env_module"
 
 
-def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
+def make_sim(name: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
     """Make an environment from a sim's short name or from any Gymnasium id.
 
     Args:
@@ -39,7 +42,9 @@ def make_sim(name: str, **kwargs: Any) -> gym.Env[Any, Any]:
     """
     env_id, spec = _resolve(name)
     with _clear_errors(name, spec, kwargs):
-        return gym.make(env_id, **kwargs)
+        env = gym.make(env_id, **kwargs)
+    _set_module([env], env_id)
+    return env
 
 
 def make_sims(
@@ -68,7 +73,17 @@ def make_sims(
         if spec is not None and spec.vector_entry_point:
             return gym.make_vec(env_id, num_envs, autoreset_mode=autoreset_mode, **kwargs)
         options = {"autoreset_mode": autoreset_mode}
-        return gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
+        envs = gym.make_vec(env_id, num_envs, "sync", vector_kwargs=options, **kwargs)
+    _set_module(getattr(envs.unwrapped, "envs", ()), env_id)
+    return envs
+
+
+def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
+    """Let logs of environments name the module whose import registers them."""
+    module = env_id.rpartition(":")[0]
+    for env in envs:
+        if module and not hasattr(env.unwrapped, _ENV_MODULE):
+            setattr(env.unwrapped, _ENV_MODULE, module)
 
 
 def _resolve(name: str) -> tuple[str, SimSpec | None]:
@@ -80,7 +95,7 @@ def _resolve(name: str) -> tuple[str, SimSpec | None]:
 
 @contextlib.contextmanager
 def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> Iterator[None]:
-    """Turn what prevents a sim from being made into an error that a user understands."""
+    """Convert the errors that making a sim raises to errors of this package."""
     if spec is not None and spec.engine:
         import_extra(spec.engine, "sims")
     try:

@@ -1,4 +1,4 @@
-"""The sims by name: our own, and those that installed packages add through entry points."""
+"""Catalog of sims: built-in ones, and those that installed packages add by entry points."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GROUP: Final = "mcaprl.sims"
 
 @dataclass(frozen=True)
 class SimSpec:
-    """Description of one sim: its names, how it is made, and who drives it.
+    """Description of a sim: its names, environment classes and pilot.
 
     A package adds a sim to `mcaprl` with an entry point in its `pyproject.toml`. The entry point's
     name is the sim's short name; its object is a `SimSpec`, or a function without arguments that
@@ -37,19 +37,19 @@ class SimSpec:
     entry_point: str | Callable[..., gym.Env[Any, Any]]
     """Environment class, or `module:class`."""
     vector_entry_point: str | None = None
-    """`module:class` of the environment that steps many vehicles together, if there is one."""
+    """`module:class` of the vector environment, if there is one."""
     max_episode_steps: int | None = None
     """Steps after which an episode is truncated."""
     pilot: str | Callable[[Any], Any] | None = None
-    """Class or function, or `module:name` of it, that takes the unwrapped environment and returns
+    """Class or function, or its `module:name`, that accepts the unwrapped environment and returns
     its scripted policy (`mcaprl.sims.evaluation.rollout.Policy`)."""
     engine: str | None = None
-    """Module of the extra `sims` without which the sim cannot be made."""
+    """Module of the extra `sims` that the sim requires."""
 
     def register(self) -> None:
         """Register the environment with Gymnasium, unless its id is registered already.
 
-        Gymnasium's passive checker stays off: it takes time in each step.
+        Gymnasium's passive checker is disabled, because it slows down each step.
         """
         if self.env_id not in gym.registry:
             gym.register(
@@ -72,12 +72,12 @@ class SimSpec:
 class SimCatalog(Mapping[str, str]):
     """Mapping from short names to Gymnasium ids; a sim is registered when it is looked up.
 
-    Our own sims are registered at once. An installed package is imported only when its sim is
-    asked for by name, or when an id is asked for that nobody has registered.
+    Built-in sims are registered immediately. An installed package is imported only when its sim
+    is looked up by name, or when an unregistered id is looked up.
     """
 
     def __init__(self, own: Iterable[SimSpec]) -> None:
-        """Register our own sims."""
+        """Register the built-in sims."""
         self._specs = {spec.name: spec for spec in own}
         for spec in self._specs.values():
             spec.register()
@@ -92,7 +92,7 @@ class SimCatalog(Mapping[str, str]):
         return self._spec(name).env_id
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of our own sims, then of the others."""
+        """Iterate over the names of the built-in sims, then of the others."""
         return iter([*self._specs, *(name for name in _installed() if name not in self._specs)])
 
     def __len__(self) -> int:
@@ -100,7 +100,7 @@ class SimCatalog(Mapping[str, str]):
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is a sim of this name; loads nothing."""
+        """Return whether there is a sim of this name; import nothing."""
         return name in self._specs or name in _installed()
 
     def find(self, env_id: str, *, loads: bool = True) -> SimSpec | None:
@@ -108,8 +108,8 @@ class SimCatalog(Mapping[str, str]):
 
         Args:
             env_id: Gymnasium id.
-            loads: Whether to import the installed sims if no sim in use has the id. One that
-                cannot be loaded causes a warning.
+            loads: Whether to import the installed sims if no registered sim has the id; a failed
+                import causes a warning.
         """
         specs = self._specs
         if loads and all(spec.env_id != env_id for spec in specs.values()):
@@ -136,10 +136,10 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 def _load(found: EntryPoint) -> SimSpec:
-    """Import what an entry point names.
+    """Load the sim of an entry point.
 
     Raises:
-        UsageError: It cannot be imported, or does not describe a sim of its name.
+        UsageError: The entry point cannot be loaded, or has no sim of its name.
     """
     package = f" of package '{found.dist.name}'" if found.dist else ""
     place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"

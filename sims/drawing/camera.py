@@ -1,7 +1,7 @@
 """Software rasterizer for depth images of triangle meshes; needs one CPU core and no display.
 
-It uses a z-buffer of inverse depths. On a plane, 1/z is linear in image coordinates, so one
-division per triangle suffices; and 0 is the value of a pixel that no triangle covers.
+The z-buffer stores inverse depths. On a plane, 1/z is linear in image coordinates, so one division
+per triangle suffices. Pixels that no triangle covers are 0.
 
 Camera axes are those of a ROS optical frame (REP 103): x right, y down, z into the image.
 """
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 _NEAR_M = 0.1
 """Distance of the near plane."""
 _BACK_M = 1e-6
-"""Distance too_near a triangle from which a camera sees its back, despite rounding."""
+"""Distance behind a triangle's plane from which the triangle is culled; allows for rounding."""
 
 
 class Lens(NamedTuple):
@@ -34,7 +34,7 @@ class Lens(NamedTuple):
 
 
 def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
-    """Return the lens of an image size and a horizontal field of view.
+    """Return the lens for an image size and a horizontal field of view.
 
     >>> lens(256, 144, math.pi / 2).focal_px
     128.00000000000003
@@ -56,13 +56,13 @@ def lengths(shape: tuple[int, int], focal_x_px: float, focal_y_px: float) -> Flo
 
 
 def level_axes(yaw_rad: float) -> Floats:
-    """Return the (3, 3) axes, as rows in the map, of a level camera in the direction of a yaw."""
+    """Return the (3, 3) axes, one per row, of a level camera that faces along a yaw angle."""
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.array([[sin, -cos, 0.0], [0.0, 0.0, -1.0], [cos, sin, 0.0]])
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the (T, 4) planes of triangles: the front's unit normal, and its distance from 0."""
+    """Return the (T, 4) planes of triangles: the front's unit normal and the offset."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -92,7 +92,7 @@ def draw(
     middles, left_u, right_u = np.empty((3, inverse_z.shape[0]))
     for row in range(len(middles)):
         middles[row] = row + 0.5
-    # Half of the image's width and height where z is 1; a corner on the border is inside.
+    # Half of the image's width and height at z = 1; a corner on the border is inside.
     wide, high = 0.5 * inverse_z.shape[1] / focal_px, 0.5 * inverse_z.shape[0] / focal_px
     for face in range(len(mesh)):
         before_m = planes[face, 0] * eye_m[0] + planes[face, 1] * eye_m[1]
@@ -125,7 +125,7 @@ def draw(
 
 
 class _Plane(NamedTuple):
-    """Points p with x p_x + y p_y + z p_z = offset; negative if the camera is at the front."""
+    """Points p with x p_x + y p_y + z p_z = offset, negative if the camera is in front."""
 
     x: float
     y: float
@@ -232,9 +232,9 @@ def _fill(
 ) -> None:
     """Fill a convex polygon that lies in a plane.
 
-    A pixel is filled if its middle is inside; a middle on an edge belongs to the polygon at its
-    right or below it, so that adjacent polygons leave no gap. The points p = z (u/f, v/f, 1) of the
-    plane have 1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the image.
+    A pixel is filled if its middle is inside; a middle on an edge belongs to the polygon to the
+    right of the edge or below. Points p = z (u/f, v/f, 1) of the plane have
+    1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the image.
 
     Args:
         rows: First row that the polygon covers, and the row after the last one.
@@ -266,7 +266,7 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires into `inverse_z`, (height, width) 1/m, where they are nearer.
+    """Draw straight wires into `inverse_z`, (height, width) 1/m, where nothing is nearer.
 
     A wire is one pixel wide at any distance: it covers one pixel of each column that it crosses,
     or of each row if it is steeper than 45 degrees in the image.
@@ -275,8 +275,8 @@ def draw_wires(
         wires: (S, 2, 3) ends of the wires.
         eye_m: (3,) position of the camera.
         axes: (3, 3) axes of the camera, as in `draw`.
-        focal_x_px: Focal length in widths of a pixel.
-        focal_y_px: Focal length in heights of a pixel.
+        focal_x_px: Focal length in pixel widths.
+        focal_y_px: Focal length in pixel heights.
         inverse_z: Image to draw into.
     """
     ends = np.empty((2, 3))
@@ -313,7 +313,7 @@ def _cut_near(ends: Floats) -> bool:
 
 @compiled
 def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
-    """Draw a line, one pixel for each pixel of its main direction.
+    """Draw a line with one pixel per step along its main direction.
 
     Args:
         ends: (2, 3) u, v and 1/z of both ends.

@@ -20,8 +20,8 @@ _SMOOTH = 2
 class Canvas:
     """Canvas for a sequence of images, which mode `human` shows in a window.
 
-    The calls for one image are: any number of `polygon`, then `flatten`, then text and other
-    elements that are not smoothed, then `finish`.
+    For each image, call `polygon` any number of times, then `flatten`, then the methods that draw
+    text and other elements without smoothing, then `finish`.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Canvas:
         """Prepare an empty image.
 
         Args:
-            render_mode: Mode; `human` opens a window.
+            render_mode: Render mode; `human` opens a window.
             size_px: Width and height.
             caption: Title of the window.
             images_per_s: Frame rate of the window.
@@ -42,7 +42,7 @@ class Canvas:
         Raises:
             MissingExtraError: Pygame is not installed.
         """
-        # pygame prints a greeting to stdout, which may be reserved for results.
+        # pygame prints a greeting to stdout, where commands print results.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.pygame = import_extra("pygame", "sims")
         self.pygame.font.init()

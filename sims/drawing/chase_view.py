@@ -2,7 +2,7 @@
 
 Faces that lie flat on the ground are drawn first, in the order of their heights, then all others,
 the farthest first. The order uses the distances of the faces' middles and can be wrong for a large
-face beside a small one. The image is for people; `sims.drawing.camera` measures depth.
+face beside a small one. For depth images, see `sims.drawing.camera`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 SIZE_PX = (960, 540)
 BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
-"""Position of the camera relative to the body, and the distance of its target in front of it."""
+"""Backward and upward offset of the camera from the body, and forward offset of its target."""
 FAR_M = 400.0
 _FOCAL_PX = 0.9 * SIZE_PX[0]
 _NEAR_M = 0.3
@@ -78,11 +78,11 @@ class ChaseView:
         follow: str,
         lines: Sequence[str],
     ) -> NDArray[np.uint8]:
-        """Render the image of one moment, (height, width, 3).
+        """Render one image, (height, width, 3).
 
         Args:
-            static: Shapes that do not change; those in the map are prepared again only if this is
-                not the same list as in the last call.
+            static: Static shapes; those in the map are prepared again only if this is another list
+                object than in the last call.
             moving: Shapes that change.
             frames: All frames.
             follow: Frame of the body; if empty, the camera faces the map's origin.

@@ -1,4 +1,4 @@
-"""Depth images: rendering, averaging to a smaller size, and encoding as one byte per pixel."""
+"""Depth images: rendering, downsampling, and encoding as one byte per pixel."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def decode_depth(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
 def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Encode meters as bytes as AirSim's examples do: 255 / max(1, d), rounded down.
 
-    Infinity is 0. Half of the codes are distances of 1 to 2 m.
+    Infinity is 0. Half of the codes cover distances of 1 to 2 m.
     """
     codes: NDArray[np.uint8] = (255.0 / np.maximum(1.0, depth_m)).astype(np.uint8)
     return codes
@@ -55,7 +55,7 @@ class Overlaps(NamedTuple):
     first: NDArray[np.int64]
     """(new,) index of the first old pixel that overlaps each new one."""
     weights: Floats
-    """(new, K) shares of the new pixel's area that the K old pixels from the first one cover."""
+    """(new, K) share of each new pixel that each of K old pixels, from the first one on, covers."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
@@ -76,12 +76,12 @@ def overlaps(old_size: int, new_size: int) -> Overlaps:
 def shrink(
     inverse: Floats, rows: Overlaps, columns: Overlaps, depth_m: NDArray[np.float32]
 ) -> None:
-    """Average an image of inverse distances to a smaller image of distances.
+    """Downsample an image of inverse distances to a smaller image of distances.
 
     If at least half of a new pixel's area is covered by surfaces, the pixel's inverse distance is
-    the mean over that part of the area, otherwise its distance is infinite. Thus the sky never
-    changes a distance; and since inverse depth is linear on a plane, the mean is the distance of
-    the plane near the middle of the area.
+    the mean over that part of the area; otherwise the distance is infinite. Thus the sky does not
+    affect distances. Since inverse depth is linear on a plane, the mean is the distance of the
+    plane near the middle of the area.
 
     Args:
         inverse: (H, W) 1/m, 0 where there is no surface.
@@ -119,8 +119,8 @@ class DepthCamera:
 
         Args:
             mesh: (T, 3, 3) triangles, meters; see `draw`.
-            view: Lens, and the size at which images are rendered.
-            small: (h, w) pixels, the size to which images are averaged.
+            view: Lens and size of the rendered images.
+            small: Size (h, w) of the downsampled images, pixels.
             wires: (S, 2, 3) meters, drawn into the small image, one pixel wide.
         """
         self._mesh, self._planes = mesh, fronts(mesh)

@@ -22,13 +22,13 @@ class Body(NamedTuple):
     """Pose of the body that the image follows."""
 
     frame: str
-    """Frame whose shapes rotate with the body; shapes of other frames only move with it, and
-    shapes of `map` do neither."""
+    """Frame whose shapes rotate with the body; shapes of other frames are only
+    translated, and shapes of `map` stay fixed."""
     x_m: float
     y_m: float
     yaw_rad: float
     height_m: float = 0.0
-    """Height of the body, added to its shapes' heights for the order of drawing."""
+    """Height of the body, added to its shapes' heights to sort them for drawing."""
 
 
 class FollowView:
@@ -46,7 +46,7 @@ class FollowView:
         """Prepare the shapes that never change.
 
         Args:
-            render_mode: Mode; `human` opens a window.
+            render_mode: Render mode; `human` opens a window.
             name: Name of the sim, for the window's title.
             static: Shapes that never change.
             width_m: Width of the ground in the image.
@@ -65,7 +65,7 @@ class FollowView:
         self._width_m = width_m
 
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
-        """Draw the surroundings of the body; more can be drawn on `canvas` before `show`.
+        """Draw the body and its surroundings; the caller may add to `canvas` before `show`.
 
         Args:
             moving: Shapes that change.

@@ -31,27 +31,27 @@ def no_points() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One thing to draw.
+    """Element of a scene.
 
     `box`, `sphere`, `cylinder` (axis along z) and `text` are at `position`, rotated by `yaw_rad`,
     with edges `size`. The others are drawn through `points`, which `yaw_rad` rotates and `position`
-    moves.
+    translates.
     """
 
     name: str
-    """Unique among the shapes of a scene."""
+    """Name, unique in the scene."""
     kind: Kind
     color: Color
     points: NDArray[np.float64] = field(default_factory=no_points)
     """(N, 3) meters. `line`: a strip; `segments`: pairs; `triangles`: triples; `arrow`: start and
     end; empty for the others."""
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Meters. `line`, `segments` and `points`: the width is the first; `arrow`: shaft diameter,
-    head diameter, head length; `text`: the height is the last."""
+    """Meters. `line`, `segments` and `points`: the first is the width; `arrow`: shaft diameter,
+    head diameter, head length; `text`: the last is the height."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Meters, in `frame`."""
     yaw_rad: float = 0.0
-    """Turn about z, counter-clockwise seen from above."""
+    """Rotation about z, counter-clockwise seen from above."""
     frame: str = "map"
     """Frame that the shape is fixed to."""
     text: str = ""
@@ -63,7 +63,7 @@ class Frame:
 
     name: str
     position: tuple[float, float, float]
-    """Meters, of the origin in `parent`."""
+    """Position of the origin in `parent`, meters."""
     rotation: tuple[float, float, float, float]
     """Unit quaternion (x, y, z, w) that transforms vectors of this frame to `parent`."""
     parent: str = "map"

@@ -23,7 +23,7 @@ def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, flo
 
 
 def label(text: str, color: Color, height_m: float, frame: str = "car") -> Shape:
-    """Return the text `speed` above the origin of a frame."""
+    """Return a text shape named `speed` above the origin of a frame."""
     at = (0.0, 0.0, height_m)
     return Shape("speed", "text", color, size=(1.0, 1.0, 0.8), position=at, frame=frame, text=text)
 

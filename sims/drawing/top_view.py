@@ -1,4 +1,4 @@
-"""Projection of shapes to flat patches, as seen from above, in the order of their heights."""
+"""Projection of shapes to flat patches, seen from above and sorted by height."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _outlines(shape: Shape) -> list[Floats]:
 
 
 def _stroke(start: Floats, end: Floats, width_m: float) -> Floats:
-    """Return the rectangle (4, 2) of a line, which extends it by half its width at each end."""
+    """Return a line as a rectangle (4, 2), extended by half its width at each end."""
     along = end - start
     length_m = float(np.hypot(along[0], along[1]))
     yaw_rad = math.atan2(along[1], along[0])

@@ -103,18 +103,18 @@ def evaluate(
     on_policy: Callable[[str], None] = lambda name: None,
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> PolicyScore:
-    """Run one policy, or one per training seed, greedily through the same episodes.
+    """Evaluate one policy, or one per training seed, greedily on the same episodes.
 
     Args:
         env: Environment.
-        policies: Policies of the training seeds; [None] acts at random.
+        policies: Policies of the training seeds; [None] for random actions.
         name: Name for tables.
         episodes: Number of episodes of each policy; all policies have the same starts.
         seed: Seed of the episodes.
-        envs: `episodes` copies of the environment that are stepped together, to be used in place of
-            `env`; only for policies that act on batches.
-        on_policy: Function that is called with each policy's own name before its first episode.
-        on_episode: Function that is called after each episode.
+        envs: Vector environment of `episodes` copies to use instead of `env`; only for policies
+            that act on batches.
+        on_policy: Function called with each policy's name before its first episode.
+        on_episode: Function called after each episode.
     """
     results = []
     for policy in policies:
@@ -138,7 +138,7 @@ def evaluate(
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
-    """Add the score on the scale random = 0, pilot = 1; return it unchanged without a pilot."""
+    """Add the score on the scale random = 0, pilot = 1; do nothing without a pilot."""
     if pilot is None or pilot.mean_return == random.mean_return:
         return score
     span = pilot.mean_return - random.mean_return

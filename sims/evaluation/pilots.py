@@ -1,4 +1,4 @@
-"""Scripted policies of the sims, which have a score of 1 by definition."""
+"""Scripted policies of the sims; their normalized score is 1 by definition."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.sims.evaluation.rollout import Policy
 
 
 def make_pilot(env: gym.Env[Any, Any]) -> Policy:
-    """Make the pilot of the sim inside `env`, wrapped or not.
+    """Create the pilot of the sim in `env`, which may be wrapped.
 
     Raises:
         UnknownNameError: The environment has no pilot.

@@ -1,4 +1,4 @@
-"""HTML report of an evaluation: comparison of policies, trajectories, and episodes to watch.
+"""HTML report of an evaluation: comparison of policies, trajectories, and selected episodes.
 
 Extra: `report`.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
@@ -65,7 +65,7 @@ def comparison_figure(
         text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
         # The line of the logged behavior may cross the label.
         text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
-    axes.set_yticks(range(len(scores)), [score.policy for score in scores])
+    axes.set_yticks(range(len(scores)), tick_labels(score.policy for score in scores))
     axes.invert_yaxis()
     axes.set_xlim(right=axes.get_xlim()[1] * 1.28)
     axes.set_xlabel("mean return; line: 95 % interval; dots: training seeds")
@@ -104,7 +104,7 @@ def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> 
 
 
 def _trajectories(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> list[Figure]:
-    """Draw one figure for each policy, so that a narrow page can show them below each other."""
+    """Draw one figure for each policy, so that a narrow page can stack the figures."""
     figures = []
     for row, score in enumerate(scores):
         if score.results[0][0].positions.size:

@@ -1,4 +1,4 @@
-"""Episodes of a policy in an environment, or in many that are stepped together."""
+"""Episodes of a policy in an environment or a vector environment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Policy(Protocol):
         """Name in logs and tables."""
 
     def act(self, observations: Any) -> NDArray[Any]:
-        """Return actions (B, *action shape) for observations (B, *shape) or a dict of such."""
+        """Return actions (B, *action shape) for observations (B, *shape) or a dict of them."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class EpisodeResult:
         seed: Seed of the reset.
         total_reward: Undiscounted return.
         length: Number of transitions.
-        reason: Reason of the end; `interrupted` if the caller's budget of steps was used up.
+        reason: Reason of the end; `interrupted` if the maximum number of steps was reached.
         positions: (length + 1, 2) x and y, meters; (0, 2) if the environment does not report them.
     """
 
@@ -59,7 +59,7 @@ class EpsilonGreedy:
 
         Args:
             policy: Policy, or None for random actions.
-            epsilon: Probability of a random action, 0 to 1; taken as 1 if there is no policy.
+            epsilon: Probability of a random action, 0 to 1; ignored if there is no policy.
             action_space: Space of the random actions.
         """
         self.policy = policy
@@ -81,7 +81,7 @@ class EpsilonGreedy:
         """Return the action for one observation, and the probability of that action.
 
         Each of A actions has the probability epsilon / A, plus 1 - epsilon if it is the policy's
-        own. It is NaN if actions are not discrete.
+        own. The probability is NaN if actions are not discrete.
         """
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
@@ -97,7 +97,7 @@ class EpsilonGreedy:
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Return the seed of an episode, which depends on nothing but the two arguments."""
+    """Return the seed of an episode, which depends only on the two arguments."""
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 
@@ -116,7 +116,7 @@ def run_episode(
         behavior: Exploration policy.
         seed: Seed of the environment and of the exploration.
         max_steps: Number of steps after which the episode is interrupted.
-        on_action: Function that is called with each action's probability before the step.
+        on_action: Function called with each action's probability before the step.
     """
     observation, info = env.reset(seed=seed)
     behavior.begin(seed)
@@ -156,10 +156,10 @@ def rollout(
         behavior: Exploration policy.
         seed: Base seed; episode k is reset with `episode_seed(seed, k)`.
         episodes: Number of episodes, or None to count steps.
-        steps: Number of steps in total; the last episode is interrupted.
+        steps: Total number of steps; the last episode may be interrupted.
         first_episode: Index k of the first episode.
-        on_action: Function that is called with each action's probability before the step.
-        on_episode: Function that is called after each episode.
+        on_action: Function called with each action's probability before the step.
+        on_episode: Function called after each episode.
 
     Raises:
         ValueError: Neither or both of `episodes` and `steps` are given.
@@ -191,15 +191,15 @@ def batch_rollout(
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Run one greedy episode from each seed, all together; the results equal `run_episode`'s.
+    """Run one greedy episode for each seed in parallel; the results equal `run_episode`'s.
 
-    Environments whose episode has ended are stepped on, and their further episodes are ignored.
+    An environment whose episode has ended is still stepped; its later episodes are ignored.
 
     Args:
-        envs: One environment for each seed, in autoreset mode `NextStep`.
-        policy: Policy that acts on batches of observations.
+        envs: Vector environment of one copy per seed, in autoreset mode `NextStep`.
+        policy: Policy for batches of observations.
         seeds: Seeds of the episodes.
-        on_episode: Function that is called after each episode, in the order of their ends.
+        on_episode: Function called after each episode, in the order in which they end.
     """
     assert envs.num_envs == len(seeds)
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP

@@ -62,14 +62,14 @@ def bootstrap_interval(
 
 
 def improvement_probability(first: Floats, second: Floats) -> float:
-    """Return the probability that an episode of one policy has a higher return than of another.
+    """Return the probability that an episode of `first` has a higher return than one of `second`.
 
     Ties count half: this is the Mann-Whitney statistic divided by the number of pairs, 0.5 for
     equal policies.
 
     Args:
-        first: (S, E) returns of the one policy.
-        second: (S', E') returns of the other policy.
+        first: (S, E) returns of the first policy.
+        second: (S', E') returns of the second policy.
     """
     return float(_improvement(first.reshape(1, -1), second.reshape(1, -1))[0])
 

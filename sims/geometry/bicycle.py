@@ -17,7 +17,7 @@ class Motion(NamedTuple):
     yaw_rad: float
     speed_m_s: float
     heading: Heading
-    """Direction of the yaw. Each step turns it with the yaw; `moving` computes it from the yaw."""
+    """Direction of the yaw; each step rotates the direction instead of recomputing it."""
 
 
 @inlined
@@ -34,7 +34,7 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step; the step may turn it by at most 90 degrees.
+    """Advance a bicycle by one explicit Euler step, which turns it by at most 90 degrees.
 
     With slip angle beta, half the wheelbase l and speed v: x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, v' = acceleration. Polack, Altche,
@@ -75,8 +75,8 @@ def steering_of(slip_sine: float) -> float:
 def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
     """Return sin(beta) of the turn that causes a lateral acceleration at a speed.
 
-    The radius of the turn is l / sin(beta), so v^2 sin(beta) / l = lateral. At low speed no turn
-    causes that much, and the result is 1.
+    The radius of the turn is l / sin(beta), so v^2 sin(beta) / l = lateral. At low speed, no
+    turn reaches that acceleration, and the result is 1.
     """
     least = 0.5 * wheelbase_m * lateral_m_s2
     return least / max(speed_m_s * speed_m_s, least)

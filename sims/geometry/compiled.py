@@ -17,16 +17,15 @@ Result = TypeVar("Result")
 def compiled(function: AnyFunction) -> AnyFunction:
     """Compile a function with numba at its first call, and cache the machine code on disk.
 
-    `fastmath` is off: sums are computed in the order in which they are written, so the same input
-    always has the same bits as its result. A division by 0 results in inf or NaN, as in NumPy,
-    because a check before each division would prevent vectorization. For a type checker, the
-    function keeps its signature.
+    `fastmath` is off, so that sums keep their written order and equal inputs produce identical
+    results. A division by 0 returns inf or NaN, as in NumPy, because a check before each division
+    would prevent vectorization. For a type checker, the function keeps its signature.
 
     The cache is `$NUMBA_CACHE_DIR` if that is set, else `__pycache__` beside the source, else, if
-    that cannot be written, the user's cache folder. Without any of them, each process compiles.
+    that cannot be written, the user's cache folder. Without a cache, each process compiles.
 
-    The cache is invalidated by an edit of the function's own file only. After an edit of a function
-    that other files call, delete the `__pycache__` folder.
+    Only an edit of the function's own file invalidates the cache. After an edit of a function that
+    other files call, delete the `__pycache__` folder.
     """
     return _compiled(function)
 
@@ -46,7 +45,7 @@ def ready(
     """Bind a compiled function to arguments that stay the same objects: arrays and constants.
 
     A normal call first inspects the type of each argument, which for a single vehicle takes as long
-    as the step itself. Here the types are inspected once. The arrays' contents may change; their
+    as the step itself. This function inspects them once. The arrays' contents may change; their
     shape and memory may not.
 
     Args:

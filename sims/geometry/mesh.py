@@ -43,7 +43,7 @@ def frustum_mesh(
 ) -> NDArray[np.float64]:
     """Return an upright square frustum without its base, (10, 3, 3) meters.
 
-    With a top side of 0 it is a pyramid, (4, 3, 3).
+    With a top side of 0, the frustum is a pyramid, (4, 3, 3).
     """
     height = _CORNERS[:, 2:] + 0.5
     level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)

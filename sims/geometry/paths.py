@@ -12,7 +12,7 @@ from mcaprl.sims.geometry.compiled import compiled, inlined
 
 
 class Path(NamedTuple):
-    """A closed polyline of N legs; places on it are given by the distance along it."""
+    """Closed polyline of N legs."""
 
     points_m: NDArray[np.float64]
     """(N + 1, 2) corners; the last one equals the first."""
@@ -26,17 +26,17 @@ class Path(NamedTuple):
 
 
 class Projection(NamedTuple):
-    """The path point nearest to a position."""
+    """Path point nearest to a position."""
 
     along_m: float
     offset_m: float
     """Distance of the position from the path, positive to the left of its direction."""
     yaw_rad: float
-    """Direction of the path there."""
+    """Direction of the path at the nearest point."""
 
 
 def closed_path(corners: ArrayLike) -> Path:
-    """Return the path through corners (N + 1, 2), meters, of which the last equals the first.
+    """Return the path through corners (N + 1, 2), meters; the last one equals the first.
 
     Raises:
         ValueError: The corners do not form a closed polyline of legs longer than 0.
@@ -57,10 +57,10 @@ def closed_path(corners: ArrayLike) -> Path:
 
 @inlined
 def wrap_angle(angle_rad: float) -> float:
-    """Return the equivalent of an angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     turns = np.floor((angle_rad + math.pi) / (2.0 * math.pi))
     wrapped = max(angle_rad - 2.0 * math.pi * turns, -math.pi)
-    # Rounding may move it just outside the other end.
+    # Rounding may push the result to pi.
     return wrapped if wrapped < math.pi else -math.pi
 
 
@@ -68,7 +68,7 @@ def wrap_angle(angle_rad: float) -> float:
 def sine(angle_rad: float) -> float:
     """Return the sine of an angle of at most 45 degrees, accurate to about one bit.
 
-    Without branches and calls, so that the compiler can vectorize it. The series is
+    Has no branches or calls, so that the compiler can vectorize loops. The series is
     x - x^3/3! + x^5/5! - ...; the first omitted term is below 6e-17 of the sine.
     """
     square = angle_rad * angle_rad
@@ -112,9 +112,9 @@ class Heading(NamedTuple):
 def heading_of(yaw_rad: float) -> Heading:
     """Return the direction of a yaw angle, accurate to about one bit.
 
-    Without branches and calls, as in `sine`. The angle is reduced to its distance from the nearest
-    quarter turn; the number of quarter turns decides which of that distance's sine and cosine is
-    the result's cosine, and their signs.
+    Has no branches or calls, as `sine`. The angle is reduced to its remainder from the nearest
+    quarter turn; the number of quarter turns selects the order and the signs of the remainder's
+    cosine and sine.
     """
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
@@ -131,9 +131,9 @@ def heading_of(yaw_rad: float) -> Heading:
 
 @inlined
 def turned(heading: Heading, angle_rad: float) -> Heading:
-    """Turn a direction to the left by an angle of at most 90 degrees, positive or negative.
+    """Rotate a direction counter-clockwise by an angle from -90 to 90 degrees.
 
-    Uses the angle addition formulas; the angle's cosine is 1 - 2 sin^2 of half of it.
+    Uses the angle addition formulas and cos(a) = 1 - 2 sin^2(a / 2).
     """
     half = sine(0.5 * angle_rad)
     cos = 1.0 - 2.0 * half * half
@@ -142,7 +142,7 @@ def turned(heading: Heading, angle_rad: float) -> Heading:
 
 
 class Spot(NamedTuple):
-    """A place on a path: the index of its leg, and the distance from the leg's start."""
+    """Position on a path: the index of its leg, and the distance from the leg's start."""
 
     leg: int
     rest_m: float
@@ -150,7 +150,7 @@ class Spot(NamedTuple):
 
 @compiled
 def spot_at(path: Path, along_m: float) -> Spot:
-    """Return the place at a distance along the path, which may be on any lap."""
+    """Return the position at a distance along the path; distances wrap around."""
     rest_m = along_m % path.length_m
     leg, beyond = 0, len(path.yaw_rad)
     while beyond - leg > 1:
@@ -164,7 +164,7 @@ def spot_at(path: Path, along_m: float) -> Spot:
 
 @compiled
 def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
-    """Return the place that is a distance of 0 or more further along the path."""
+    """Return the position `ahead_m` (at least 0) further along the path."""
     leg, rest_m = spot.leg, spot.rest_m + ahead_m
     length_m = path.along_m[leg + 1] - path.along_m[leg]
     while rest_m >= length_m:
@@ -176,29 +176,29 @@ def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
 
 @compiled
 def point_of(path: Path, spot: Spot) -> tuple[float, float]:
-    """Return the coordinates (x, y) of a place, meters."""
+    """Return the coordinates (x, y) of a position, meters."""
     start, forward = path.points_m[spot.leg], path.forward[spot.leg]
     return start[0] + spot.rest_m * forward[0], start[1] + spot.rest_m * forward[1]
 
 
 @compiled
 def leg_at(path: Path, along_m: float) -> int:
-    """Return the index of the leg at a distance along the path, which may be on any lap."""
+    """Return the index of the leg at a distance along the path; distances wrap around."""
     return spot_at(path, along_m).leg
 
 
 @compiled
 def point_at(path: Path, along_m: float) -> tuple[float, float]:
-    """Return the point (x, y), meters, at a distance along the path, which may be on any lap."""
+    """Return the point (x, y), meters, at a distance along the path; distances wrap around."""
     return point_of(path, spot_at(path, along_m))
 
 
 @compiled
 def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the nearest of the path points between two distances along the path.
+    """Return the nearest path point between two distances along the path.
 
-    Where the path meets itself, the window [from_m, to_m] selects the pass that a vehicle is on. It
-    may begin on any lap; the result's `along_m` is inside it.
+    Where the path crosses itself, the window [from_m, to_m] selects the vehicle's branch. The
+    window may begin on any lap and contains the result's `along_m`.
     """
     leg, rest_m = spot_at(path, from_m)
     leg_start_m = from_m - rest_m

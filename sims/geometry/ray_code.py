@@ -19,7 +19,7 @@ def log_code(length_m: float) -> float:
 
 
 def ray_name(left_deg: int) -> str:
-    """Return the name of a ray by its angle to the left, as `ahead`, `left_30` or `right_30`."""
+    """Return the name of a ray from its angle to the left, such as `ahead` or `left_30`."""
     if left_deg in (0, 180):
         return "behind" if left_deg else "ahead"
     return f"{'left' if left_deg > 0 else 'right'}_{abs(left_deg)}"

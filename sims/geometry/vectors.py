@@ -9,7 +9,7 @@ from mcaprl.sims.geometry.compiled import inlined
 
 
 class Vector(NamedTuple):
-    """Three coordinates; the name of a variable or field says their unit."""
+    """Three coordinates; the name of the variable or field contains their unit."""
 
     x: float
     y: float

@@ -1,7 +1,7 @@
-"""Courses of a road of highway-env: its consecutive lanes joined, in ROS axes.
+"""Courses of a highway-env road, which join consecutive lanes, in ROS axes.
 
-highway-env's y points down in its images. Here y and all angles have the opposite sign, so that z
-is up, angles are counter-clockwise, and left is positive.
+In highway-env's images, y points down. Here y and all angles have the opposite sign, so that z is
+up, angles are counter-clockwise, and left is positive.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Place(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Middle of a lane from one end of the road to the other, or around a closed road."""
+    """Center line of a lane from one end of the road to the other, or around a closed road."""
 
     points_m: Floats
-    """(N + 1, 2) points about 1 m apart; if it is closed, the last equals the first."""
+    """(N + 1, 2) points about 1 m apart; on a closed course, the last point equals the first."""
     along_m: Floats
     """(N + 1,) distance of each point from the first."""
     lengths_m: Floats
@@ -80,7 +80,7 @@ class Course(NamedTuple):
 
 
 def courses_of(network: Any) -> tuple[Course, ...]:
-    """Join the consecutive lanes of a road to courses, one for each of the parallel lanes.
+    """Join the consecutive lanes of a road; return one course per parallel lane.
 
     Args:
         network: A `highway_env.road.road.RoadNetwork` without forks.
@@ -95,7 +95,7 @@ def courses_of(network: Any) -> tuple[Course, ...]:
 def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
     """Yield start node, end node and lanes of each edge, in the direction of travel.
 
-    A closed road begins at its first node, another one at the node without a predecessor.
+    Begin at the node without a predecessor, or on a closed road at its first node.
     """
     reached = {end for ends in graph.values() for end in ends}
     first = next((node for node in graph if node not in reached), next(iter(graph)))
@@ -109,13 +109,13 @@ def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, l
 def _course(lanes: list[Any], is_closed: bool) -> Course:
     points: list[Floats] = []
     for lane in lanes:
-        # A lane may overlap the end of the previous one; sampling continues where that one ended.
+        # A lane may overlap the previous lane; sampling continues at the end of that lane.
         first_m = lane.local_coordinates(points[-1] * FLIP)[0] if points else 0.0
         count = int(np.ceil((lane.length - first_m) / SAMPLE_M))
         sampled = np.linspace(max(0.0, first_m), lane.length, count + 1)
         points += [lane.position(along_m, 0.0) * FLIP for along_m in sampled[bool(points) :]]
     if is_closed:
-        # The end of the last lane may be beyond the start of the first one.
+        # The last lane may end beyond the start of the first lane.
         while lanes[0].local_coordinates(points[-1] * FLIP)[0] > -SAMPLE_M / 2:
             points.pop()
         points.append(points[0])

@@ -1,4 +1,4 @@
-"""Gymnasium environment of the highway-lane sim, a wrapper around roads of highway-env."""
+"""Gymnasium environment of the highway-lane sim, a wrapper around highway-env."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ OBSERVATION_NAMES = (
 )
 OBSERVATION_LIMIT = 4.0
 TRAIL_LENGTH = 40
-# highway-env's own observation, which is not used, is made empty to save time.
+# The observation of highway-env is not used; an empty one saves time.
 _NO_OBSERVATION = {"type": "AttributesObservation", "attributes": []}
 
 
@@ -69,9 +69,9 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     environment for autonomous driving decision-making",
     https://github.com/Farama-Foundation/HighwayEnv, 2018.
 
-    A decision lasts 0.1 s of simulated time, on racetracks 0.2 s. The same seed and actions result
-    in the same bits. Axes are right-handed with z up, x and y in meters; y and angles have the
-    opposite sign of highway-env's, so left is positive.
+    A decision lasts 0.1 s of simulated time, or 0.2 s on racetracks. Results are bit-identical for
+    the same seed and actions. Axes are right-handed with z up, x and y in meters; y and angles have
+    the opposite sign of highway-env's, so left is positive.
 
     ## Action Space
 
@@ -105,20 +105,20 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     ## Rewards
 
     Those of highway-env. Lane keeping: 1 - (d / 10 m)^2 at distance d from the middle of the lane
-    to be followed. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for full steering, scaled to 0 to 1; 0
+    to follow. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for full steering, scaled to 0 to 1; 0
     off the road.
 
     ## Starting State
 
-    `start="line"`: the start of highway-env, which is constant in lane keeping.
-    `start="anywhere"`: a random place on the road, except the last 60 m of an open road and 20 m
+    `start="line"`: the starting state of highway-env, which is constant in lane keeping.
+    `start="anywhere"`: a random position on the road, except the last 60 m of an open road and 20 m
     around another car, with an offset of up to 1.5 m and 0.2 rad.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
     number, starts at that pose.
 
     ## Episode End
 
-    Terminated with `info["reason"]` = `off_lane` (the car's middle is on no lane), `collision`, or
+    Terminated with `info["reason"]` = `off_lane` (the car's center is on no lane), `collision`, or
     `finished` (5 m before the end of an open road). Truncated after 700 steps, and on racetracks
     with `time_limit` after highway-env's limit of 300 s.
 
@@ -208,14 +208,14 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         """Start an episode; see "Starting State".
 
         Raises:
-            UsageError: `options` has an unknown key, or a pose that is invalid, occupied or not on
-                a lane.
+            UsageError: `options` has an unknown key, or the pose is invalid, occupied or not on a
+                lane.
         """
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         self._inner.reset(seed=seed)
-        # Otherwise this list of all states grows without limit.
+        # This list of all states would otherwise grow without limit.
         getattr(self._inner, "trajectory", []).clear()
         self._locate()
         car, others = self._car, self.others
@@ -251,7 +251,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         return self._observe(), self._reward, bool(reason), bool(is_over and not reason), info
 
     def _reason(self) -> str:
-        """Return the reason of a termination; empty if the episode goes on."""
+        """Return the reason of a termination; empty if the episode continues."""
         if self._inner.vehicle.crashed:
             return "collision"
         if abs(self._place.offset_m) > self.course.half_width_m:
@@ -260,7 +260,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         return "finished" if not self.course.is_closed and left_m < LOOKAHEADS_M[0] else ""
 
     def _locate(self) -> None:
-        """Update the car and its place; the nearest course is its lane."""
+        """Update the car, its nearest course (the lane), and its position on the course."""
         self._car = _car_of(self._inner.vehicle)
         places = [course.nearest(self._car.x_m, self._car.y_m) for course in self.courses]
         self._lane = int(np.argmin([abs(place.offset_m) for place in places]))
@@ -282,7 +282,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._locate()
 
     def _observe(self) -> NDArray[np.float32]:
-        """Return the observation; append the position to the trail, and show it in mode `human`."""
+        """Return the observation; append to the trail, and render in mode `human`."""
         self._trail_m.append((self._car.x_m, self._car.y_m))
         if self.render_mode == "human":
             self.render()

@@ -12,13 +12,13 @@ from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 PURSUIT_M = 10.0
 ROOM_M = 30.0
-"""Free distance ahead below which the pilot changes to the lane with the most."""
+"""Free distance ahead below which the pilot changes to the lane with the most free distance."""
 BESIDE_M = 9.0
-"""Distance up to which a following car also blocks its lane."""
+"""Distance below which a following car also blocks its lane."""
 
 
 class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
-    """Driver of one highway-lane sim's car."""
+    """Scripted driver of the highway-lane sim's car."""
 
     def choose(self) -> int:
         """Choose the action for the current state of the car.
@@ -36,7 +36,7 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
         return int(np.argmin(np.abs(STEERING_RAD - wanted_rad)))
 
     def _free_course(self) -> Course:
-        """Return the current lane while it has enough free space, else the lane with the most."""
+        """Return the current lane if it has enough free space, else the lane with the most."""
         own = self.sim.course
         if self._room_m(own) >= ROOM_M:
             return own

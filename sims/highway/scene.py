@@ -1,6 +1,6 @@
-"""Scene of the highway-lane sim: asphalt, lines, cars, and what the agent observes.
+"""Scene of the highway-lane sim: asphalt, lines, cars, and the agent's observations.
 
-Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's middle, x
+Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's center, x
 forward, y left).
 """
 
@@ -34,13 +34,13 @@ MARGIN_M = 60.0
 """Width of the grass around the road."""
 CAR_HEIGHT_M = 1.4
 DASH_SAMPLES, DASH_PERIOD = 3, 6
-"""Segments of about 1 m that are drawn of a dashed line, and in one period of it."""
+"""Numbers of segments of about 1 m in a dash, and in a period of a dashed line."""
 STRIPED, CONTINUOUS = 1, 2
 """Values of highway-env's `LineType`."""
 
 
 class Car(NamedTuple):
-    """State and size of a car; the position is that of its middle."""
+    """State and size of a car; the position is that of its center."""
 
     x_m: float
     y_m: float
@@ -50,7 +50,7 @@ class Car(NamedTuple):
     width_m: float
 
     def to_body_frame(self, point_m: tuple[float, float]) -> tuple[float, float]:
-        """Transform a point of the map into this car's frame: (forward, left), meters."""
+        """Transform a map point into this car's frame: (forward, left), meters."""
         dx_m, dy_m = point_m[0] - self.x_m, point_m[1] - self.y_m
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin
@@ -74,7 +74,7 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
 
 def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
-    """Yield each lane with its left and right edge, (N, 2) points about 1 m apart in the map."""
+    """Yield each lane, and its left and right edges: (N, 2) map points about 1 m apart."""
     for lane in network.lanes_list():
         along_m = np.linspace(0.0, lane.length, 2 + int(lane.length))
         half_m = [lane.width_at(each) / 2 for each in along_m]

@@ -1,4 +1,4 @@
-"""Starts of the highway-lane sim's episodes that differ from highway-env's."""
+"""Starting states of the highway-lane sim that differ from those of highway-env."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LAST_START_M = 60.0
 def drawn_pose(
     random: np.random.Generator, courses: Sequence[Course], others: Sequence[Car], speed_m_s: float
 ) -> Pose:
-    """Draw a start away from other cars, with an offset of up to 1.5 m and 0.2 rad from a lane."""
+    """Draw a starting pose away from other cars, up to 1.5 m and 0.2 rad off a lane."""
     course = courses[int(random.integers(len(courses)))]
     last_m = course.length_m - (0.0 if course.is_closed else LAST_START_M)
     while True:
@@ -40,10 +40,10 @@ def drawn_pose(
 def pose_from_options(
     options: dict[str, Any], courses: Sequence[Course], others: Sequence[Car], own: Car
 ) -> Pose:
-    """Read a start from the options of `reset`; the speed defaults to the car's current one.
+    """Return the pose in the options of `reset`; the speed defaults to the car's current speed.
 
     Raises:
-        UsageError: There is another option, or the pose is malformed, occupied, or not on a lane.
+        UsageError: An option is unknown, or the pose is malformed, occupied, or not on a lane.
     """
     pose = pose_from(options, 0.0, FASTEST_M_S)
     if len(options["pose"]) < len(Pose._fields):

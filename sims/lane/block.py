@@ -2,8 +2,8 @@
 
 Cars are stored in blocks, as structures of arrays. The loops over a block have no branches and no
 calls, and all offsets are constants, so that the compiler can prove that cars do not overlap in
-memory and vectorize the loops. The results equal those of single cars bit for bit, in a third of
-the time.
+memory and vectorize the loops. The results are bit-identical to those of single cars, and take a
+third of the time.
 """
 
 from __future__ import annotations
@@ -73,10 +73,10 @@ def step_only_car(
     observations: NDArray[np.float32],
     action: int,
 ) -> tuple[float, int, float, float, float, float]:
-    """Advance a single car as `step_cars` does, and return the contents of its `info` as well.
+    """Advance a single car like `step_cars`; also return the contents of its `info`.
 
     Args:
-        cars: (1, 10) row of `Car` and of the place where the car started.
+        cars: (1, 10) row: the `Car`, and its initial distance along the path.
         rewards: (1,) output.
         ends: (1,) output.
         observations: (1, 12) output.
@@ -100,7 +100,7 @@ def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
     """Compute the contents of the `info` of N cars.
 
     Args:
-        cars: (N, 10) rows of `Car` and of the place where the car started.
+        cars: (N, 10) rows: the `Car`, and its initial distance along the path.
         info: (4, N) output: offsets, heading errors, speeds and progress.
     """
     for i in range(len(cars)):
@@ -117,7 +117,7 @@ def _step_blocks(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> int:
-    """Advance as many cars as fill whole blocks, and return their number."""
+    """Advance the cars that fill whole blocks; return their number."""
     block = np.empty(_BLOCK_NUMBERS * LANES)
     count = len(cars) // LANES * LANES
     for first in range(0, count, LANES):

@@ -1,4 +1,4 @@
-"""Depth camera of the lane sim's car; it sees the ground, the rails and the buildings."""
+"""Depth camera of the lane sim's car; renders the ground, the rails and the buildings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mcaprl.sims.lane.rules import Car
 
 LENS = lens(256, 144, math.pi / 2)
 IMAGE_SHAPE = (84, 84)
-"""Size of the averaged image; one of its pixels covers 3.05 x 1.71 rendered pixels."""
+"""Size of the averaged image; each pixel covers 3.05 x 1.71 rendered pixels."""
 
 
 def _solid(box: Box) -> NDArray[np.float64]:

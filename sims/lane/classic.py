@@ -1,7 +1,7 @@
-"""Published rules of the lane sim with their faults, which `LaneKeepingEnv` lists.
+"""Published rules of the lane sim, including the faults that `LaneKeepingEnv` lists.
 
-The published text and code differ: by the text an episode ends if the car is too slow, by the code
-if it hits something.
+The published text and code differ: in the text, an episode ends if the car is too slow; in the
+code, if the car hits an obstacle.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_
     """Return the outcome of a step: DRIVING, OFF_LANE, LOW_REWARD, SLOW or COLLISION.
 
     Args:
-        distance_m: Distance to the nearest infinite line.
+        distance_m: Distance to the nearest infinite line through a leg.
         speed_m_s: Speed after the step.
         action: Action of the step.
-        hit: Whether the car's body touched something.
+        hit: Whether the car's body touched an obstacle.
         by_code: Whether to follow the published code instead of the text.
     """
     if distance_m > CLASSIC_LANE_M:
@@ -81,7 +81,7 @@ def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_
 
 @compiled
 def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
-    """Drive for a second; return the car, and whether its body touched something meanwhile.
+    """Drive for a second; return the car, and whether its body touched an obstacle.
 
     Obstacles do not stop the car.
     """

@@ -2,8 +2,8 @@
 
 The path consists of two squares of about 130 m that share a leg, 1,026 m in total: the first square
 is driven clockwise, the second counter-clockwise. Coordinates are right-handed with z up; y has the
-opposite sign of the published course's, so that right turns remain right turns. Nothing is random:
-the course is the same on every machine.
+opposite sign of y in the published course, so that right turns remain right turns. The course is
+deterministic and identical on every machine.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ NEXT_TURN: NDArray[np.float64] = np.sign(np.sin(np.roll(COURSE.yaw_rad, -1) - CO
 
 LANE_HALF_WIDTH_M = 3.5
 RAIL_OFFSET_M = 4.0
-"""Distance of the rails' inner faces from the center line."""
+"""Distance from the center line to the inner faces of the rails."""
 RAIL_HEIGHT_M = 0.7
 RAIL_THICKNESS_M = 0.12
 GROUND_HALF_SIDE_M = 1000.0
-"""Half of the ground's side, so that it extends to the last row of pixels below the horizon."""
+"""Half of the ground's side; the ground extends to the last row of pixels below the horizon."""
 
 CAMERA_FORWARD_M = 0.4
 """Distance of the camera from the middle of the wheelbase, the origin of the car's frame."""
@@ -50,7 +50,7 @@ HOUSE_GAP_M = 1.0
 
 
 class Box(NamedTuple):
-    """Box on the ground with edges along x, y and z, meters; x and y are those of its middle."""
+    """Axis-aligned box on the ground, meters; x and y are the coordinates of its center."""
 
     x_m: float
     y_m: float
@@ -60,7 +60,7 @@ class Box(NamedTuple):
 
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the two ends (2,) of each leg, meters, without the repetition of the shared leg."""
+    """Return the two ends (2,) of each leg, meters; the shared leg occurs once."""
     legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 
@@ -72,14 +72,14 @@ def street_bounds(half_width_m: float) -> NDArray[np.float64]:
 
 
 class Pavement(NamedTuple):
-    """Union of the streets, divided into cells by the lines through all rectangles' edges."""
+    """Union of the street rectangles, divided into cells along the lines through their edges."""
 
     x_m: NDArray[np.float64]
     """(M + 1,) cell borders."""
     y_m: NDArray[np.float64]
     """(N + 1,) cell borders."""
     paved: NDArray[np.bool_]
-    """(M, N) whether each cell is on a street."""
+    """(M, N) mask of the cells on a street."""
 
 
 def pavement(half_width_m: float) -> Pavement:
@@ -126,8 +126,8 @@ def _house(
     """Return house number `index`.
 
     Args:
-        index: Number that decides its size and its distance from the street.
-        at: (2,) point on the center line at which its front begins, meters.
+        index: House number, which determines the size and the distance from the street.
+        at: (2,) point on the center line where the front of the house begins, meters.
         forward: (2,) unit vector along the street.
         left: (2,) unit vector from the street to the house.
     """
@@ -140,7 +140,7 @@ def _house(
 
 
 def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, int]]:
-    """Yield each side of each street: start (2,), direction (2,), length in meters, and side."""
+    """Yield start (2,), direction (2,), length in meters and side of each side of each street."""
     for start, end in streets():
         length_m = float(np.hypot(*(end - start)))
         for side in (1, -1):
@@ -149,7 +149,7 @@ def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], 
 
 @functools.cache
 def buildings() -> tuple[Box, ...]:
-    """Return the houses on both sides of each street, without overlaps."""
+    """Return non-overlapping houses on both sides of each street."""
     taken = street_bounds(RAIL_OFFSET_M + 2.0)
     boxes: list[Box] = []
     index = 0

@@ -29,7 +29,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     The agent drives a car along a course of streets with sharp corners: two squares that share a
     leg, 1,026 m in total, the first driven clockwise and the second counter-clockwise, between
     guard rails and houses. The car is a kinematic bicycle with a wheelbase of 2.7 m. One decision
-    lasts 0.25 s of simulated time. The same seed and actions result in the same bits.
+    lasts 0.25 s of simulated time. Results are bit-identical for the same seed and actions.
 
     Axes are right-handed with z up, x and y in meters. Angles are counter-clockwise, so left is
     positive.
@@ -64,12 +64,12 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     | 8, 9 | path point 20 m ahead | 20 m | 4 |
     | 10, 11 | path point 40 m ahead | 40 m | 4 |
 
-    `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth in the log code of
+    `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth, encoded by
     `mcaprl.sims.drawing.depth.encode_depth`; 255 where there is no surface.
 
     `observation="dashboard"`: a `Dict` of `depth`, the same image, and `motion`, 3 float32: rows
     2 and 3 of the table, and the direction of the next turn, 1 left or -1 right. A single image
-    contains neither the speed nor the direction in which to turn at the end of a street.
+    shows neither the speed nor the direction of the next turn.
 
     `observation="rays"`: `Box` of 20 float32.
 
@@ -80,20 +80,20 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     | 17 | last steering command, left positive | 50 % | 1 |
     | 18, 19 | path point 20 m ahead: forward, left of the car | 20 m | 4 |
 
-    The rays start at the car's middle, in the directions 0, 10, -10, 20, -20, 30, -30, 45, -45, 60,
+    The rays start at the car's center, in the directions 0, 10, -10, 20, -20, 30, -30, 45, -45, 60,
     -60, 90, -90, 135, -135 and 180 degrees; left is positive. A distance of d meters is observed as
-    ln(1 + d / 1 m) / ln(101), and as 1 beyond 100 m. At a crossing, the path point shows which
-    street to take.
+    ln(1 + d / 1 m) / ln(101), and as 1 beyond 100 m. At a crossing, the path point
+    indicates the street to take.
 
     ## Rewards
 
-    ds / 7.5 m (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from it;
-    -5 for leaving the lane or stalling.
+    ds / 7.5 m (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from the
+    path; -5 for leaving the lane or stalling.
 
     ## Starting State
 
-    `start="anywhere"`: a random place on the path, at least 2 m after and 8 m before a corner, with
-    an offset of up to 1.5 m and 0.2 rad, at 0 to 10 m/s.
+    `start="anywhere"`: a random position on the path, at least 2 m after and 8 m before a corner,
+    with an offset of up to 1.5 m and 0.2 rad, at 0 to 10 m/s.
     `start="line"`: 2 m from the start of the course, with an offset of up to 0.3 m and 0.05 rad, at
     rest.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
@@ -109,35 +109,35 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     ## Classic Rules
 
-    `rules="classic"` and `"classic-code"` are the rules as they were published. A decision lasts a
-    second. The reward is (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5) at v m/s, with the
-    distance d to the nearest of the *infinite* lines through the legs, and -3 beyond 3.5 m. An
-    episode terminates if the reward is below -1 (`off_lane` beyond 3.5 m, else `low_reward`); and,
-    by the published text (`"classic"`), at 5 m/s or less without braking (`slow`), or, by the
-    published code (`"classic-code"`), if the car touches a rail or a house during action 1,
-    straight (`collision`). It starts on the line, after one second straight ahead. `depth` has the
-    code of `encode_nearness`. Known faults:
+    `rules="classic"` and `"classic-code"` are the published rules. A decision lasts one second. The
+    reward is (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5) at v m/s, with the distance d to the
+    nearest of the *infinite* lines through the legs, and -3 beyond 3.5 m. An episode terminates
+    if the reward is below -1 (`off_lane` beyond 3.5 m, else `low_reward`). In the published text
+    (`"classic"`), it also terminates at 5 m/s or less without braking (`slow`); in the published
+    code (`"classic-code"`), if the car touches a rail or a house during action 1, straight
+    (`collision`). It starts on the start line, after one second straight ahead. `depth` is encoded
+    by `encode_nearness`. Known faults:
 
-    - Speed is scaled by 300 m/s, so that its term is always near -0.5: a fast car in the middle of
-      the lane has a reward near 0, and one 0.3 m beside it loses more than half a point per second.
-      The return of a whole lap is far below that of leaving the road at once, which is -3.
+    - Speed is scaled by 300 m/s, so that its term is always near -0.5: the reward is near 0 for a
+      fast car in the middle of the lane, and below -0.5 per second at an offset of 0.3 m. The
+      return of a whole lap is far below -3, the return of leaving the road at once.
     - A reward below -1 defines a second lane: 1.1 m to each side at rest, wider with increasing
-      speed, and without a limit from 10 m/s.
+      speed, and unlimited from 10 m/s.
     - The lines are infinite: leaving the course along the extension of a leg has the same reward as
       following it.
     - Standing still with the brake never ends an episode, and costs less than most driving.
-    - By the code, a collision ends an episode only during the action straight.
-    - A second is too long for corrections: at 15 m/s, the smallest steering angle leaves the lane.
-    - The image's code uses half of its values for distances of 1 to 2 m.
+    - In the published code, a collision ends an episode only during the action straight.
+    - A second is too long for corrections: at 15 m/s, any steering action leaves the lane.
+    - The image encoding uses half of its values for distances of 1 to 2 m.
 
-    The car and the town are our own, and images are averaged where the published ones are
-    interpolated. Rails and houses do not stop a car.
+    The car and the town differ from the published ones, and images are downsampled by averaging
+    instead of interpolation. Rails and houses do not stop a car.
 
     ## Arguments
 
     - `rules`: `"default"`, `"classic"` or `"classic-code"`.
     - `observation`: `"state"`, `"depth"`, `"dashboard"` or `"rays"`.
-    - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, in the classic rules `"line"`.
+    - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -220,6 +220,6 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
 
 class BatchedLaneKeepingEnv(BatchedEnv):
-    """Many cars that are stepped together; arguments as in `LaneKeepingEnv`."""
+    """Vectorized environment of N cars; arguments as in `LaneKeepingEnv`."""
 
     fleet_type = LaneFleet

@@ -41,7 +41,7 @@ STARTS = ("anywhere", "line")
 OBSERVATIONS = ("state", "depth", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
-"""Index of the first number in a car's row that `info` uses."""
+"""Index, in a car's row, of the first number that `info` uses."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
 
@@ -111,7 +111,7 @@ class LaneFleet(Fleet):
         self._depth_m.pop(i, None)
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
-        """Start an episode of some cars."""
+        """Start episodes of the chosen cars."""
         draws, kind = self._draws, (self._on_line, self._classic)
         draws.draw_ahead(chosen)
         chances = (draws.numbers, draws.used, *kind)
@@ -133,13 +133,13 @@ class LaneFleet(Fleet):
             self._depth_m.clear()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car; where possible, one call returns reward, end and `info`."""
+        """Advance the only car; if possible, in one compiled call for reward, end and `info`."""
         if not self._has_fast_step:
             return super().step_one(action)
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
         if self._depth_m:
             self._depth_m.clear()
-        # As in `_named`, without the cost of a call.
+        # Inlined copy of `_named`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -157,7 +157,7 @@ class LaneFleet(Fleet):
         kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
         return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
-    # The following functions serve a fleet of one car.
+    # Functions for a fleet of one car.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
@@ -170,7 +170,7 @@ class LaneFleet(Fleet):
         return copy
 
     def observation(self, i: int) -> Any:
-        """Return the numbers or the image that car i observes."""
+        """Return the observation of car i."""
         if not self._has_images:
             return self._seen[i].copy()
         depth = self._encode(self.depth_image_m(i))[:, :, np.newaxis]

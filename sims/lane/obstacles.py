@@ -1,4 +1,4 @@
-"""Obstacles of the lane sim, rails and houses: contact with the car, and distances along rays."""
+"""Rails and houses of the lane sim: collision test with the car, and distances along rays."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mcaprl.sims.lane.rules import Car
 
 BODY_LENGTH_M, BODY_WIDTH_M = 4.3, 1.75
 BODY_FORWARD_M = 0.05
-"""Distance of the body's middle from the middle of the wheelbase."""
+"""Distance of the body's center ahead of the middle of the wheelbase."""
 
 BOXES_M: NDArray[np.float64] = np.array(
     [(box.x_m, box.y_m, box.length_m / 2, box.width_m / 2) for box in (*rails(), *buildings())]
 )
-"""(K, 4) x and y of the middle of each obstacle, and half of its edges along x and y."""
+"""(K, 4) x and y of the center of each obstacle, and half of its size along x and y."""
 _HUGE = 1e12
 """Finite replacement for 1 / 0."""
 
@@ -28,8 +28,8 @@ _HUGE = 1e12
 def touches(car: Car) -> bool:
     """Return whether the car's body touches a rail or a house.
 
-    Separating axis theorem: two rectangles are disjoint if and only if their projections on the
-    direction of an edge of one of them are.
+    Separating axis theorem: two rectangles are disjoint if and only if an edge of either rectangle
+    has a direction on which their projections are disjoint.
     """
     cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
@@ -68,5 +68,5 @@ def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
 
 @compiled
 def _per_meter(share: float) -> float:
-    """Return the length of a ray per meter along an axis, with the sign of its direction."""
+    """Return the signed ray length per meter along an axis, from the direction's component."""
     return 1.0 / share if abs(share) * _HUGE > 1.0 else math.copysign(_HUGE, share)

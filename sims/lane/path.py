@@ -1,8 +1,7 @@
-"""Branch-free geometry of the lane sim's course, which the compiler can vectorize over cars.
+"""Branch-free geometry of the lane sim's course that the compiler can vectorize over cars.
 
-`mcaprl.sims.geometry.paths` computes the same on any path, with searches and loops of variable
-length. This module relies on properties of the course: there are eight legs, each longer than the
-distance that a car looks ahead.
+`mcaprl.sims.geometry.paths` supports any path, with searches and loops of variable length. This
+module assumes the lane sim's course: eight legs, each longer than the lookahead distance.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from mcaprl.sims.geometry.paths import Projection
 from mcaprl.sims.lane.course import COURSE
 
 LONGEST_LOOK_M: Final = float(np.diff(COURSE.along_m).min())
-"""Length of the shortest leg; a shorter stretch of the path contains at most one corner."""
+"""Length of the shortest leg; a shorter part of the path contains at most one corner."""
 _LENGTH_M: Final = COURSE.length_m
 _LAST_LEG: Final = 7.0
 assert len(COURSE.yaw_rad) == _LAST_LEG + 1
@@ -32,15 +31,15 @@ _YAW_RAD: Final[Eight] = tuple(COURSE.yaw_rad.tolist())
 
 
 class CourseSpot(NamedTuple):
-    """A place on the course: a leg, and the distance from the leg's start."""
+    """Position on the course: a leg, and the distance from the start of that leg."""
 
     leg: float
-    """Index of the leg; as a float, it can be compared without a conversion."""
+    """Index of the leg; a float, so that comparisons need no conversion."""
     rest_m: float
 
 
 class Leg(NamedTuple):
-    """Straight leg of the course: its start, its direction as a unit vector, and its length."""
+    """Straight leg of the course: start, direction as a unit vector, and length."""
 
     x_m: float
     y_m: float
@@ -51,7 +50,7 @@ class Leg(NamedTuple):
 
 @inlined
 def course_spot_at(along_m: float) -> CourseSpot:
-    """Return the place at a distance along the course, as `paths.spot_at` does."""
+    """Return the position at a distance along the course; equivalent to `paths.spot_at`."""
     rest_m = along_m - _LENGTH_M * np.floor(along_m / _LENGTH_M)
     leg = 1.0 if rest_m >= _ALONG_M[1] else 0.0
     leg = 2.0 if rest_m >= _ALONG_M[2] else leg
@@ -65,13 +64,13 @@ def course_spot_at(along_m: float) -> CourseSpot:
 
 @inlined
 def course_leg(leg: float) -> Leg:
-    """Return the leg with an index."""
+    """Return the leg with this index."""
     return Leg(_of(leg, _X_M), _of(leg, _Y_M), _of(leg, _COS), _of(leg, _SIN), _of(leg, _LEG_M))
 
 
 @inlined
 def course_next(leg: float) -> float:
-    """Return the index of the leg after another."""
+    """Return the index of the next leg; leg 0 follows the last leg."""
     return leg + 1.0 if leg < _LAST_LEG else 0.0
 
 
@@ -79,7 +78,7 @@ def course_next(leg: float) -> float:
 def course_point_ahead(
     leg: Leg, following: Leg, rest_m: float, ahead_m: float
 ) -> tuple[float, float]:
-    """Return the point (x, y), meters, less than `LONGEST_LOOK_M` ahead of a place on a leg."""
+    """Return the point (x, y), meters, `ahead_m` < `LONGEST_LOOK_M` after a position on a leg."""
     on_leg_m = rest_m + ahead_m
     is_beyond = on_leg_m >= leg.length_m
     on_leg_m = on_leg_m - leg.length_m if is_beyond else on_leg_m
@@ -90,9 +89,9 @@ def course_point_ahead(
 
 @inlined
 def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the nearest of the course's points between two distances along it.
+    """Return the nearest point of the course between two distances along the course.
 
-    As in `paths.project`; the distances must differ by less than `LONGEST_LOOK_M`.
+    Equivalent to `paths.project`; the distances must differ by less than `LONGEST_LOOK_M`.
     """
     here = course_spot_at(from_m)
     leg, after = course_leg(here.leg), course_next(here.leg)
@@ -113,10 +112,10 @@ def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projec
 def _on_leg(
     leg: Leg, x_m: float, y_m: float, first_m: float, last_m: float
 ) -> tuple[float, float, float]:
-    """Return the nearest point of a part of a leg.
+    """Return the point nearest to (x_m, y_m) on a part of a leg.
 
     Returns:
-        Distance along the leg, squared distance from the point, and signed distance to the left.
+        Distance along the leg, squared distance from (x_m, y_m), and its signed offset to the left.
     """
     dx, dy = x_m - leg.x_m, y_m - leg.y_m
     along_m = min(max(dx * leg.cos + dy * leg.sin, first_m), last_m)
@@ -126,7 +125,7 @@ def _on_leg(
 
 @inlined
 def _of(leg: float, numbers: Eight) -> float:
-    """Select a leg's number; an array lookup could not be vectorized over cars."""
+    """Return `numbers[leg]`; the compiler cannot vectorize an array lookup over cars."""
     number = numbers[1] if leg >= 1.0 else numbers[0]
     number = numbers[2] if leg >= 2.0 else number
     number = numbers[3] if leg >= 3.0 else number

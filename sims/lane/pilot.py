@@ -26,18 +26,18 @@ from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 PURSUIT_M = 8.0
 PURSUIT_S = 0.4
-"""The pursued point is 8 m plus 0.4 s at the current speed ahead on the path."""
+"""Pursuit distance along the path: 8 m plus 0.4 s times the speed."""
 CORNER_SPEED_M_S = 7.0
 CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
-"""The car brakes with at most 1.5 m/s^2 to have the corner speed 2 m before a corner."""
+"""The car brakes with at most 1.5 m/s^2 and has the corner speed 2 m before a corner."""
 HORIZON = 12
 """Number of decisions (3 s by default) that a plan must survive."""
 
 
 @compiled
 def pursue(car: Car) -> int:
-    """Choose an action by pure pursuit, or brake for the next corner.
+    """Choose an action by pure pursuit; brake for the next corner if necessary.
 
     The circle that is tangent to the car's heading and passes through a point at distance d, l to
     the left, has the radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path tracking
@@ -65,7 +65,7 @@ def pursue(car: Car) -> int:
 
 @compiled
 def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
-    """Return the value of pursuit: the number of survived decisions, plus 0.1 of the reward."""
+    """Return the number of decisions that pursuit survives, plus 0.1 times the total reward."""
     total = 0.0
     for survived in range(HORIZON):
         after = drive(car, pursue(car), substeps)
@@ -78,7 +78,7 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose pursuit if it survives, else the first action of the best pair before pursuit.
+    """Choose the pursuit action if pursuit survives; else search two actions before pursuit.
 
     Args:
         car: State of the car.
@@ -100,7 +100,7 @@ def choose(car: Car, substeps: int = SUBSTEPS) -> int:
 
 
 class LanePilot(ScriptedPilot[LaneKeepingEnv]):
-    """Driver of one lane sim's car."""
+    """Scripted driver of the lane sim's car."""
 
     def choose(self) -> int:
         """Choose the action for the current state of the car."""

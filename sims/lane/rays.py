@@ -1,4 +1,4 @@
-"""Ray observation of the lane sim: distances to obstacles, and a point of the path ahead."""
+"""Ray observation of the lane sim: distances to obstacles, and a path point ahead."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from mcaprl.sims.lane.obstacles import ray_length
 from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
 
 RAYS_DEG = (0, 10, -10, 20, -20, 30, -30, 45, -45, 60, -60, 90, -90, 135, -135, 180)
-"""Directions of the rays from the car's middle; left is positive."""
+"""Directions of the rays from the car's center; left is positive."""
 RAYS_RAD = tuple(math.radians(angle) for angle in RAYS_DEG)
 RAYS = len(RAYS_DEG)
 WAY_M = 20.0
-"""Distance of the observed path point, which shows the street to take at a crossing."""
+"""Distance of the observed path point, which indicates the street to take at a crossing."""
 WAY_LIMIT = 4.0
 RAY_OBSERVATION_NAMES = (
     *(ray_name(angle) for angle in RAYS_DEG),
@@ -47,13 +47,13 @@ def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
 
 @compiled
 def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
-    """Write the observations (N, 20) of N cars, (N, 10) rows that begin with `Car`."""
+    """Write the observations (N, 20) of N cars; the rows (N, 10) begin with a `Car`."""
     for i in range(len(cars)):
         observe_rays(car_at(cars[i]), observations[i])
 
 
 def ray_lines(car: Car) -> NDArray[np.float64]:
-    """Return the rays as lines (16, 2, 2) from the car's middle to their ends, meters."""
+    """Return the rays as segments (16, 2, 2) from the car's center to their ends, meters."""
     lines = np.empty((RAYS, 2, 2))
     lines[:, 0] = car.x_m, car.y_m
     for line, turn_rad in zip(lines, RAYS_RAD, strict=True):

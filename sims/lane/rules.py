@@ -1,4 +1,4 @@
-"""Equations of the lane sim's default rules: motion, rewards, ends and observations of a car."""
+"""Default rules of the lane sim: motion, rewards, episode ends and observations of a car."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mcaprl.sims.lane.path import (
 
 ACTION_MEANINGS = ("brake", "straight", "right", "left", "slightly right", "slightly left")
 STEERING = (0.0, 0.0, -0.5, 0.5, -0.25, 0.25)
-"""Shares of the maximum steering angle, left positive; action 0 brakes and keeps the last one."""
+"""Fractions of the maximum steering angle, left positive; action 0 keeps the last command."""
 BRAKE = 0
 
 DECISION_S = 0.25
@@ -43,12 +43,12 @@ MAX_SPEED_M_S = 30.0
 MAX_STEERING_RAD = math.radians(40.0)
 MAX_LATERAL_M_S2 = 9.0
 STEERING_CURVE_M_S = (20 / 3.6, 60 / 3.6, 120 / 3.6)
-"""Knots of the maximum steering angle as a piecewise linear function of speed, and its shares."""
 STEERING_CURVE = (0.9, 0.8, 0.7)
+"""Speeds and values of the knots of the piecewise linear maximum steering, a fraction of 40 deg."""
 _FALL_1 = (1.0 - STEERING_CURVE[0]) / STEERING_CURVE_M_S[0]
 _FALL_2 = (STEERING_CURVE[0] - STEERING_CURVE[1]) / (STEERING_CURVE_M_S[1] - STEERING_CURVE_M_S[0])
 _FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STEERING_CURVE_M_S[1])
-"""Decrease of the share per m/s before each knot."""
+"""Decrease of that fraction per m/s before each knot."""
 
 BACK_M = 4.0
 AHEAD_M = 8.0
@@ -59,7 +59,7 @@ STALL_TIME_S = 3.0
 FAILURE_REWARD = -5.0
 DRIVING, OFF_LANE, STALL, LOW_REWARD, SLOW, COLLISION = range(6)
 REASONS = ("", "off_lane", "stall", "low_reward", "slow", "collision")
-"""Reasons by end; the last three occur in the classic rules only."""
+"""`info["reason"]` of each end; the last three occur in the classic rules only."""
 
 LOOKAHEADS_M = (5.0, 10.0, 20.0, 40.0)
 OBSERVATION_NAMES = (
@@ -75,7 +75,7 @@ _LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
 
 class Car(NamedTuple):
-    """State of one car on the course, stored as a row of a (cars, 9) array."""
+    """State of one car on the course; a row of a (cars, 9) array."""
 
     x_m: float
     y_m: float
@@ -83,7 +83,7 @@ class Car(NamedTuple):
     """Yaw counter-clockwise from x, in [-pi, pi)."""
     speed_m_s: float
     steering: float
-    """Last steering command, a share of the maximum angle, left positive."""
+    """Last steering command as a fraction of the maximum angle, left positive."""
     along_m: float
     """Distance of the nearest path point along the path, counted over all laps."""
     offset_m: float
@@ -134,7 +134,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Return the car with a motion, its place on the path searched around `near_m`."""
+    """Return the car with this motion; search its position on the path around `near_m`."""
     place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
@@ -153,7 +153,7 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
     """Advance a motion by a substep of 0.05 s.
 
-    Without branches, so that the compiler can vectorize it over cars.
+    Branch-free, so that the compiler can vectorize over cars.
     """
     speed_m_s = motion.speed_m_s
     throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
@@ -164,13 +164,13 @@ def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
 
 @inlined
 def steering_for(action: int, last: float) -> float:
-    """Return the steering command of an action; braking keeps the last one."""
+    """Return the steering command of an action; braking keeps the last command."""
     return last if action == BRAKE else STEERING[action]
 
 
 @compiled
 def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
-    """Return the car after an action of a number of substeps of 0.05 s."""
+    """Return the car after an action that lasts `substeps` of 0.05 s."""
     motion = moving(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
     steering = steering_for(action, car.steering)
     for _ in range(substeps):
@@ -180,14 +180,14 @@ def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
 
 @inlined
 def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
-    """Return the car after a number of substeps that ended in a motion."""
+    """Return the car whose motion after a number of substeps is `motion`."""
     slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, before.along_m, slow_s)
 
 
 @inlined
 def end_of(car: Car) -> int:
-    """Return the end of a decision: DRIVING, OFF_LANE or STALL."""
+    """Return the outcome of a decision: DRIVING, OFF_LANE or STALL."""
     stalled = STALL if car.slow_s >= STALL_TIME_S else DRIVING
     return OFF_LANE if abs(car.offset_m) > LANE_HALF_WIDTH_M else stalled
 
@@ -197,7 +197,7 @@ def reward_of(before: Car, after: Car) -> float:
     """Return the reward of a decision.
 
     ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from
-    it, and -5 for a failure.
+    the path; -5 for a failure.
     """
     progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
     paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
@@ -244,7 +244,7 @@ def seen_from(car: Car) -> Numbers:
 def _ahead(
     car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
 ) -> tuple[float, float]:
-    """Return the path point at a lookahead in the car's frame, divided by the lookahead."""
+    """Return the path point at a lookahead distance in the car's frame, as fractions of it."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
     forward, left = forward_m / lookahead_m, left_m / lookahead_m

@@ -1,4 +1,4 @@
-"""Scene of the lane sim: streets, rails, houses, the car and what it observes.
+"""Scene of the lane sim: streets, rails, houses, the car and its observations.
 
 Frames: `map` (x and y on the ground, z up), `car` (on the ground under the middle of the wheelbase,
 x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the view).

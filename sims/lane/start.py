@@ -1,4 +1,4 @@
-"""Starts of the lane sim's episodes."""
+"""Starting states of the lane sim."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread, take
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
-"""Indices in a row of a car's distance along the path, and of that distance at its start."""
+"""Indices, in a car's row, of the distance along the path and of its value at the start."""
 LINE_M = 2.0
 """Distance of the start line along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
-"""Distances of random starts from corners; closer to them, some cars cannot turn in time."""
+"""Minimum distances of random starts from corners; closer, some cars cannot turn in time."""
 FASTEST_START_M_S = 10.0
 
 _CLEAR_M: NDArray[np.float64] = np.concatenate(
     [[0.0], np.cumsum(np.diff(COURSE.along_m) - AFTER_CORNER_M - BEFORE_CORNER_M)]
 )
-"""(legs + 1,) length of the path before each corner, without the parts close to corners."""
+"""(legs + 1,) length of the path before each corner, excluding the parts near corners."""
 
 
 @compiled
 def start_on_line(shares: NDArray[np.float64]) -> Car:
     """Return a car at rest near the start line.
 
-    Two numbers from 0 to 1 decide its offset of up to 0.3 m and 0.05 rad.
+    Two random numbers from 0 to 1 determine its offset of up to 0.3 m and 0.05 rad.
     """
     return beside(LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
 
 
 @compiled
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
-    """Return a car on the path; four numbers from 0 to 1 decide place, offset, heading, speed."""
+    """Return a car on the path; four random numbers set position, offset, heading and speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
     leg = 0
     while _CLEAR_M[leg + 1] <= clear_m:
@@ -62,7 +62,7 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
-    """Return a car beside a place on the path, left positive, at an angle to the path."""
+    """Return a car at an offset from a path point, left positive, and an angle to the path."""
     leg = leg_at(COURSE, along_m)
     rest_m = along_m - COURSE.along_m[leg]
     cos, sin = COURSE.forward[leg]
@@ -80,13 +80,13 @@ def start_car(
     row: NDArray[np.float64],
     observation: NDArray[np.float32],
 ) -> None:
-    """Start a car at random, and write its state and observation.
+    """Start a car at random; write its state and observation.
 
     Args:
         shares: (4,) random numbers from 0 to 1.
-        on_line: Whether to start on the line instead of anywhere.
-        classic: Whether a start on the line drives straight ahead for a second.
-        row: (10,) output: the `Car`, and its start along the path.
+        on_line: Whether to start on the start line instead of anywhere.
+        classic: Whether a car on the start line first drives straight ahead for a second.
+        row: (10,) output: the `Car`, and its initial distance along the path.
         observation: (12,) output.
     """
     car = start_on_line(shares) if on_line else start_anywhere(shares)
@@ -108,7 +108,7 @@ def start_one_of(
     observations: NDArray[np.float32],
     i: int,
 ) -> None:
-    """Start car i of N; the other arguments are those of `start_car` and `start_cars`."""
+    """Start car i of N; other arguments as in `start_car` and `start_cars`."""
     start_car(shares, on_line, classic, cars[i], observations[i])
     rewards[i], ends[i] = 0.0, DRIVING
 
@@ -125,11 +125,11 @@ def start_cars(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Start K of N cars as `start_car` does.
+    """Start K of N cars with `start_car`.
 
     Args:
         chosen: (K,) indices of the cars.
-        numbers: Numbers of a `Draws` with 4 for each start.
+        numbers: Random numbers of a `Draws` with 4 numbers per start.
         used: Counters of the same `Draws`.
         on_line: As in `start_car`.
         classic: As in `start_car`.
@@ -144,10 +144,10 @@ def start_cars(
 
 
 def car_from(options: dict[str, Any]) -> Car:
-    """Read a start from the options of `reset`.
+    """Return the starting state in the options of `reset`.
 
     Raises:
-        UsageError: There is another option, or the pose is malformed or not on the lane.
+        UsageError: An option is unknown, or the pose is malformed or not on the lane.
     """
     pose = pose_from(options, 0.0, MAX_SPEED_M_S)
     place = project(COURSE, pose.x_m, pose.y_m, 0.0, COURSE.length_m)

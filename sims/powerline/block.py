@@ -1,7 +1,7 @@
 """Vectorized flight of many quadrotors.
 
-Drones are stored in blocks, as structures of arrays, so that the compiler can vectorize over them.
-The results equal those of single drones bit for bit, in a quarter of the time.
+Drones are stored in blocks, as structures of arrays, so that the compiler can vectorize over
+drones. The results are bit-identical to those of single drones, and take a quarter of the time.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mcaprl.sims.powerline.quadrotor import (
 LANES = 8
 """Number of drones in a block."""
 _MIN_BLOCK = 3
-"""Number of drones from which a block is faster than single drones."""
+"""Minimum number of drones for which a block is faster than single drones."""
 _COMMAND, _WIND = DRONE_SIZE * LANES, (DRONE_SIZE + 3) * LANES
 _BLOCK_NUMBERS = DRONE_SIZE + 6
-"""Numbers of each drone in a block: its state, command and wind."""
+"""Number of values per drone in a block: state, command and wind."""
 
 
 @compiled
@@ -41,7 +41,7 @@ def fly_all(
     winds_m_s: NDArray[np.float64],
     duration_s: float,
 ) -> None:
-    """Fly K of N drones, in place, as `fly` does.
+    """Fly K of N drones in place with `fly`.
 
     Args:
         plant: As in `fly`.
@@ -75,7 +75,7 @@ def _gather(
     chosen: NDArray[np.int64],
     block: NDArray[np.float64],
 ) -> None:
-    """Copy drones into a block; the last one fills the lanes that are left over."""
+    """Copy drones into a block; fill the remaining lanes with the last drone."""
     for lane in range(LANES):
         i = chosen[min(lane, len(chosen) - 1)]
         for k in range(DRONE_SIZE):
@@ -99,7 +99,7 @@ def _advance_block(block: NDArray[np.float64]) -> None:
     """Advance the drones of a block by 2 ms.
 
     The loop has no branches and no calls, and all offsets are constants, so that the compiler can
-    prove that lanes do not overlap in memory and vectorize it.
+    prove that lanes do not overlap in memory and vectorize the loop.
     """
     for lane in range(LANES):
         command = _vector_in(block, _COMMAND + lane)

@@ -1,8 +1,8 @@
-"""Depth camera of the drone; it sees the ground, the firs, the towers and the conductors.
+"""Depth camera of the drone; renders the ground, the firs, the towers and the conductors.
 
-The mesh is in ROS axes, as the scene for viewers. The lattice of the towers is rendered as a solid.
-A conductor of 3 cm would be thinner than a pixel from a distance of 1.3 m; therefore it is drawn
-one pixel wide at any distance.
+The mesh is in ROS axes, like the scene for viewers. Towers are rendered as solids without lattice.
+Conductors are drawn one pixel wide at any distance, because a real one of 3 cm is thinner than a
+pixel from a distance of 1.3 m.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 
 LENS = lens(256, 144, math.pi / 2)
 IMAGE_SHAPE = (84, 84)
-"""Size of the averaged image; one of its pixels covers 3.05 x 1.71 rendered pixels."""
+"""Size of the averaged image; each pixel covers 3.05 x 1.71 rendered pixels."""
 
 CAMERAS = ("down", "front")
 CAMERA_AT_M = {"down": Vector(0.0, 0.0, 0.1), "front": Vector(0.2, 0.0, 0.0)}
@@ -48,9 +48,9 @@ GROUND_X_M = np.concatenate(
     [np.linspace(-180, -6, 7), np.linspace(0, 54, 10), np.linspace(60, 720, 31)]
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
-"""NED grid of the ground's mesh: densest on the steep hill, and 100 m larger than the line."""
+"""NED grid of the ground mesh: densest on the steep hill, 100 m larger than the line."""
 TREE_SIDE_M = 0.45
-"""Side of a fir as a share of its height."""
+"""Side of a fir as a fraction of its height."""
 MAST_FOOT_M = 3.0
 MAST_TOP_M = 0.9
 
@@ -73,7 +73,7 @@ def tree_triangles(tree: Tree) -> Floats:
 
 
 def _tower_triangles(tower: Tower) -> Floats:
-    """Return a mast and its arm in ROS axes, (22, 3, 3) meters."""
+    """Return the mast and the arm of a tower in ROS axes, (22, 3, 3) meters."""
     foot = (tower.x_m, -tower.y_m, -tower.foot_z_m)
     mast = frustum_mesh(foot, MAST_FOOT_M, MAST_TOP_M, tower.foot_z_m - tower.arm_z_m)
     arm = box_mesh((0.0, 0.0, 0.0), (0.5, 2 * ARM_HALF_LENGTH_M, 0.4))
@@ -92,13 +92,13 @@ def world_mesh() -> Floats:
 
 
 def world_wires() -> Floats:
-    """Return the straight segments of the conductors in ROS axes, (S, 2, 3) meters."""
+    """Return the segments of the conductors in ROS axes, (S, 2, 3) meters."""
     pieces = np.stack([WIRES_M[:, :-1], WIRES_M[:, 1:]], axis=2)
     return to_ros(pieces.reshape(-1, 2, 3))
 
 
 class DroneCamera:
-    """Camera that is fixed to the drone's body."""
+    """Camera fixed to the drone's body."""
 
     def __init__(self, view: str) -> None:
         """Prepare the `down` or `front` camera: 90 degrees wide, 84 x 84 pixels."""

@@ -1,4 +1,4 @@
-"""Published rules of the powerline sim with their faults, which `PowerlineEnv` lists.
+"""Published rules of the powerline sim, including the faults that `PowerlineEnv` lists.
 
 Axes are NED, as in `mcaprl.sims.powerline.course`.
 """
@@ -47,7 +47,7 @@ def classic_distance(position_m: Vector) -> float:
 
 @compiled
 def classic_end(position_m: Vector, hit: bool) -> int:
-    """Return the end of a decision: FLYING, OFF_LINE or COLLISION."""
+    """Return the outcome of a decision: FLYING, OFF_LINE or COLLISION."""
     if hit:
         return COLLISION
     return OFF_LINE if classic_distance(position_m) > MAX_DISTANCE_M else FLYING
@@ -66,7 +66,7 @@ def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
 
 @compiled
 def classic_decide(plant: int, flight: Flight, action: int) -> tuple[Flight, bool]:
-    """Fly for 5 s at the measured velocity plus a step; return the flight and a collision flag."""
+    """Fly 5 s at the measured velocity plus a step; return the flight, and whether it collided."""
     step = times(CLASSIC_VELOCITY_STEP_M_S, vector_at(DIRECTIONS[action], 0))
     command = plus(flight.drone.velocity_m_s, step)
     wind = plus(flight.wind_m_s, flight.gust_m_s)

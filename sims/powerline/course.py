@@ -1,7 +1,7 @@
 """Course of the powerline sim: the line to follow, its towers and conductors, and the ground.
 
 Axes are those of the published line, NED: x north, y east, z down; meters. `to_ros` transforms to
-ROS axes for viewers. Nothing is random: the course is the same on every machine.
+ROS axes for viewers. The course is deterministic and identical on every machine.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BELOW_LINE_M = 6.0
 PHASES_M = (-4.0, 0.0, 4.0)
 """Lateral positions of the three conductors, right positive."""
 SAG = 0.02
-"""Sag of a conductor in the middle of its span, as a share of the span's length."""
+"""Sag of a conductor in the middle of its span, as a fraction of the span's length."""
 CHORDS = 16
 """Number of straight segments of a conductor."""
 
@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
 
 class Tower(NamedTuple):
-    """Mast with an arm on top, across the line."""
+    """Mast with an arm on top, perpendicular to the line."""
 
     x_m: float
     y_m: float
@@ -75,7 +75,7 @@ class Tower(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """Fir beside the line."""
+    """Fir near the line."""
 
     x_m: float
     y_m: float
@@ -123,7 +123,7 @@ def nearest_on_line(position_m: Vector) -> Place:
 def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
     """Return the distance to the infinite line through a leg, meters.
 
-    For a point p, |(p - a) x t|, with a on the line and the unit vector t along it.
+    |(p - a) x t| for a point p, a point a on the line, and the line's unit vector t.
     """
     start = Vector(POINTS_M[leg, 0], POINTS_M[leg, 1], POINTS_M[leg, 2])
     tangent = Vector(TANGENTS[leg, 0], TANGENTS[leg, 1], TANGENTS[leg, 2])
@@ -134,7 +134,7 @@ def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
 def ground_height(x_m: float, y_m: float) -> float:
     """Return the height of the ground, meters above z = 0.
 
-    Below the line it is a smooth curve through the towers' feet; beside the line there are hills.
+    The ground is a smooth curve through the towers' feet below the line, and hilly beside the line.
     """
     span = 0
     while span + 1 < LEGS and POINTS_M[span + 1, 0] <= x_m:
@@ -159,8 +159,8 @@ def _foot_height(tower: int) -> float:
 def wire_distance(position_m: Vector) -> float:
     """Return the distance to the nearest conductor, meters.
 
-    In each span, only the segments around the one beside the position are evaluated. The result is
-    exact if it is below 4 m; otherwise the true distance may be slightly smaller.
+    In each span, only the segments near the position are evaluated. The result is exact below 4 m;
+    otherwise the true distance may be slightly smaller.
     """
     nearest_m = math.inf
     for wire in range(len(WIRES_M)):
@@ -205,10 +205,10 @@ def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
     """Return the heights of a hanging wire relative to its first end, meters.
 
     y = a cosh((x - x0) / a) + c. For a given a, x0 follows from the rise. Bisection finds the a
-    with the wanted sag, the distance of the wire's middle below the straight line between its ends.
+    for `sag_m`, the distance of the wire's middle below the straight line between its ends.
 
     Args:
-        span_m: Horizontal distance of the ends.
+        span_m: Horizontal distance between the ends.
         rise_m: Height of the second end relative to the first.
         sag_m: Sag, above 0.
         x_m: (N,) horizontal distances from the first end.
@@ -248,7 +248,7 @@ def towers() -> tuple[Tower, ...]:
 
 
 def _wires() -> Floats:
-    """Return the conductors (12, CHORDS + 1, 3), three for each span, along the line."""
+    """Return the points of the conductors (12, CHORDS + 1, 3), three conductors for each span."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     found = towers()
     wires = []
@@ -269,7 +269,7 @@ def _wires() -> Floats:
 
 
 def _beams() -> Floats:
-    """Return the mast and the arm of each tower as pairs of ends, (10, 2, 3)."""
+    """Return the masts and arms of the towers as segments, (10, 2, 3)."""
     beams = []
     for x_m, y_m, foot_z_m, arm_z_m, right in towers():
         across = ARM_HALF_LENGTH_M * np.array([*right, 0.0])
@@ -283,7 +283,7 @@ BEAMS_M: Floats = _beams()
 
 
 def trees() -> tuple[Tree, ...]:
-    """Return the firs: small ones in the strip under the line, tall ones on both sides of it."""
+    """Return the firs: small ones under the line, tall ones on both sides of it."""
     found = []
     for index in range(TREE_COUNT):
         along_m = (index + 0.5) / TREE_COUNT * LENGTH_M

@@ -28,17 +28,17 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     The agent commands the velocity of a drone that follows a line of four legs (71, 146, 198 and
     206 m) over hilly ground, with a tower under each corner and three conductors 6 m below the
-    line. The drone is a quadrotor with controllers, or a point that follows the command with a lag;
-    it always faces north. The same seed and actions result in the same bits.
+    line. The drone is a quadrotor with controllers, or a point mass that follows the command with a
+    lag; it always faces north. Results are bit-identical for the same seed and actions.
 
-    Actions, observations and poses have the axes of the published line, NED: x north, y east, z
+    Actions, observations and poses use the axes of the published line, NED: x north, y east, z
     **down**; meters and m/s. Data for viewers (telemetry, scene, frames, and the offsets in `info`)
-    have ROS axes: x north, y west, z up; y and z have the opposite sign.
+    use ROS axes: x north, y west, z up; y and z have the opposite sign.
 
     ## Action Space
 
-    `Discrete(7)`. Each changes the last commanded velocity by 0.5 m/s; a change that would result
-    in more than 8 m/s is ignored. One decision lasts 0.5 s.
+    `Discrete(7)`. Each action changes the last commanded velocity by 0.5 m/s; a change that would
+    exceed 8 m/s is ignored. One decision lasts 0.5 s.
 
     | Action | Meaning |
     |---|---|
@@ -65,24 +65,24 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     | 16 | exp(-distance to the leg's end / 10 m) | 1 | 1 |
     | 17 | distance along the line to the furthest point so far | 10 m | 10 |
 
-    `observation="depth"`: a `Dict` of `depth`, (84, 84, 1) uint8, the camera's image in the
-    logarithmic code of `mcaprl.sims.drawing.depth.encode_depth`, 255 where there is no surface; and
-    `motion`, 6 float32, rows 3 to 8 of the table. Conductors are drawn one pixel wide, so that they
-    are visible. With `rules="classic"` it is only the image, in the code of `encode_nearness`.
+    `observation="depth"`: a `Dict` of `depth`, (84, 84, 1) uint8, the camera's depth, encoded by
+    `mcaprl.sims.drawing.depth.encode_depth`, 255 where there is no surface; and `motion`, 6
+    float32, rows 3 to 8 of the table. Conductors are drawn one pixel wide to be visible. With
+    `rules="classic"`, the observation is only the image, encoded by `encode_nearness`.
 
     ## Rewards
 
     min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds along the line beyond the
-    furthest point so far, at distance d from the line; it is highest at 5 m/s. +5 for finishing;
-    -5 instead for leaving the line or a collision.
+    furthest point so far, at distance d from the line; highest at 5 m/s. +5 in addition for
+    finishing; -5 instead for leaving the line or a collision.
 
     ## Starting State
 
     `start="line"`: after 5 s at (1, -0.5, -1) m/s from the first point, with an offset of up to
     0.2 m on each axis.
-    `start="anywhere"`: half of the episodes as above; the others at a random place on the line,
-    except its last 20 m, with an offset of up to 1 m, along the line at 0 to 5 m/s, rounded to
-    0.5 m/s on each axis.
+    `start="anywhere"`: half of the episodes as above; the others at a random position on the
+    line, except its last 20 m, with an offset of up to 1 m, along the line at 0 to 5 m/s, rounded
+    to 0.5 m/s on each axis.
     `reset(options={"pose": (x_m, y_m, z_m)})`, optionally with the velocity in m/s as three more
     numbers, starts at that pose; the velocity is also the first command.
 
@@ -97,24 +97,24 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     ## Classic Rules
 
-    `rules="classic"` are the rules as they were published, by default for a point that follows its
-    command with a lag of 0.5 s. A decision lasts 5 s; actions change the *measured* velocity by
+    `rules="classic"` are the published rules, by default for a point mass that follows its command
+    with a lag of 0.5 s. A decision lasts 5 s; actions change the *measured* velocity by
     0.25 m/s. The reward is (exp(-d) - 0.5) + (speed - 0.5), with the distance d to the nearest of
-    the *infinite* lines through the legs; -10 and the end beyond 7 m, -100 and the end for a
-    collision. An episode starts after 5 s at (1, -0.67, -0.8) m/s. Known faults:
+    the *infinite* lines through the legs. An episode terminates beyond 7 m with -10, and at a
+    collision with -100. It starts after 5 s at (1, -0.67, -0.8) m/s. Known faults:
 
-    - Speed is rewarded in any direction: flying to and fro has a higher return than following the
-      line.
+    - Speed is rewarded in any direction: flying back and forth has a higher return than following
+      the line.
     - Flying past the first tower along the extension of the first leg is rewarded for over 100 m.
-    - The line has no end: flying on beyond the last tower is rewarded as well.
-    - Hovering on the line costs nothing and never ends; flying backward is as good as forward.
+    - The line has no end: flying beyond the last tower is also rewarded.
+    - Hovering on the line costs nothing and never ends the episode; flying backward is rewarded
+      like flying forward.
     - Commands that change the measured velocity drift: the effects of gusts and lag persist.
-    - 5 s is too long for corrections: it is 25 m at 5 m/s, three and a half times the allowed
-      distance.
-    - The image's code uses half of its values for distances of 1 to 2 m.
+    - 5 s is too long for corrections: the drone flies 25 m at 5 m/s; 7 m is the limit.
+    - The image encoding uses half of its values for distances of 1 to 2 m.
 
-    The world and the point's lag are our own, and images are averaged where the published ones are
-    interpolated. A collision stops the drone.
+    The world and the lag differ from the published ones, and images are downsampled by averaging
+    instead of interpolation. A collision stops the drone.
 
     ## Arguments
 
@@ -122,10 +122,10 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     - `observation`: `"state"` or `"depth"`.
     - `camera`: `"down"` or `"front"`; 90 degrees wide, fixed to the body.
     - `start`: `"anywhere"` or `"line"`; the classic rules always start on the line.
-    - `plant`: `"quad"`, `"point"`, or None, which means quad, in the classic rules point.
-    - `wind_m_s`: maximum steady wind, 0 to 8; each episode draws its speed and direction.
+    - `plant`: `"quad"` or `"point"`; None means `"quad"`, or `"point"` in the classic rules.
+    - `wind_m_s`: maximum steady wind, 0 to 8; speed and direction are random in each episode.
     - `gust_m_s`: standard deviation of the gusts on each axis, 0 to 3; 0 in the classic rules.
-      Wind and gusts have no effect on a point.
+      Wind and gusts have no effect on a point mass.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
     ## Version History
@@ -188,7 +188,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return (powerline_scene.camera_frame(self._camera),)
 
     def frames(self) -> Sequence[Frame]:
-        """Return the drone's position in the map, as a level frame, and its attitude in that."""
+        """Return the drone's level frame in the map, and the body's frame in the level frame."""
         return powerline_scene.drone_frames(self.flight.drone)
 
     def _open_view(self, render_mode: RenderMode) -> PowerlineView:
@@ -201,6 +201,6 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
 
 class BatchedPowerlineEnv(BatchedEnv):
-    """Many drones that are stepped together, each in its own wind; see `PowerlineEnv`."""
+    """Vectorized environment of N drones, each with its own wind; see `PowerlineEnv`."""
 
     fleet_type = PowerlineFleet

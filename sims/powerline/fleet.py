@@ -44,11 +44,11 @@ STARTS = ("anywhere", "line")
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 MOTION = slice(3, 9)
-"""Indices of the observed numbers beside an image: velocity, and command minus velocity."""
+"""Indices of the state that `motion` contains: velocity, and command minus velocity."""
 
 
 class PowerlineFleet(Fleet):
-    """N drones on the line, each in its own wind; arguments as in `PowerlineEnv`."""
+    """N drones on the line, each with its own wind; arguments as in `PowerlineEnv`."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
@@ -138,7 +138,7 @@ class PowerlineFleet(Fleet):
         return step_flights, *before, self._gust_m_s, self.noise, *after
 
     def observation(self, i: int) -> Any:
-        """Return the numbers or the image that drone i observes."""
+        """Return the observation of drone i."""
         if self._shows_state:
             return self._seen[i].copy()
         if self.classic:

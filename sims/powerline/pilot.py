@@ -1,4 +1,4 @@
-"""Pilot of the powerline sim: it aims at a point ahead and slows down before corners."""
+"""Pilot of the powerline sim: aims at a point ahead and slows down before corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.sims.powerline.rules import ACTION_MEANINGS, DIRECTIONS, Flight
 from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 AIM_M = 6.0
-"""Distance along the line to the point that the pilot aims at."""
+"""Distance along the line to the target point."""
 OFFSET_GAIN_PER_S = 0.5
 MAX_SPEED_M_S = 5.0
 HALF_TURN_RAD = 0.46
@@ -25,7 +25,7 @@ NO_CHANGE = len(ACTION_MEANINGS) - 1
 
 @compiled
 def corner_speed(leg: int) -> float:
-    """Return the speed, m/s, for the corner at a leg's end; the sharper it is, the slower."""
+    """Return the speed, m/s, for the corner at a leg's end; lower for sharper corners."""
     if leg + 1 >= LEGS:
         return MAX_SPEED_M_S
     cosine = 0.0
@@ -38,7 +38,7 @@ def corner_speed(leg: int) -> float:
 
 @compiled
 def wanted_velocity(position_m: Vector) -> Vector:
-    """Return the velocity, m/s, that a drone at a position should have."""
+    """Return the desired velocity, m/s, of a drone at a position."""
     place = nearest_on_line(position_m)
     slowing_m = max(0.0, ALONG_M[place.leg + 1] - place.along_m - CORNER_EARLY_M)
     corner_m_s = corner_speed(place.leg)
@@ -50,7 +50,7 @@ def wanted_velocity(position_m: Vector) -> Vector:
 
 @compiled
 def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
-    """Choose the action that reduces the command's error most, or no change if it is small.
+    """Choose the action that most reduces the command's error; no change if the error is small.
 
     Args:
         flight: State of the drone.
@@ -70,7 +70,7 @@ def choose(flight: Flight, step_m_s: float, from_measured: bool) -> int:
 
 
 class PowerlinePilot(ScriptedPilot[PowerlineEnv]):
-    """Pilot of one powerline sim's drone."""
+    """Scripted pilot of the powerline sim's drone."""
 
     def choose(self) -> int:
         """Choose the action for the current state of the drone."""

@@ -1,7 +1,7 @@
-"""Two drones that follow a commanded velocity: a quadrotor with its controllers, and a point.
+"""Two drones that follow a commanded velocity: a quadrotor with controllers, and a point mass.
 
-Axes are NED: x north, y east, z down; those of the body are x forward, y right, z down. Both always
-face north.
+World axes are NED: x north, y east, z down. Body axes are x forward, y right, z down. Both drones
+always face north.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ POINT_LAG_S = 0.5
 MASS_KG = 1.0
 INERTIA_KG_M2 = (0.01, 0.01, 0.018)
 ROTOR_OFFSET_M = 0.15
-"""Distance of each rotor from the middle, both forward and sideways: the arms form an X."""
+"""Distance of each rotor from the center along x and along y; the arms form an X."""
 TORQUE_PER_THRUST_M = 0.016
 MAX_ROTOR_THRUST_N = 5.5
 ROTOR_LAG_S = 0.02
 ROTOR_SHARE = 1.0 - math.exp(-TIME_STEP_S / ROTOR_LAG_S)
-"""Share of the difference to the commanded thrust that one time step makes up."""
+"""Fraction of the thrust error that is corrected in one time step."""
 DRAG_PER_S = 0.25
-"""Drag per mass, linear in the airspeed."""
+"""Coefficient of the drag per mass, which is linear in the airspeed."""
 
 VELOCITY_GAIN_PER_S = 2.5
 INTEGRAL_GAIN_PER_S2 = 1.5
 REFERENCE_GAIN_PER_S = VELOCITY_GAIN_PER_S + DRAG_PER_S
-"""Rate at which the reference, as the velocity in still air, approaches the command."""
+"""Rate at which the reference approaches the command, equal to the velocity's in still air."""
 MAX_INTEGRAL_M_S2 = 2.0
 MAX_ACCELERATION_M_S2 = 6.0
 ATTITUDE_GAIN_PER_S = 12.0
@@ -59,7 +59,7 @@ RATE_GAIN_PER_S = 30.0
 
 
 class Rotors(NamedTuple):
-    """One number for each rotor; the first two rotate opposite to the last two."""
+    """One value per rotor; the first two rotate opposite to the last two."""
 
     front_right: float
     rear_left: float
@@ -68,7 +68,7 @@ class Rotors(NamedTuple):
 
 
 class Drone(NamedTuple):
-    """State of a drone and its controllers; a point uses only the first two fields."""
+    """State of a drone and its controllers; a point mass uses only the first two fields."""
 
     position_m: Vector
     velocity_m_s: Vector
@@ -78,13 +78,13 @@ class Drone(NamedTuple):
     """Angular velocity about the body's axes."""
     thrusts_n: Rotors
     reference_m_s: Vector
-    """Velocity that the drone would have now without wind."""
+    """Velocity that the drone would have without wind."""
     integral_m_s2: Vector
     """Integral of the velocity controller, which compensates for the wind."""
 
 
 DRONE_SIZE = 23
-"""Size of a `Drone`, and of the array row that stores one."""
+"""Number of floats in the array row of a `Drone`."""
 
 
 @compiled
@@ -136,8 +136,8 @@ def fly(
     """Return the drone after flying at a commanded velocity.
 
     Args:
-        plant: QUAD or POINT; wind has no effect on the latter.
-        drone: State before.
+        plant: QUAD or POINT; wind has no effect on POINT.
+        drone: Initial state.
         command_m_s: Commanded velocity over the ground.
         wind_m_s: Velocity of the air over the ground.
         duration_s: Duration; for QUAD a multiple of 2 ms.
@@ -151,7 +151,7 @@ def fly(
 
 @compiled
 def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
-    """Advance a point by the exact solution of v' = (c - v) / T.
+    """Advance a point mass by the exact solution of v' = (c - v) / T.
 
     v(t) = c + (v - c) e and x(t) = x + c t + (v - c) T (1 - e), with e = exp(-t / T).
     """
@@ -196,8 +196,8 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
     """Return the acceleration with which the velocity controller approaches the command.
 
-    On each axis it is the sum of k (c - v), the drag at the commanded speed, and the integral of
-    the error from the reference, which is due to wind and not to steps of the command; it is
+    On each axis, the sum of k (c - v), the drag at the commanded speed, and the integral of the
+    deviation from the reference velocity, which is caused by wind but not by command changes;
     limited to 6 m/s^2.
     """
     c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
@@ -212,7 +212,7 @@ def _asked(command_m_s: float, velocity_m_s: float, integral_m_s2: float) -> flo
 
 @inlined
 def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> float:
-    """Integrate the velocity error of an axis, unless its acceleration is at the limit."""
+    """Integrate the velocity error of an axis unless the acceleration is at its limit."""
     if abs(wanted_m_s2) >= MAX_ACCELERATION_M_S2:
         return integral_m_s2
     grown = integral_m_s2 + TIME_STEP_S * INTEGRAL_GAIN_PER_S2 * error_m_s
@@ -221,12 +221,12 @@ def _integrated(integral_m_s2: float, error_m_s: float, wanted_m_s2: float) -> f
 
 @inlined
 def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
-    """Return the commanded thrusts of the rotors, newtons, for a wanted acceleration.
+    """Return the commanded thrusts of the rotors, newtons, for a desired acceleration.
 
-    The wanted attitude is the shortest rotation from upright that points the body's z axis along
-    g - a. Its error commands the angular velocity, whose error commands the torques, as in the
-    cascade of Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors",
-    ICRA 2011.
+    The desired attitude is the shortest rotation from upright that points the body's z axis along
+    g - a. The attitude error determines the commanded angular velocity, and the angular velocity
+    error the torques: the cascade of Mellinger and Kumar, "Minimum snap trajectory generation and
+    control for quadrotors", ICRA 2011.
     """
     down = minus(Vector(0.0, 0.0, GRAVITY_M_S2), wanted_m_s2)
     size = norm(down)
@@ -250,7 +250,7 @@ def angular_momentum(rates_rad_s: Vector) -> Vector:
 
 @inlined
 def _mixed(thrust_n: float, torque_n_m: Vector) -> Rotors:
-    """Distribute a thrust and torques among the rotors, each within 0 and its maximum."""
+    """Distribute a thrust and torques among the rotors; clip each thrust to its limits."""
     each = 0.25 * thrust_n
     roll = 0.25 * torque_n_m.x / ROTOR_OFFSET_M
     pitch = 0.25 * torque_n_m.y / ROTOR_OFFSET_M
@@ -273,8 +273,8 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     """Advance a rigid body by 2 ms with the semi-implicit Euler method.
 
     m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega, q' = q (0, omega) / 2, and
-    each thrust follows its command with a lag of 20 ms. Attitude and position are advanced with the
-    new rates and the new velocity.
+    each thrust follows its command with a lag of 20 ms. The new rates and velocity advance attitude
+    and position.
     """
     share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(

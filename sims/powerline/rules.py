@@ -1,4 +1,4 @@
-"""Equations of the powerline sim's default rules: flight, rewards, ends and observations.
+"""Default rules of the powerline sim: flight, rewards, episode ends and observations.
 
 Axes are NED, as in `mcaprl.sims.powerline.course`.
 """
@@ -37,29 +37,29 @@ ACTION_MEANINGS = (
     "no change",
 )
 DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])
-"""(7, 3) change of the velocity by each action, in steps along x, y and z."""
+"""(7, 3) velocity change of each action along x, y and z, in steps."""
 
 DECISION_S = 0.5
 CHECK_S = 0.1
-"""Interval of the checks for collisions and other ends."""
+"""Interval of the checks for collisions and other episode ends."""
 VELOCITY_STEP_M_S = 0.5
 MAX_COMMAND_M_S = 8.0
 APPROACH_S = 5.0
 """Duration of the flight from the first point of the line before the first decision."""
 FIRST_COMMAND_M_S = (1.0, -0.5, -1.0)
-"""Command of that flight. From the published one, (1, -0.67, -0.8), steps of 0.5 m/s could not
-return to hovering."""
+"""Command of that flight; from the published (1, -0.67, -0.8), steps of 0.5 m/s cannot return to
+hovering."""
 
 MAX_DISTANCE_M = 7.0
 WIRE_CLEARANCE_M = 0.6
 TOWER_CLEARANCE_M = 1.2
 GROUND_CLEARANCE_M = 0.3
 FINISH_M = 1.0
-"""Distance from the line's end at which it is finished."""
+"""Distance from the line's end at which an episode is finished."""
 FAILURE_REWARD = -5.0
 FINISH_REWARD = 5.0
 BEST_PROGRESS_M = 2.5
-"""Progress per decision with the highest reward: 5 m/s."""
+"""Progress per decision with the highest reward; equals 5 m/s."""
 DISTANCE_SCALE_M = 4.0
 FLYING, OFF_LINE, COLLISION, FINISHED = 0, 1, 2, 3
 REASONS = ("", "off_line", "collision", "finished")
@@ -77,7 +77,7 @@ OBSERVATION_LIMIT = np.array([2] * 3 + [4] * 3 + [8] * 3 + [1] * 8 + [10], dtype
 
 COMMAND, WIND, GUST, FURTHEST = DRONE_SIZE, DRONE_SIZE + 3, DRONE_SIZE + 6, DRONE_SIZE + 9
 FLIGHT_SIZE = DRONE_SIZE + 10
-"""Size of a `Flight`, and of the array row that stores one."""
+"""Number of floats in the array row of a `Flight`."""
 
 
 class Flight(NamedTuple):
@@ -89,7 +89,7 @@ class Flight(NamedTuple):
     wind_m_s: Vector
     """Steady wind of the episode."""
     gust_m_s: Vector
-    """Current gust, which is added to the wind."""
+    """Current gust, in addition to the steady wind."""
     furthest_m: float
     """Maximum progress along the line so far."""
 
@@ -125,7 +125,7 @@ def store_flight(flight: Flight, row: NDArray[np.float64]) -> None:
 
 @compiled
 def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Return a flight that starts at its commanded velocity."""
+    """Return the start of a flight at its commanded velocity."""
     drone = cruising(position_m, command_m_s)
     place = nearest_on_line(position_m)
     return Flight(drone, command_m_s, wind_m_s, Vector(0.0, 0.0, 0.0), place.along_m)
@@ -133,7 +133,7 @@ def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
 
 @compiled
 def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Return the flight after 5 s at a command from hovering at a position."""
+    """Return the flight 5 s after a command to a drone that hovers at a position."""
     drone = cruising(position_m, Vector(0.0, 0.0, 0.0))
     drone = fly(plant, drone, command_m_s, wind_m_s, APPROACH_S)
     along_m = nearest_on_line(drone.position_m).along_m
@@ -142,7 +142,7 @@ def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vect
 
 @compiled
 def commanded(command_m_s: Vector, action: int) -> Vector:
-    """Return a command changed by an action; unchanged if it would exceed 8 m/s."""
+    """Return the command after an action; unchanged if it would exceed 8 m/s."""
     direction = vector_at(DIRECTIONS[action], 0)
     changed = plus(command_m_s, times(VELOCITY_STEP_M_S, direction))
     return changed if norm(changed) <= MAX_COMMAND_M_S else command_m_s
@@ -150,7 +150,7 @@ def commanded(command_m_s: Vector, action: int) -> Vector:
 
 @compiled
 def next_gust(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
-    """Return the gust of the next decision: on each axis an Ornstein-Uhlenbeck process.
+    """Return the gust of the next decision, an Ornstein-Uhlenbeck process on each axis.
 
     g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has the stationary standard deviation s.
 
@@ -177,7 +177,7 @@ def collides(position_m: Vector) -> bool:
 
 @compiled
 def end_of(position_m: Vector, place: Place) -> int:
-    """Return the end of a decision: FLYING, OFF_LINE, COLLISION or FINISHED."""
+    """Return the outcome of a decision: FLYING, OFF_LINE, COLLISION or FINISHED."""
     if collides(position_m):
         return COLLISION
     if place.distance_m > MAX_DISTANCE_M:
@@ -187,12 +187,12 @@ def end_of(position_m: Vector, place: Place) -> int:
 
 @compiled
 def reward_of(furthest_m: float, after: Flight, end: int) -> float:
-    """Return the reward of a decision: new progress along the line, close to the line.
+    """Return the reward of a decision.
 
     min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds beyond `furthest_m`, the
-    furthest point before the decision, at distance d; +5 for the finish, -5 for a failure. Beyond
-    5 m/s the reward decreases. If it only stayed constant, flying too fast would still lose the
-    reward of the rest of the line, but a discounting agent would not notice.
+    maximum progress before the decision, at distance d from the line; +5 for the finish, -5 for a
+    failure. The reward decreases beyond 5 m/s: if it were constant there, an agent with a discount
+    would fly too fast, although a crash forfeits the rewards of the remaining line.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD
@@ -234,13 +234,13 @@ class Bearing(NamedTuple):
     distance_m: float
     """Distance from the line."""
     along_m: float
-    """Distance of the nearest point along the line."""
+    """Distance along the line of the nearest point."""
     speed_m_s: float
 
 
 @compiled
 def bearing_of(drone: Drone) -> Bearing:
-    """Return the bearing of a drone."""
+    """Return the position of a drone relative to the line."""
     place = nearest_on_line(drone.position_m)
     away = minus(drone.position_m, place.point_m)
     forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
@@ -252,7 +252,7 @@ def bearing_of(drone: Drone) -> Bearing:
 
 @compiled
 def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
-    """Write the bearings (N, 5) of N drones, (N, 33) rows of `Flight`."""
+    """Write the bearings (N, 5) of N drones from their rows (N, 33) of `Flight`."""
     for i in range(len(flights)):
         bearing = bearing_of(drone_at(flights[i]))
         for k, value in enumerate(bearing):
@@ -312,7 +312,7 @@ def decide_all(
 ) -> None:
     """Fly N drones, (N, 33) rows of `Flight`, for half a second or until their episodes end.
 
-    Writes FLYING, OFF_LINE, COLLISION or FINISHED to the ends (N,).
+    Write FLYING, OFF_LINE, COLLISION or FINISHED to `ends` (N,).
     """
     count = len(flights)
     commands, winds = flights[:, COMMAND : COMMAND + 3], np.empty((count, 3))

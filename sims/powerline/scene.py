@@ -2,7 +2,7 @@
 
 Frames: `map` (x north, y west, z up), `base_stabilized` (at the drone, level), `drone` (its body, x
 forward, y left, z up) and `camera` (ROS optical axes: x right, y down, z along the view).
-The drone is drawn at five times its size, so that it is visible.
+The drone is drawn at five times its size to be visible.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
 UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
-"""Offset of arrows, since viewers reject an arrow of length 0."""
+"""Offset of arrows; viewers reject an arrow of length 0."""
 CORNERS_PER_M = 16
-"""Corners of surfaces are rounded to 1/16 m, so that they take a third of the space in a log."""
+"""Rounding of surface corners to 1/16 m, which reduces their size in a log to a third."""
 SHADES = 10
-"""Number of brightness levels of surfaces, by their angle to the sun."""
+"""Number of brightness levels of surfaces; the angle to the sun determines the level."""
 SUN = np.array([0.45, 0.35, 0.82])
 
 DRONE_SCALE = 5.0
@@ -55,7 +55,7 @@ def ros(ned: Vector) -> tuple[float, float, float]:
 
 
 def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> list[Shape]:
-    """Color triangles (T, 3, 3) by their angle to the sun, one shape for each brightness."""
+    """Color triangles (T, 3, 3) by their angle to the sun; one shape per brightness level."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     light = np.clip(normals @ SUN / np.linalg.norm(normals, axis=1), 0.0, 1.0)
     classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)
@@ -180,7 +180,7 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     position = flight.drone.position_m
     place = course.nearest_on_line(position)
     here = np.array(ros(position))
-    # Shapes that start at the drone are relative to it: they then repeat and compress well in logs.
+    # Shapes at the drone are in its frame: they then repeat and compress well in logs.
     level, origin = "base_stabilized", np.zeros(3)
     link = np.array([origin, ros(place.point_m) - here])
     ahead = np.array([ros(course.point_on_line(place.along_m + 6.0)) - here])
@@ -196,10 +196,10 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
 
 
 def drone_frames(drone: Drone) -> tuple[Frame, ...]:
-    """Return the drone's position in the map, as a level frame, and its attitude in that frame.
+    """Return the drone's level frame in the map, and the body's frame in the level frame.
 
     NED axes are ROS axes rotated by half a turn about x, for the world and for the body; therefore
-    the y and z parts of a quaternion change sign, as those of a vector.
+    y and z change sign in quaternions as in vectors.
     """
     q = drone.attitude
     return (
@@ -209,7 +209,7 @@ def drone_frames(drone: Drone) -> tuple[Frame, ...]:
 
 
 def camera_frame(view: str) -> Frame:
-    """Return the camera's frame in the drone: optical axes."""
+    """Return the camera's optical frame, relative to the drone."""
     half = math.sqrt(0.5)
     rotations = {"front": (-0.5, 0.5, -0.5, 0.5), "down": (half, -half, 0.0, 0.0)}
     return Frame("camera", ros(camera.CAMERA_AT_M[view]), rotations[view], parent="drone")

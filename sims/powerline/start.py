@@ -1,4 +1,4 @@
-"""Starts of the powerline sim's episodes, and their wind."""
+"""Starting states and wind of the powerline sim's episodes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MAX_SPEED_M_S = 5.0
 
 
 def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
-    """Draw an episode's steady horizontal wind from a random direction."""
+    """Draw an episode's steady horizontal wind, with a random speed and direction."""
     if not greatest_m_s:
         return Vector(0.0, 0.0, 0.0)
     speed_m_s = random.uniform(0.0, greatest_m_s)
@@ -49,14 +49,14 @@ def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
 def start_on_line(
     random: np.random.Generator, plant: int, command: tuple[float, float, float], wind: Vector
 ) -> Flight:
-    """Return a flight after 5 s at a command, m/s, from hovering near the first point."""
+    """Return the flight 5 s after a command, m/s, to a drone that hovers near the first point."""
     noise = random.uniform(-FIRST_POINT_NOISE_M, FIRST_POINT_NOISE_M, 3)
     position = Vector(*(POINTS_M[0] + noise).tolist())
     return approach(plant, position, Vector(*command), wind)
 
 
 def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
-    """Return a flight near a random place on the line, along it, in multiples of 0.5 m/s."""
+    """Return a flight along the line at a random position, rounded to 0.5 m/s on each axis."""
     along_m = float(random.uniform(0.0, LENGTH_M - LAST_START_M))
     point = point_on_line(along_m)
     speed_m_s = random.uniform(0.0, MAX_SPEED_M_S)
@@ -68,10 +68,10 @@ def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
 
 
 def flight_from(options: dict[str, Any], wind: Vector, classic: bool) -> Flight:
-    """Read a start from the options of `reset`.
+    """Return the starting state in the options of `reset`.
 
     Raises:
-        UsageError: There is another option, or the pose is malformed, too fast, or would end the
+        UsageError: An option is unknown, or the pose is malformed, too fast, or would end the
             episode at once.
     """
     pose = read_pose(options, POSE_NAMES, least=3)

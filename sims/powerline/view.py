@@ -44,7 +44,7 @@ _SAMPLE_M = 2.0
 
 
 class PowerlineView:
-    """Renderer of one image for each step, which mode `human` shows in a window."""
+    """Renderer of one image per step, shown in a window in mode `human`."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"]) -> None:
         """Prepare the shapes that never change.
@@ -115,7 +115,7 @@ def _ground_under(along_m: Floats) -> Floats:
 
 
 def _middle_wire() -> tuple[Floats, Floats]:
-    """Return distances along the line, and heights of the middle conductor there."""
+    """Return distances along the line, and the heights of the middle conductor there."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     spans = WIRES_M[len(PHASES_M) // 2 :: len(PHASES_M)]
     along_m = ALONG_M[:-1, None] + shares * np.diff(ALONG_M)[:, None]

@@ -1,4 +1,4 @@
-"""The car that races by its rays, `mcaprl/Racer-v0`."""
+"""The racing car with ray sensors, `mcaprl/Racer-v0`."""
 
 from mcaprl.sims.spec import SimSpec
 

@@ -1,6 +1,6 @@
 """Car of the racer sim: its state, its corners, and its placement on a track.
 
-Pixels and angles are those of the image: y points down, so angles are clockwise.
+Coordinates are those of the image: y points down, so angles are clockwise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CAR_LENGTH_PX, CAR_WIDTH_PX = 30.0, 14.0
 
 
 class Car(NamedTuple):
-    """State of one car, stored as a row of a (cars, 12) array."""
+    """State of one car; a row of a (cars, 12) array."""
 
     x_px: float
     y_px: float
@@ -45,7 +45,7 @@ class Car(NamedTuple):
 
 
 STARTED_AT = len(Car._fields)
-"""Index in a row of the car's distance along the path at its start; it follows the `Car`."""
+"""Index, in a car's row, of the initial distance along the path, which follows the `Car`."""
 
 
 @compiled
@@ -80,7 +80,7 @@ def placed(
 ) -> Car:
     """Return a car on a track before its first step; its next gate is the first one ahead.
 
-    Its place on the path is searched within half a lap of `near_m`.
+    Search its position on the path within half a lap of `near_m`.
     """
     half_lap_m = 0.5 * track.path.length_m
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
@@ -109,7 +109,7 @@ def placed(
 
 @compiled
 def is_beyond(x_px: float, y_px: float, gate: NDArray[np.float64]) -> bool:
-    """Return whether a point is beyond the line through a gate (4,), in the direction of travel."""
+    """Return whether a point is past the line through a gate (4,), in the direction of travel."""
     across_x, across_y = gate[2] - gate[0], gate[3] - gate[1]
     return bool(across_x * (y_px - gate[1]) - across_y * (x_px - gate[0]) < 0.0)
 

@@ -1,7 +1,7 @@
-"""Tracks of the racer sim: a closed spline with walls on both sides and gates across it.
+"""Tracks of the racer sim: closed splines with walls on both sides, and gates between them.
 
-Pixels are those of a 1000 x 600 image: x to the right, y down, angles clockwise. One pixel is
-0.1 m. The map for viewers has its origin in the image's lower left corner, y up, and
+Pixel coordinates refer to a 1000 x 600 image: x to the right, y down, angles clockwise. One pixel
+is 0.1 m. The map for viewers has its origin in the image's lower left corner, y up, and
 counter-clockwise angles.
 """
 
@@ -54,7 +54,7 @@ CONTROL_POINTS_PX = (
 
 _SAMPLES_PER_SPAN = 32
 _STRAIGHT_PX = 220.0
-"""Length of a straight that has as many walls as a turn of 1 rad."""
+"""Length of a straight with the same number of walls as a turn of 1 rad."""
 _MARGIN_PX = 6.0
 _TIGHTEST_PX = 62.0
 """Minimum distance of random tracks from the image's edge, and minimum radius of their turns."""
@@ -86,7 +86,7 @@ def to_map(points_px: Floats) -> Floats:
 
 
 def asphalt(track: Track) -> Floats:
-    """Return triangles between the walls, one for each wall: corners (3 walls, 2), pixels."""
+    """Return the corners (3 W, 2) of the W triangles between the walls, pixels."""
     left, right = track.walls_px[:WALLS_PER_SIDE, :2], track.walls_px[WALLS_PER_SIDE:, :2]
     left_m, right_m = _progress(track.path, left), _progress(track.path, right)
     i = j = 0
@@ -103,9 +103,9 @@ def asphalt(track: Track) -> Floats:
 
 
 def _progress(path: Path, corners_px: Floats) -> list[float]:
-    """Return the distances along the path of the corners of the walls of one side.
+    """Return the distances along the path of the wall corners of one side.
 
-    The first corner is repeated at the end, a lap later.
+    The last item is the first corner again, a lap later.
     """
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
@@ -185,7 +185,7 @@ def _at(values: Floats, along: Floats, places: Floats) -> Floats:
 
 
 def _wall(line: Floats) -> Floats:
-    """Approximate a closed line by `WALLS_PER_SIDE` straight walls (W, 4), shorter in bends."""
+    """Approximate a closed line by `WALLS_PER_SIDE` walls (W, 4); they are shorter in bends."""
     tangents = _tangents(line)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(yaw)))])
@@ -217,7 +217,7 @@ def _distance(start: Floats, direction: Floats, walls: Floats) -> float:
 
 
 def _random_controls(random: np.random.Generator) -> Floats:
-    """Draw control points around the image's middle, counter-clockwise from the left."""
+    """Draw control points around the image's center, counter-clockwise from the left."""
     count = int(random.integers(11, 16))
     angles = math.pi - (np.arange(count) + random.uniform(-0.25, 0.25, count)) * (
         2 * math.pi / count
@@ -230,7 +230,7 @@ def _random_controls(random: np.random.Generator) -> Floats:
 
 
 def _drivable(controls: Floats) -> bool:
-    """Return whether a track through these points fits into the image and can be driven."""
+    """Return whether a track through these points fits into the image and is drivable."""
     center = _spline(controls)
     room = HALF_WIDTH_PX + _MARGIN_PX
     limits = np.array([IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX]) - room

@@ -31,7 +31,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     The agent drives a car of 30 x 14 pixels counter-clockwise around a closed track, which is
     defined in a top view of 1000 x 600 pixels: 48 straight walls, about 83 pixels apart, and 37
     gates. The car turns by 15 degrees per step and drives at up to 10 pixels per step, forward or
-    backward. The same seed and actions result in the same bits.
+    backward. Results are bit-identical for the same seed and actions.
 
     Rays, walls and rules use pixels of the image, y down. For viewers, poses and `info`, one pixel
     is 0.1 m and one step is 0.1 s, so that 1 pixel per step is 1 m/s. The map's axes are
@@ -54,7 +54,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     | 7 | forward left | +2 | 15 degrees to the left |
     | 8 | forward right | +2 | 15 degrees to the right |
 
-    `actions=5` has the first five of them; `actions=8` has all except `none`, numbered from 0.
+    `actions=5` allows actions 0 to 4; `actions=8` all except `none`, renumbered from 0.
 
     ## Observation Space
 
@@ -69,8 +69,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     | 18 | speed / 10 pixels per step, forward is positive |
 
     A ray of d pixels to the nearest wall is observed as ln(1 + d / 10) / ln(101). The nearest 50
-    pixels take almost two fifths of this scale, but a twentieth of the scale (1000 - d) / 1000; an
-    agent learns to complete laps in fewer steps with it.
+    pixels cover 39 % of this scale, but 5 % of the classic scale (1000 - d) / 1000; agents learn to
+    complete laps in fewer steps with the logarithmic scale.
 
     ## Rewards
 
@@ -78,8 +78,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     ## Starting State
 
-    `start="anywhere"`: a random place on the track, with an offset of up to 12 pixels and 0.2 rad
-    from its center line, at 0 to 6 pixels per step.
+    `start="anywhere"`: a random position on the track, with an offset of up to 12 pixels and 0.2
+    rad from its center line, at 0 to 6 pixels per step.
     `start="line"`: (50, 300) pixels, facing down in the image, with an offset of up to 3 pixels and
     0.05 rad, at rest; on random tracks, the start of their path.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
@@ -95,7 +95,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     ## Classic Rules
 
-    `rules="classic"` are the published rules, on a track of our own. They differ as follows:
+    `rules="classic"` are the published rules, on a different track. They differ as follows:
 
     - Forward and back are swapped: `forward` drives in the direction opposite to ray 0, so that
       gates can only be passed with `back`. The observed speed has the sign of `forward`.
@@ -105,7 +105,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
       straight observes unequal distances.
     - Rays are observed as (1000 - d) / 1000: five in six of the values are between 0.8 and 1.
     - A gate is passed if it is straight ahead of the car and within 20 pixels of its center
-      (rounded down), hence before the car crosses it. A gate that is crossed without this can
+      (rounded down), hence before the car crosses it. A gate that the car crosses otherwise can
       never be passed.
     - The reward of a crash is -1 for each wall that is hit, so -2 at a joint of walls.
     - The start is always exactly on the line, at rest.
@@ -115,10 +115,10 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     - `rules`: `"default"` or `"classic"`.
     - `observation`: `"rays"`.
-    - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, in the classic rules `"line"`.
+    - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
     - `actions`: 5, 8 or 9.
-    - `drift`: the direction of travel follows the heading by at most 100 / (speed + 1) degrees per
-      step.
+    - `drift`: whether the direction of travel follows the heading by at most 100 / (speed + 1)
+      degrees per step.
     - `track_seed`: None for the default track, or the seed of a random track, at least 0.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 
@@ -196,6 +196,6 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
 
 class BatchedRacerEnv(BatchedEnv):
-    """Many cars that are stepped together; arguments as in `RacerEnv`."""
+    """Vectorized environment of N cars; arguments as in `RacerEnv`."""
 
     fleet_type = RacerFleet

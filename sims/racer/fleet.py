@@ -76,7 +76,7 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        # Random numbers of a single start; their count selects the kind of start.
+        # Random numbers of a single start; the array's size selects the kind of start.
         self._shares = np.zeros(ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
@@ -104,11 +104,11 @@ class RacerFleet(Fleet):
         self._step()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car; one call returns reward, end and `info`."""
+        """Advance the only car; one compiled call computes reward, end and `info`."""
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
             self._numbers[action]
         )
-        # As in `_named`, without the cost of a call.
+        # Inlined copy of `_named`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -131,7 +131,7 @@ class RacerFleet(Fleet):
         arrays = (self._shares, self._cars, self._seen)
         return ready(start_car, self.track, self.classic, *arrays, examples=(0,))
 
-    # The following functions serve a fleet of one car.
+    # Functions for a fleet of one car.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], StepResult]:
@@ -143,7 +143,7 @@ class RacerFleet(Fleet):
         return copy
 
     def observation(self, i: int) -> NDArray[np.float32]:
-        """Return the numbers that car i observes."""
+        """Return the observation of car i."""
         seen: NDArray[np.float32] = self._seen[i].copy()
         return seen
 

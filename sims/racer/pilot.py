@@ -1,4 +1,4 @@
-"""Pilot of the racer sim: it steers toward free space and slows down where there is little."""
+"""Pilot of the racer sim: steers toward free space and slows down near walls."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from mcaprl.sims.racer.rules import MAX_SPEED_PX, SPEED_CHANGE_PX, THROTTLE, TUR
 from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 ROOM_EXPONENT = 1.17
-"""Exponent of a ray's length in its weight."""
+"""Exponent of a ray's length in the weight of the ray."""
 TURN_BEYOND_RAD = math.radians(7.5)
 """Half of the turn of one action."""
 STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
-"""The speed is 0.296 times the free distance ahead beyond 38.5 pixels, and at least 2."""
+"""The target speed is 0.296 times the free distance ahead beyond 38.5 pixels, at least 2."""
 
 
 @compiled
 def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
-    """Choose one of the allowed actions by the forward rays, up to 90 degrees to each side.
+    """Choose one of the allowed actions from the rays up to 90 degrees to each side.
 
-    Their mean direction, weighted by their lengths, decides the turn; the ray straight ahead
-    decides the speed. If no action does both, the turn has priority.
+    The mean direction of the rays, weighted by length, determines the turn; the ray straight ahead
+    determines the speed. If no action achieves both, the turn has priority.
     """
     lengths_px = np.empty(RAYS)
     measure(track.walls_px, car, False, lengths_px)
@@ -54,7 +54,7 @@ def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) ->
 
 
 class RacerPilot(ScriptedPilot[RacerEnv]):
-    """Driver of one racer sim's car."""
+    """Scripted driver of the racer sim's car."""
 
     def choose(self) -> int:
         """Choose the action for the current state of the car."""

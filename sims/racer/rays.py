@@ -15,7 +15,7 @@ from mcaprl.sims.racer.course import METERS_PER_PX
 
 FAR_PX = FAR_M / METERS_PER_PX
 JOINT = 1e-9
-"""Share by which walls are extended at both ends, so that no ray passes between two of them."""
+"""Fraction by which walls are extended at both ends, so that no ray passes between two walls."""
 CENTER_RAYS_DEG = (0, -30, 30, 45, -45, 90, -90, 180, 10, -10, 135, -135, 20, -20)
 """Directions of the rays from the car's center; right is positive."""
 CENTER_RAYS_RAD = tuple(math.radians(angle) for angle in CENTER_RAYS_DEG)
@@ -36,7 +36,7 @@ RAY_NAMES = (
 def crossing(
     x: float, y: float, dx: float, dy: float, line: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Return where the line through two points intersects another line.
+    """Return the intersection of the line through two points with another line.
 
     Args:
         x: x of the first point.
@@ -46,8 +46,8 @@ def crossing(
         line: (4,) x1, y1, x2, y2.
 
     Returns:
-        Position of the intersection as a share of the way from the first point to the second, and
-        as a share of `line`; both are between 0 and 1 if the segments intersect. Infinite for
+        Position of the intersection as a fraction of the segment between the points, and as a
+        fraction of `line`; both are between 0 and 1 if the segments intersect. Infinite for
         parallel lines.
     """
     ex, ey = line[2] - line[0], line[3] - line[1]
@@ -60,9 +60,9 @@ def crossing(
 
 @compiled
 def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
-    """Write a car's rays (4, 18): x and y of the start, and the vector to the end 1000 pixels away.
+    """Write a car's rays (4, 18): x and y of the start, and x and y of a vector of 1000 pixels.
 
-    The left corner's sideways ray points to the left; in the classic rules, across the car's nose.
+    The left corner's sideways ray points to the left, or in the classic rules across the nose.
     """
     cos, sin = heading_of(car.heading_rad)
     for ray in range(CENTER_RAYS):
@@ -84,7 +84,7 @@ def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
 def cast(
     walls: NDArray[np.float64], rays: NDArray[np.float64], shares: NDArray[np.float64]
 ) -> None:
-    """Compute where rays first hit a wall.
+    """Compute the first hit of each ray on a wall.
 
     The equations are those of `crossing`, without branches, so that the compiler can vectorize the
     loop over rays. Parallel lines result in inf or NaN, which fail the comparisons.
@@ -92,7 +92,7 @@ def cast(
     Args:
         walls: (W, 4) walls.
         rays: (4, R) rays as written by `write_rays`.
-        shares: (R,) output: hit as a share of the ray's length; 1 without a hit.
+        shares: (R,) output: hit as a fraction of the ray's length; 1 without a hit.
     """
     x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
     shares[:] = 1.0
@@ -111,9 +111,9 @@ def cast(
 
 @compiled
 def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float:
-    """Return the distance from a car's center to a point of a line, rounded down to whole pixels.
+    """Return the distance from a car's center to a line's point, rounded down to whole pixels.
 
-    The point is given as a share of the line's length.
+    `share` is the point's position as a fraction of the line.
     """
     hit_x = math.floor(line[0] + share * (line[2] - line[0]))
     hit_y = math.floor(line[1] + share * (line[3] - line[1]))
@@ -126,7 +126,7 @@ def floored_ray_length(
 ) -> float:
     """Return the classic length of a ray: the distance from the car's center to the nearest hit.
 
-    Hits are rounded down to whole pixels before they are compared; without a hit it is 1000.
+    Hits are rounded down to whole pixels before the comparison; 1000 without a hit.
     """
     nearest = math.inf
     for wall in walls:
@@ -140,7 +140,7 @@ def floored_ray_length(
 def measure(
     walls: NDArray[np.float64], car: Car, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays; classic lengths are all from the car's center."""
+    """Write the lengths (18,) of the car's rays; classic lengths start at the car's center."""
     rays = np.empty((4, RAYS))
     write_rays(car, classic, rays)
     if classic:
@@ -153,7 +153,7 @@ def measure(
 
 
 def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
-    """Return the rays as lines (18, start and end, x and y) to the walls, pixels."""
+    """Return the rays as segments (18, start and end, x and y) to the walls, pixels."""
     rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
     write_rays(car, False, rays)
     cast(walls, rays, shares)
@@ -163,5 +163,5 @@ def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
 
 @compiled
 def classic_code(length_px: float) -> float:
-    """Encode a length as (1000 px - d) / 1000 px: 1 is near."""
+    """Encode a length d as (1000 px - d) / 1000 px."""
     return (FAR_PX - length_px) / FAR_PX

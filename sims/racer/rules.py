@@ -1,6 +1,6 @@
-"""Equations of the racer sim, default and classic: motion, rewards, ends and observations of a car.
+"""Default and classic rules of the racer sim: motion, rewards, episode ends and observations.
 
-Pixels and angles are those of the image: y points down, so angles are clockwise.
+Coordinates are those of the image: y points down, so angles are clockwise.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ SPEED_CHANGE_PX = 2.0
 MAX_SPEED_PX = 10.0
 MAX_SPEED_M_S = MAX_SPEED_PX * METERS_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
-"""Approximate maximum turn of a drifting car's course in a step at top speed; more if slower."""
+"""Approximate maximum course change of a drifting car per step at top speed; more if slower."""
 
 BACK_M, AHEAD_M = 4.0, 8.0
 """Search window of the nearest path point, relative to the last one."""
@@ -99,7 +99,7 @@ def walls_hit(track: Track, car: Car) -> int:
 
 @compiled
 def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Car:
-    """Return the car after one action, with a passed gate counted.
+    """Return the car after one action; count the next gate if the car passed it.
 
     In the classic rules, forward and back are swapped.
     """
@@ -134,7 +134,7 @@ def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Ca
 
 @compiled
 def _with_gate(track: Track, before: Car, after: Car, classic: bool) -> Car:
-    """Return the car after a step with the next gate counted if the step passed it."""
+    """Return the car after a step; count the next gate if the car passed it."""
     gate = track.gates_px[int(after.next_gate)]
     passed = sees_gate(after, gate) if classic else crosses_gate(before, after, gate)
     if not passed:
@@ -165,7 +165,7 @@ def crosses_gate(before: Car, after: Car, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
-    """Return whether a gate (4,) is passed by the classic rules: it is ahead within 20 pixels."""
+    """Return whether a gate (4,) is ahead within 20 pixels, hence passed in the classic rules."""
     dx, dy = LOOK_PX * math.cos(car.course_rad), LOOK_PX * math.sin(car.course_rad)
     share, along_gate = crossing(car.x_px, car.y_px, dx, dy, gate)
     if not (0.0 < share < 1.0 and 0.0 < along_gate < 1.0):
@@ -177,7 +177,7 @@ def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
 def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[float, int]:
     """Return a step's reward and end: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
 
-    The reward is +1 for a gate and -1 for a crash; in the classic rules -1 for each wall hit.
+    The reward is +1 for a gate and -1 for a crash, or in the classic rules -1 for each wall hit.
     """
     hits = walls_hit(track, after)
     reward = after.gates - before.gates
@@ -248,7 +248,7 @@ def step_only_car(
     drift: bool,
     action: int,
 ) -> StepResult:
-    """Advance a single car as `step_cars` does, and return the contents of its `info` as well.
+    """Advance a single car with `step_cars`; also return the contents of its `info`.
 
     Returns:
         Reward, end, offset, heading error, speed, progress, and gates passed.
@@ -265,7 +265,7 @@ def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
     """Compute the contents of the `info` of N cars.
 
     Args:
-        cars: (N, 13) rows of `Car` and of the place where the car started.
+        cars: (N, 13) rows: the `Car`, and its initial distance along the path.
         info: (5, N) output: offsets, heading errors, speeds, progress and gates.
     """
     for i in range(len(cars)):

@@ -1,4 +1,4 @@
-"""Starts of the racer sim's episodes."""
+"""Starting states of the racer sim."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread
 
 ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
-"""Number of random numbers of each kind of start."""
+"""Number of random numbers for each kind of start."""
 
 
 @compiled
@@ -30,7 +30,7 @@ def start_exactly(track: Track) -> Car:
 
 @compiled
 def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
-    """Return a car at rest near the line; two numbers from 0 to 1 decide offset and heading."""
+    """Return a car at rest near the line; two random numbers set its offset and heading."""
     x_px, y_px, heading_rad = track.start_px
     left_px, left_rad = spread(shares[0], 3.0), spread(shares[1], 0.05)
     x_px += left_px * math.sin(heading_rad)
@@ -40,7 +40,7 @@ def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def start_anywhere(track: Track, shares: NDArray[np.float64]) -> Car:
-    """Return a car on the track; four numbers from 0 to 1 decide place, speed, offset, heading."""
+    """Return a car on the track; four random numbers set position, speed, offset and heading."""
     along_m, speed_px = track.path.length_m * shares[0], 6.0 * shares[1]
     left_px, left_rad = spread(shares[2], 12.0), spread(shares[3], 0.2)
     x_m, y_m = point_at(track.path, along_m)
@@ -59,14 +59,14 @@ def start_car(
     observations: NDArray[np.float32],
     i: int,
 ) -> None:
-    """Start car i of N, and write its state and observation.
+    """Start car i of N; write its state and observation.
 
     Args:
         track: Track of the cars.
         classic: Whether the classic rules apply.
         shares: Random numbers from 0 to 1: (4,) for a start anywhere, (2,) near the line, (0,)
             exactly on the line.
-        cars: (N, 13) rows of `Car`, and of its start along the path.
+        cars: (N, 13) rows: the `Car`, and its initial distance along the path.
         observations: (N, 19) output.
         i: Index of the car.
     """
@@ -82,10 +82,10 @@ def start_car(
 
 
 def car_from(track: Track, options: dict[str, Any]) -> Car:
-    """Read a start from the options of `reset`.
+    """Return the starting state in the options of `reset`.
 
     Raises:
-        UsageError: There is another option, or the pose is malformed or not on the track.
+        UsageError: An option is unknown, or the pose is malformed or not on the track.
     """
     pose = pose_from(options, -MAX_SPEED_M_S, MAX_SPEED_M_S)
     x_px, y_px = pose.x_m / METERS_PER_PX, IMAGE_HEIGHT_PX - pose.y_m / METERS_PER_PX
@@ -95,6 +95,6 @@ def car_from(track: Track, options: dict[str, Any]) -> Car:
     if abs(car.offset_m) > half_width_m or walls_hit(track, car):
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {abs(car.offset_m):.1f} m from the middle of the"
-            f" track: the whole car must be inside the walls, {half_width_m} m from it"
+            f" track: the whole car must be inside the walls at {half_width_m} m"
         )
     return car

@@ -26,7 +26,7 @@ _ARROWS = {"forward": (0, -1), "left": (-1, 0), "back": (0, 1), "right": (1, 0)}
 
 
 class RacerView:
-    """Renderer of one image for each step, which mode `human` shows in a window."""
+    """Renderer of one image per step, shown in a window in mode `human`."""
 
     def __init__(self, render_mode: Literal["human", "rgb_array"], track: Track) -> None:
         """Prepare the shapes that never change.

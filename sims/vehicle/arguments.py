@@ -1,4 +1,4 @@
-"""Validation of the arguments that a user passes to a sim; each message says what is allowed."""
+"""Validation of the arguments that a user passes to a sim."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Pose(NamedTuple):
 
 
 def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
-    """Validate that a value is one of those allowed.
+    """Validate that a value is allowed.
 
     Raises:
-        UnknownNameError: The value is not allowed; the message lists those that are.
+        UnknownNameError: The value is not allowed; the message lists the allowed ones.
     """
     if value not in allowed:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
@@ -70,7 +70,7 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
             f" not {numbers.dtype} of shape {numbers.shape}"
         )
     numbers = numbers.astype(np.int64, copy=False)
-    # Viewed as unsigned, negative numbers are the largest.
+    # As unsigned integers, negative actions exceed `count`, too.
     does_not_exist = numbers.view(np.uint64) >= count
     if does_not_exist.any():
         wrong = numbers[does_not_exist][0]
@@ -84,11 +84,10 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
     Args:
         options: Options of `reset`.
         names: Names, with units, of all numbers that a pose can have.
-        least: Number of those that it must have; the others default to 0.
+        least: Number of required values; the others default to 0.
 
     Raises:
-        UsageError: There is another option, or the pose does not consist of this many finite
-            numbers.
+        UsageError: There is another option, or the pose has a wrong length or is not finite.
     """
     if set(options) != {"pose"}:
         raise UsageError(f"reset accepts only the option 'pose', not {sorted(set(options))}")

@@ -24,16 +24,16 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """N vehicles of one sim, stepped together.
 
     Vehicle i behaves as a single environment of the sim that is seeded with `seed + i` and wrapped
-    in a TimeLimit: observations, rewards, ends and infos are equal bit for bit. Infos have
+    in a TimeLimit: observations, rewards, ends and infos are identical. Infos have
     Gymnasium's vector format: an array for each key, and a mask `_key` of the environments that
     have the key.
 
     `reset` accepts the options of the sim's single environment, for all vehicles; a `pose` of shape
-    (N, K) has one row for each vehicle. With `reset_mask`, (N,) bools, only some are reset.
+    (N, K) has one row for each vehicle. `reset_mask`, (N,) bools, selects the vehicles to reset.
 
-    The autoreset mode is one of Gymnasium's. `NextStep` resets in the step after an end and ignores
-    its action. `SameStep` resets at once, with the last observation in `final_obs` and its info in
-    `final_info`. `Disabled` leaves the reset to the caller, with a `reset_mask`.
+    The autoreset modes are Gymnasium's. `NextStep` resets in the step after an episode's end and
+    ignores the action of that step. `SameStep` resets immediately and returns the last observation
+    in `final_obs` and its info in `final_info`. With `Disabled`, the caller resets.
     """
 
     fleet_type: ClassVar[type[Fleet]]
@@ -46,16 +46,16 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **kwargs: Any,
     ) -> None:
-        """Make N vehicles.
+        """Create N vehicles.
 
         Args:
             num_envs: Number of vehicles N, at least 1.
             max_episode_steps: Steps after which an episode is truncated; None for no limit.
-            autoreset_mode: When an ended episode is followed by the next.
+            autoreset_mode: Autoreset mode, as described for the class.
             **kwargs: Arguments of the sim's single environment, except `render_mode`.
 
         Raises:
-            UnknownNameError: An argument has a value that is not in its list.
+            UnknownNameError: An argument has an unknown value.
             UsageError: A number is outside its range.
         """
         if kwargs.pop("render_mode", None) is not None:
@@ -70,7 +70,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._adopt_spaces(self.fleet)
         self._truncates = np.array(self.fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # An episode that goes on has no reason.
+        # A running episode has no reason.
         self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -97,8 +97,8 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         """Start episodes.
 
         Args:
-            seed: Seed of the first vehicle, vehicle i using seed + i; or one seed for each; or None
-                to continue with the present random generators.
+            seed: Seed of the first vehicle (vehicle i uses seed + i), one seed for each vehicle, or
+                None to keep the current random generators.
             options: Options as described for the class.
 
         Raises:
@@ -117,7 +117,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self.fleet.observations(), self._infos_of(chosen, np.zeros_like(chosen))
 
     def step(self, actions: Any) -> tuple[Any, NDArray[np.float64], Bools, Bools, dict[str, Any]]:
-        """Take one step with each vehicle.
+        """Advance each vehicle by one step.
 
         Args:
             actions: (N,) integers.
@@ -135,7 +135,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
         fleet.advance()
         self._steps += 1
-        # For episodes that had ended before, this step is the reset.
+        # This step resets the episodes that ended in an earlier step.
         self._begin_all(np.flatnonzero(fresh))
         has_reason = fleet.ends != GOING_ON
         terminated, truncated = has_reason, self._steps >= self._max_steps
@@ -152,7 +152,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return self.fleet.places()
 
     def _check_can_step(self) -> Bools:
-        """Return which episodes have ended and are reset in this step."""
+        """Return a mask of the ended episodes, which this step resets."""
         if not self._is_started:
             raise gym.error.ResetNeeded("call reset() before step()")
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
@@ -223,7 +223,7 @@ def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int |
 
 
 def _mask_of(mask: Any, count: int) -> Bools:
-    """Return which vehicles to reset: all if there is no mask."""
+    """Return a mask of the vehicles to reset: all by default."""
     if mask is None:
         return np.ones(count, dtype=np.bool_)
     chosen = np.asarray(mask)

@@ -1,4 +1,4 @@
-"""Random numbers for the starts of episodes, drawn ahead of their use."""
+"""Random numbers for the starts of episodes, drawn in advance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _AHEAD = 32
 def take(numbers: NDArray[np.float64], used: NDArray[np.int64], i: int) -> NDArray[np.float64]:
     """Return the next (size,) numbers of generator i from the arrays of a `Draws`.
 
-    `draw_ahead` must have made sure that there are some.
+    Call `draw_ahead` first.
     """
     used[i] += 1
     row: NDArray[np.float64] = numbers[i, used[i] - 1]
@@ -25,19 +25,19 @@ def take(numbers: NDArray[np.float64], used: NDArray[np.int64], i: int) -> NDArr
 
 @compiled
 def spread(share: float, most: float) -> float:
-    """Map a number from 0 to 1 to one from -most to most."""
+    """Map [0, 1] linearly to [-most, most]."""
     return (2.0 * share - 1.0) * most
 
 
 class Draws:
-    """Numbers from 0 to 1 of N generators, each generator's in its own order.
+    """Numbers from 0 to 1 of N generators, each in the order of its generator.
 
-    A call of a generator takes a microsecond even for a few numbers. Therefore the numbers of many
-    starts are drawn in one call.
+    A generator call takes a microsecond even for a few numbers, so one call draws the numbers of
+    many starts.
 
     Attributes:
-        numbers: (N, ahead, size) numbers drawn ahead.
-        used: (N,) number of draws that are used up.
+        numbers: (N, ahead, size) numbers drawn in advance.
+        used: (N,) number of used draws.
     """
 
     def __init__(self, count: int, size: int) -> None:
@@ -47,19 +47,19 @@ class Draws:
         self._generators: list[Any] = [None] * count
 
     def use_generator(self, i: int, generator: np.random.Generator) -> None:
-        """Use a generator for vehicle i from now on; numbers drawn from another are dropped."""
+        """Assign a generator to vehicle i; numbers drawn from another generator are dropped."""
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 
     def one(self, i: int, numbers: NDArray[np.float64]) -> None:
-        """Write the next numbers of generator i into a (size,) array, without drawing ahead."""
+        """Write the next numbers of generator i into a (size,) array; draw none in advance."""
         if self.used.item(i) == _AHEAD:
             self._generators[i].random(out=numbers)
         else:
             numbers[:] = take(self.numbers, self.used, i)
 
     def draw_ahead(self, chosen: NDArray[np.int64]) -> None:
-        """Make sure that `take` finds numbers of these (K,) generators."""
+        """Draw numbers for `take` from those of these (K,) generators that have none left."""
         for i in chosen[self.used[chosen] == _AHEAD].tolist():
             self._generators[i].random(out=self.numbers[i])
             self.used[i] = 0

@@ -31,10 +31,10 @@ AnyView = TypeVar("AnyView", bound=View)
 
 
 class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
-    """Environment that opens its renderer when it is first needed."""
+    """Environment that creates its renderer on first use."""
 
     def __init__(self, render_mode: RenderMode | None) -> None:
-        """Choose a render mode.
+        """Set the render mode.
 
         Raises:
             UnknownNameError: There is no such render mode.
@@ -45,7 +45,7 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
 
     @abstractmethod
     def _open_view(self, render_mode: RenderMode) -> AnyView:
-        """Make the renderer of the sim; pygame is first imported here."""
+        """Create the renderer of the sim; this imports pygame."""
 
     @abstractmethod
     def _draw(self, view: AnyView) -> NDArray[np.uint8]:
@@ -68,7 +68,7 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
 
 
 class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
-    """Environment of one vehicle: seeding, steps, ends and rendering, the same in all sims."""
+    """Environment of one vehicle; all sims share its seeding, steps, ends and rendering."""
 
     trail_length: int = 40
     success_reasons: ClassVar[tuple[str, ...]]
@@ -88,7 +88,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        # Attributes of this object are faster to look up in each step.
+        # Attributes of this object are faster to look up than the fleet's.
         self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
@@ -121,7 +121,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # This call only raises the error; calling it in every step would be slower.
+            # Raises the error; calling this in every step would be slower.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -141,7 +141,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @property
     def trail(self) -> list[tuple[float, ...]]:
-        """Last positions of the vehicle, at least one, since the trail was first read."""
+        """Last positions of the vehicle, at least one, recorded since the first read."""
         self._is_watched = True
         if not self._trail:
             self._trail.append(self.place)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.geometry.compiled import ready
 
 GOING_ON = 0
-"""Value of `Fleet.ends` while an episode goes on."""
+"""Value of `Fleet.ends` while an episode runs."""
 
 
 class Fleet(ABC):
@@ -28,7 +28,7 @@ class Fleet(ABC):
         step_duration_s: Simulated time of one step.
         actions: (N,) valid actions of the next step.
         rewards: (N,) rewards of the last step; 0 after a start.
-        ends: (N,) `GOING_ON`, or the index in `reasons` of why the last step ended the episode.
+        ends: (N,) `GOING_ON`, or the index in `reasons` of the reason why the episode ended.
         noise: (N, K) standard normal numbers that the environment draws for the next step; K is 0
             if steps are deterministic.
     """
@@ -83,10 +83,10 @@ class Fleet(ABC):
 
     @abstractmethod
     def advance(self) -> None:
-        """Take one step with each vehicle, with the actions in `actions`."""
+        """Advance each vehicle by one step with its action in `actions`."""
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Take a step with the only vehicle of a fleet of one.
+        """Advance the only vehicle of a fleet of one.
 
         Args:
             action: Valid action.
@@ -111,10 +111,7 @@ class Fleet(ABC):
         return ready(*self._kernel())
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copies, without the cached properties.
-
-        Those refer to this fleet's arrays; the copy computes its own.
-        """
+        """Return the state for copies, without cached properties: they refer to our arrays."""
         kind = type(self)
         return {
             name: value
@@ -125,8 +122,8 @@ class Fleet(ABC):
     def imitate(self, i: int, other: Fleet, j: int) -> None:
         """Copy the state of vehicle j of another fleet of the same class into vehicle i.
 
-        The state of vehicles are arrays with one row for each vehicle, and dicts from a vehicle's
-        index to a cached value.
+        The state is stored in arrays with one row for each vehicle, and in dicts of cached values
+        by the index of the vehicle.
         """
         for name, theirs in vars(other).items():
             mine = getattr(self, name)

@@ -1,4 +1,4 @@
-"""Base class of the scripted drivers."""
+"""Base class of the scripted policies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ AnySim = TypeVar("AnySim")
 
 
 class ScriptedPilot(ABC, Generic[AnySim]):
-    """Policy that reads the whole state of one environment and ignores its observations."""
+    """Policy that reads the full state of one environment and ignores its observations."""
 
     name: ClassVar[str] = "pilot"
 
@@ -24,7 +24,7 @@ class ScriptedPilot(ABC, Generic[AnySim]):
         """Return the action, shape (1,), for the current state of the environment.
 
         Args:
-            observations: Observations with a leading dimension of 1, or a dict of such.
+            observations: Observations with a leading dimension of 1, or a dict of them.
 
         Raises:
             ValueError: The observations are of more than one environment.

@@ -59,7 +59,7 @@ def test_a_pose_is_kept() -> None:
 
 @pytest.mark.parametrize("place", [(20.0, 30.0), (1.0, 30.0), (-50.0, 0.0)])
 def test_a_pose_beside_the_track_or_in_a_wall_is_refused(place: tuple[float, float]) -> None:
-    with pytest.raises(UsageError, match="must be inside the walls, 4\\.15 m from it"):
+    with pytest.raises(UsageError, match="must be inside the walls at 4\\.15 m"):
         racer().reset(options={"pose": (*place, -math.pi / 2)})
 
 
