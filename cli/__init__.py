@@ -1,8 +1,8 @@
-"""The command line: parse, call, print. `mcaprl --help` lists the commands.
+"""Command-line interface; `mcaprl --help` lists the commands.
 
-Every command exits 0 on success, 1 on failure, 2 on wrong usage. A user's mistake is one line on
-stderr. Each command calls the function of the public API that has its name; engines are imported
-when a command runs, so that `mcaprl info` needs no torch.
+Every command exits 0 on success, 1 on failure, 2 on invalid usage. User errors are printed as one
+line on stderr. Each command calls the public API function of the same name. Torch and numba are
+imported only by the commands that need them.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from mcaprl.cli.export import export
 from mcaprl.cli.logs import check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
+from mcaprl.cli.show import echo
 from mcaprl.cli.train_offline import train_offline
 from mcaprl.cli.train_online import train_online
 from mcaprl.errors import McaprlError
@@ -30,7 +31,7 @@ from mcaprl.errors import McaprlError
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, prog_name="mcaprl", message="%(prog)s %(version)s")
 def cli() -> None:
-    """The robot's log is the dataset: record, learn from and replay MCAP files."""
+    """Record reinforcement learning episodes as MCAP logs, learn from logs, and replay them."""
 
 
 _COMMANDS = (
@@ -54,10 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the program and exit.
 
     Args:
-        arguments: Command line without the name of the program; None for that of the process.
+        arguments: Command-line arguments; None for those of the process.
     """
-    # A terminated recording closes its file, as an interrupted one does; so does one whose terminal
-    # is closed, unless it was started with nohup.
+    # On SIGTERM and SIGHUP, a recording closes its file as on Ctrl-C. SIGHUP stays ignored under
+    # nohup.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str] | None = None) -> int:
-    """Run the program and return its exit code; report the user's errors on stderr."""
+    """Run the program and return its exit code; print user errors to stderr."""
     try:
         code = cli.main(arguments, prog_name="mcaprl", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -82,16 +83,16 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _fail(f"{error.filename or 'output'}: {error.strerror}", 1)
     except (click.Abort, KeyboardInterrupt):
-        return _fail("interrupted; what was finished is kept", 1)
+        return _fail("interrupted; finished work is kept", 1)
     return code if isinstance(code, int) else 0
 
 
 def _fail(message: str, code: int) -> int:
     line = " ".join(message.split())
-    click.echo(f"mcaprl: {line}", err=True)
+    echo(f"mcaprl: {line}", err=True)
     return code
 
 
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Print a warning on one line, without its place in the source."""
-    click.echo(f"mcaprl: warning: {' '.join(str(message).split())}", err=True)
+    """Print a warning on one line, without its source location."""
+    echo(f"mcaprl: warning: {' '.join(str(message).split())}", err=True)

@@ -1,4 +1,4 @@
-"""`mcaprl evaluate`: returns of policies and their uncertainty, in a sim or from logs alone."""
+"""`mcaprl evaluate`: returns of policies with intervals, in a sim or estimated from logs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 
 import mcaprl
 from mcaprl.cli.options import sim_options
-from mcaprl.cli.show import print_json, print_table
+from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
 from mcaprl.sims.evaluation.statistics import interquartile_mean
@@ -27,7 +27,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
 @click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
-@click.option("--data", help="Logs for estimates without a sim.")
+@click.option("--data", help="Logs to estimate from, without a sim.")
 @click.option(
     "--episodes",
     default=30,
@@ -59,11 +59,11 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
     type=click.IntRange(1),
     help="With --data: number of threads that read chunks.  [default: 1]",
 )
-@click.option("--behavior", metavar="DATA", help="Logs whose returns are compared with.")
-@click.option("--record", type=click.Path(path_type=Path), help="Log of the episodes.")
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for a page and images.")
-@click.option("--overwrite", is_flag=True, help="Replacement of an existing log.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+@click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
+@click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
+@click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing log.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def evaluate(
     policies: tuple[str, ...],
     sim: str | None,
@@ -73,16 +73,16 @@ def evaluate(
     as_json: bool,
     **others: Any,
 ) -> None:
-    """Run each POLICY greedily through the same episodes of SIM, or estimate from the logs DATA.
+    """Evaluate each POLICY on the same episodes of SIM, or estimate its return from logs.
 
-    POLICY is pilot, random, or a trained run; of a run with several seeds each is evaluated. Scores
-    are on the scale where random is 0 and pilot is 1, if the sim has a pilot. Without a sim the
-    values are estimates of discounted returns, each with a verdict on whether the logs suffice.
+    POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
+    Scores are normalized to random = 0 and pilot = 1 if the sim has a pilot. Without a sim, values
+    are estimates of discounted returns, each with a verdict on whether the logs suffice.
     """
     given = {name: value for name, value in others.items() if value}
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
-        # Zero is a value of these options.
+        # 0 is a valid value of these options.
         given = {name: others[name] for name in _OF_DATA if others[name] is not None}
         estimates = mcaprl.estimate(policies, data, seed=seed, progress=terminal_bar, **given)
         print_json(estimates.to_json()) if as_json else _print_estimates(estimates)
@@ -93,13 +93,13 @@ def evaluate(
         )
         print_json(found.to_json()) if as_json else _print_scores(found, episodes)
     else:
-        raise UsageError("evaluate needs --sim SIM or --data DATA, one of the two")
+        raise UsageError("evaluate needs either --sim SIM or --data DATA")
 
 
 def _refuse_unused(given: dict[str, Any], names: Sequence[str], needed: str) -> None:
     for name in names:
         if name in given:
-            raise UsageError(f"--{name} is of use with --{needed} only")
+            raise UsageError(f"--{name} requires --{needed}")
 
 
 def _print_scores(found: Evaluation, episodes: int) -> None:
@@ -134,7 +134,7 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
             "policy",
             "mean return",
             "95 % interval",
-            "middle half",
+            "IQM",
             "random 0, pilot 1",
             "success",
             "ends",
@@ -146,7 +146,7 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
 
 def _print_improvements(compared: Sequence[Improvement]) -> None:
     print_table(
-        "how often an episode of one returns more than an episode of the other",
+        "probability that an episode of one policy has a higher return than one of the other",
         ["policy", "than", "probability", "95 % interval"],
         [
             [one.better, one.than, f"{one.probability:.2f}", _interval(one.interval)]
@@ -174,13 +174,13 @@ def _print_estimates(found: LogEstimates) -> None:
         rows,
     )
     coverage = ", ".join(f"{share:.0%} by {name}" for name, share in found.coverage.items())
-    click.echo(f"logged actions that the policies would take: {coverage}")
+    echo(f"logged actions that the policies would take: {coverage}")
     if found.behavior_calibration is not None:
-        click.echo(f"behavior_prob of the logs implies {found.behavior_calibration}")
+        echo(f"behavior_prob of the logs implies {found.behavior_calibration}")
     if (order := found.ranking) is not None:
-        click.echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
+        echo(f"best first, by {order['estimator']}: {', '.join(order['policies'])}")
         if not order["trusted"]:
-            click.echo("no estimator has a verdict on all of them: do not choose by this order")
+            echo("no estimator is trusted for all policies: do not rely on this order")
 
 
 def _interval(interval: Sequence[float], digits: int = 2) -> str:

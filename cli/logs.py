@@ -1,4 +1,4 @@
-"""`mcaprl info`, `check`, `recover` and `layout`: contents and condition of logs."""
+"""`mcaprl info`, `check`, `recover` and `layout`: commands on logs."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from pathlib import Path
 import click
 
 import mcaprl
-from mcaprl.cli.show import print_facts, print_json, print_problems
+from mcaprl.cli.show import echo, print_facts, print_json, print_problems
 from mcaprl.texts import counted
 
-# Exit code of `recover` if the new file lacks anything of the old one.
+# Exit code of `recover` if data is lost.
 _WITH_LOSSES = 3
 
 
 @click.command()
 @click.argument("data", nargs=-1, required=True)
-@click.option("--report", type=click.Path(path_type=Path), help="Folder for a page and an image.")
-@click.option("--strict", is_flag=True, help="Exit code 1 if there are problems.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+@click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
+@click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option(
     "--threads",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Number of threads that decompress chunks; of use for large logs.",
+    help="Number of threads that decompress chunks; useful for large logs.",
 )
 def info(
     data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
@@ -40,13 +40,13 @@ def info(
         rows += [("notes", "\n".join(notes))] if notes else []
         print_facts(found.title, rows)
         for moment in found.moments:
-            click.echo(moment)
+            echo(moment)
     return int(strict and bool(found.problems))
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option(
     "--threads",
     type=click.IntRange(1),
@@ -55,16 +55,16 @@ def info(
     help="Number of threads that decompress chunks.",
 )
 def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
-    """Read every byte of FILE... and list what is wrong. Exits with 1 if anything is."""
+    """Read FILE... completely and list all problems. Exits with 1 if there are any."""
     found = mcaprl.check(files, threads=threads)
     if as_json:
         print_json(found.to_json())
         return int(not found.ok)
     for problem in found.missing:
-        click.echo(f"mcaprl: {problem.what}", err=True)
+        echo(f"mcaprl: {problem.what}", err=True)
     print_problems(problem for problem in found.problems if problem not in found.missing)
     if found.ok:
-        click.echo(f"{counted(len(found.files), 'file')} checked, nothing wrong")
+        echo(f"{counted(len(found.files), 'file')} checked, no problems")
     return int(not found.ok)
 
 
@@ -74,14 +74,14 @@ def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
 @click.option(
     "--keep-unfinished",
     is_flag=True,
-    help="Unfinished episodes up to their last whole transition, marked truncated.",
+    help="Keep unfinished episodes up to their last complete transition, marked truncated.",
 )
-@click.option("--overwrite", is_flag=True, help="Replacement of an existing file.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
-    """Write the valid part of FILE, cut off or damaged, to OUT, which is then a valid log.
+    """Write the valid part of a damaged or cut-off FILE to the new log OUT.
 
-    Exits with 0 if nothing is lost, with 3 if something is, with 1 if nothing can be kept.
+    Exits with 0 if nothing is lost, 3 if data is lost, 1 if nothing can be kept.
     """
     found = mcaprl.recover(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
     if as_json:
@@ -89,7 +89,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     else:
         ended = f", {found.ended} of them without their end" if found.ended else ""
         episodes = counted(found.episodes, "episode")
-        click.echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
+        echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
         print_problems(found.problems)
     return _WITH_LOSSES if found.has_losses else 0
 
@@ -97,8 +97,8 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
 @click.command()
 @click.argument("source", metavar="SIM|FILE")
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="JSON file to write.")
-@click.option("--overwrite", is_flag=True, help="Replacement of an existing file.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
     mcaprl.layout(source, out, overwrite=overwrite)
-    click.echo(f"{out}: in Foxglove, open the layout menu and import this file")
+    echo(f"{out}: in Foxglove, open the layout menu and import this file")

@@ -1,4 +1,4 @@
-"""Options that several commands have."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -15,3 +15,23 @@ def sim_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )
     rules = click.option("--rules", help="Rules of the sim: default, classic, ...")
     return observation(rules(command))
+
+
+def trust_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the option that trusts the environment of a log."""
+    return click.option(
+        "--trust-env",
+        is_flag=True,
+        help="Trust in FILE: import the module in its environment's id, and pass on all arguments.",
+    )(command)
+
+
+def origin_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the option that lets a web page connect to the live server."""
+    return click.option(
+        "--allow-origin",
+        multiple=True,
+        metavar="ORIGIN",
+        help="Another web page that may connect, such as https://viewer.example; may be given"
+        " repeatedly.",
+    )(command)

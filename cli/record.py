@@ -1,4 +1,4 @@
-"""`mcaprl record`: a policy acts, and the log stores each step."""
+"""`mcaprl record`: logs of a policy in a sim."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 
 import mcaprl
 from mcaprl.cli.options import sim_options
+from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_bar
 from mcaprl.recorder.format.writing import COMPRESSIONS
 from mcaprl.texts import counted, size
@@ -38,8 +39,8 @@ from mcaprl.texts import counted, size
     help="Number of processes; with more than one, OUT is a folder with one file per process.",
 )
 @sim_options
-@click.option("--no-scene", is_flag=True, help="Omission of the topics that only viewers show.")
-@click.option("--camera", is_flag=True, help="Metric depth images on /camera/depth.")
+@click.option("--no-scene", is_flag=True, help="Omit the topics that only viewers use.")
+@click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
 @click.option(
     "--compression",
     default="zstd",
@@ -47,21 +48,21 @@ from mcaprl.texts import counted, size
     type=click.Choice(COMPRESSIONS),
     help="Compression of chunks.",
 )
-@click.option("--overwrite", is_flag=True, help="Replacement of an existing file.")
-@click.option("--append", is_flag=True, help="Addition of the episodes to an existing file.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.option("--append", is_flag=True, help="Add the episodes to an existing file.")
 @click.option(
     "--rotate-mb",
     type=click.FloatRange(0, min_open=True),
-    help="Size in MB after which another file is begun (OUT-00000.mcap, OUT-00001.mcap, ...).",
+    help="Size in MB after which a new file is started (OUT-00000.mcap, OUT-00001.mcap, ...).",
 )
 def record(no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 
-    SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each finished episode is on
-    disk at once.
+    SIM is lane, powerline, racer, highway-lane, or any Gymnasium id. Each episode is
+    written when it ends.
     """
     found = mcaprl.record(**request, scene=not no_scene, progress=terminal_bar)
-    click.echo(
+    echo(
         f"{found.out}: {counted(found.episodes, 'episode')}, {counted(found.steps, 'step')},"
         f" mean return {found.mean_return:.2f} (standard deviation {found.return_std:.2f}),"
         f" {size(found.size_bytes)}"

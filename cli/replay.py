@@ -1,4 +1,4 @@
-"""`mcaprl replay`: logged episodes in Foxglove or as a video, and the same steps in the sim."""
+"""`mcaprl replay`: logged episodes in Foxglove, as a video, or compared with the sim."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 import mcaprl
-from mcaprl.cli.show import print_address, print_problems
+from mcaprl.cli.options import origin_option, trust_option
+from mcaprl.cli.show import echo, print_address, print_problems
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
 from mcaprl.recorder.dataset.open import find_logs
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--episode", type=click.IntRange(0), help="Index of the only episode, from 0.")
+@click.option("--episode", type=click.IntRange(0), help="Index of a single episode, from 0.")
 @click.option(
     "--speed",
     default=1.0,
@@ -28,46 +29,51 @@ if TYPE_CHECKING:
     type=click.FloatRange(0, min_open=True),
     help="Simulated seconds per second.",
 )
-@click.option("--loop", is_flag=True, help="New start at the end.")
+@click.option("--loop", is_flag=True, help="Restart at the end.")
 @click.option(
     "--port",
     default=8765,
     show_default=True,
     type=click.IntRange(0, 65535),
-    help="Port of 127.0.0.1; 0 for any free one.",
+    help="Port on 127.0.0.1; 0 for any free port.",
 )
-@click.option("--verify", "verifies", is_flag=True, help="Comparison with the steps of the sim.")
+@origin_option
+@click.option("--verify", "verifies", is_flag=True, help="Compare each step with the sim.")
 @click.option("--video", type=click.Path(path_type=Path), help="Video to write: .mp4 or .gif.")
-@click.option("--contact-sheet", type=click.Path(path_type=Path), help="Stills to write: .png.")
-@click.option("--overwrite", is_flag=True, help="Replacement of an existing video or image.")
-@click.option("--sim", help="Sim to step instead of the one that the log names.")
+@click.option("--contact-sheet", type=click.Path(path_type=Path), help="Image to write: .png.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing video or image.")
+@click.option("--sim", help="Sim to step instead of the logged one.")
+@trust_option
 def replay(
     files: tuple[str, ...],
     episode: int | None,
     speed: float,
     loop: bool,
     port: int,
+    allow_origin: tuple[str, ...],
     verifies: bool,
     sim: str | None,
+    trust_env: bool,
     video: Path | None,
     contact_sheet: Path | None,
     overwrite: bool,
 ) -> int:
-    """Play FILE... to Foxglove; check it with --verify; or draw an episode with --video.
+    """Play FILE... in Foxglove, compare it with the sim, or render an episode as a video.
 
     Several files play side by side: all start at the same time, each with its own topic prefix.
     """
     if verifies:
-        same = [_verify(path, episode, sim) for path in find_logs(files)]
+        same = [_verify(path, episode, sim, trust_env) for path in find_logs(files)]
         return int(not all(same))
     if video or contact_sheet:
         paths = find_logs(files)
         if len(paths) > 1:
-            raise UsageError("a video shows one file: give each file its own")
+            raise UsageError("a video shows one file: render each file separately")
         drawn = mcaprl.render(
             paths[0],
             episode=episode or 0,
             sim=sim,
+            trust_env=trust_env,
             speed=speed,
             video=video,
             contact_sheet=contact_sheet,
@@ -75,26 +81,36 @@ def replay(
             progress=terminal_bar,
         )
         if video:
-            click.echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
+            echo(f"{video}: {drawn.frames} images of episode {drawn.episode}")
         if contact_sheet:
-            click.echo(f"{contact_sheet}: {drawn.stills} stills of episode {drawn.episode}")
+            echo(f"{contact_sheet}: {drawn.stills} stills of episode {drawn.episode}")
         return 0
-    mcaprl.replay(files, episode=episode, speed=speed, loop=loop, port=port, on_open=_print_open)
-    click.echo("ended")
+    mcaprl.replay(
+        files,
+        episode=episode,
+        speed=speed,
+        loop=loop,
+        port=port,
+        allow_origin=allow_origin,
+        on_open=_print_open,
+    )
+    echo("ended")
     return 0
 
 
 def _print_open(address: LiveAddress) -> None:
     print_address(address)
-    click.echo("Ctrl-C ends it")
+    echo("press Ctrl-C to stop")
 
 
-def _verify(path: Path, episode: int | None, sim: str | None) -> bool:
+def _verify(path: Path, episode: int | None, sim: str | None, trust_env: bool) -> bool:
     """Compare one file with the sim, and print the result; return whether all is the same."""
-    found = mcaprl.verify(path, episode=episode, sim=sim, progress=terminal_bar)
+    found = mcaprl.verify(
+        path, episode=episode, sim=sim, trust_env=trust_env, progress=terminal_bar
+    )
     print_problems(found.problems(str(path)))
     if found.difference is None and found.episodes:
-        click.echo(
+        echo(
             f"{path}: {counted(found.episodes, 'episode')} and {counted(found.steps, 'step')}"
             " compared: every observation, reward and end is the same, bit for bit"
         )

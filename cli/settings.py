@@ -1,4 +1,4 @@
-"""Options from the settings of algorithms: one per field, with its doc line as the help."""
+"""Command-line options from the fields of the settings of algorithms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class SettingsCommand(click.Command):
 
         Args:
             *arguments: Arguments of `click.Command`.
-            configs: Loads the algorithms, and returns their default settings.
+            configs: Function that loads the algorithms and returns their default settings.
             **others: Arguments of `click.Command`.
         """
         super().__init__(*arguments, **others)
@@ -34,8 +34,8 @@ class SettingsCommand(click.Command):
 def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
     """Return an option for each field of several algorithms' settings.
 
-    The first algorithm that has a field describes it. An omitted option is None, so that the
-    algorithm's own default is used.
+    Help and default come from the first algorithm that has the field. An omitted option is None,
+    so that the algorithm's default is used.
     """
     options: dict[str, click.Option] = {}
     for config in configs:

@@ -1,4 +1,4 @@
-"""Output of commands on stdout: JSON for programs, tables for people."""
+"""Output of commands on stdout, as JSON or tables."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.text import Text
 
 from mcaprl.files import json_text
 from mcaprl.problem import Problem
+from mcaprl.texts import printable
 
 if TYPE_CHECKING:
     from mcaprl.api.replay import LiveAddress
@@ -20,41 +21,49 @@ if TYPE_CHECKING:
 _PIPE_WIDTH = 120
 
 
+def echo(text: object, *, err: bool = False) -> None:
+    """Print a line to stdout or stderr; texts from data cannot control the terminal."""
+    click.echo(printable(text).replace("\n", r"\n"), err=err)
+
+
 def print_json(value: Any) -> None:
     """Print one JSON object to stdout; NaN and infinities become null."""
-    click.echo(json_text(value))
+    # JSON need not escape this control character.
+    click.echo(json_text(value).replace("\x7f", r"\u007f"))
 
 
 def print_problems(problems: Iterable[Problem]) -> None:
     """Print one line for each problem to stdout."""
     for problem in problems:
-        click.echo(problem)
+        echo(problem)
 
 
 def print_address(address: LiveAddress) -> None:
-    """Print where a viewer connects, and the layout that it imports."""
-    click.echo(f"open {address.app_url}")
-    click.echo(f"or connect any viewer of the Foxglove protocol to {address.url}")
-    click.echo(f"layout to import: {address.layout}")
+    """Print the addresses for viewers, and the path of the layout to import."""
+    echo(f"open {address.app_url}")
+    echo(f"or connect any viewer of the Foxglove protocol to {address.url}")
+    echo(f"layout to import: {address.layout}")
 
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """Print a table to stdout: the first column left-aligned, the others right-aligned."""
-    table = Table(title=Text(title), title_justify="left", title_style="bold")
+    table = Table(title=Text(printable(title)), title_justify="left", title_style="bold")
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(printable(cell)) for cell in row))
     _print(table)
 
 
 def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
     """Print names and values to stdout, one pair per line."""
-    table = Table(title=Text(title), title_justify="left", title_style="bold", show_header=False)
+    table = Table(
+        title=Text(printable(title)), title_justify="left", title_style="bold", show_header=False
+    )
     table.add_column(style="dim")
     table.add_column(overflow="fold")
     for fact in facts:
-        table.add_row(*map(Text, fact))
+        table.add_row(*(Text(printable(cell)) for cell in fact))
     _print(table)
 
 

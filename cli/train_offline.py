@@ -1,4 +1,4 @@
-"""`mcaprl train-offline`: a policy from logs."""
+"""`mcaprl train-offline`: training of policies from logs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 
 import mcaprl
 from mcaprl.cli.settings import SettingsCommand
+from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_progress
 from mcaprl.settings import Settings
 from mcaprl.texts import counted
@@ -25,7 +26,7 @@ def _configs() -> list[Settings]:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option(
     "--algo",
-    help="dqn, double-dqn, cql, bc, bcq, iql, or an installed package's.  [default: cql]",
+    help="dqn, double-dqn, cql, bc, bcq, iql, or one of an installed package.  [default: cql]",
 )
 @click.option(
     "--seeds",
@@ -46,26 +47,25 @@ def _configs() -> list[Settings]:
     default=1,
     show_default=True,
     type=click.IntRange(1),
-    help="Number of threads of PyTorch and of the reader; of use for large batches on an idle"
+    help="Number of threads of PyTorch and of the reader; useful for large batches on an idle"
     " machine.",
 )
 @click.option(
     "--device",
     default="cpu",
     show_default=True,
-    help="Device of data and networks: cpu or cuda.",
+    help="Device of the data and networks: cpu or cuda.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
-@click.option("--follow", is_flag=True, help="New episodes of logs that are still being written.")
-@click.option("--other-data", is_flag=True, help="With --resume: permission for other DATA.")
+@click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
+@click.option("--other-data", is_flag=True, help="With --resume: allow other DATA.")
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.
 
     A number after a name is a weight: with good.mcap:2 rest/, transitions of good.mcap are drawn
-    twice as often as others. With --follow, another process may still write DATA: each episode is
-    used once it is finished, until all updates are done. All seeds are trained side by side,
-    independently of each other. Settings that are omitted have the algorithm's defaults; with
-    --resume, the run's.
+    twice as often as others. With --follow, another process may still write DATA: training uses
+    each episode after it has ended. All seeds are trained in parallel and independently. Omitted
+    settings default to those of the algorithm; with --resume, to those of the run.
     """
     given = {name: value for name, value in request.items() if value is not None}
     with terminal_progress("updates", "loss") as progress:
@@ -74,18 +74,18 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     from mcaprl.offline.training.metrics import describe_seeds
 
     for line in describe_seeds(summaries):
-        click.echo(line)
+        echo(line)
     if (out / CURVES_NAME).exists():
-        click.echo(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
+        echo(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
     else:
-        click.echo(
+        echo(
             f"curves: tensorboard --logdir {out}; for an image: matplotlib is not installed:"
             " pip install 'mcaprl[report]'"
         )
 
 
 def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
-    click.echo(
+    echo(
         f"{algo} learns from {counted(len(dataset.episodes), 'episode')},"
         f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
     )

@@ -1,4 +1,4 @@
-"""`mcaprl train-online`: a policy from acting in a sim, while its log is written."""
+"""`mcaprl train-online`: training of policies in a sim."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import sim_options
+from mcaprl.cli.options import origin_option, sim_options
 from mcaprl.cli.settings import SettingsCommand
-from mcaprl.cli.show import print_address, print_table
+from mcaprl.cli.show import echo, print_address, print_table
 from mcaprl.progress import terminal_progress
 from mcaprl.runs import read_config
 from mcaprl.settings import Settings
@@ -49,37 +49,38 @@ def _configs() -> list[Settings]:
     default=1,
     show_default=True,
     type=click.IntRange(1),
-    help="Number of threads of PyTorch; of use only for images on an idle machine.",
+    help="Number of threads of PyTorch; useful only for images on an idle machine.",
 )
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
-    help="Log of every transition; with several seeds a folder.",
+    help="Log of all transitions; with several seeds, a folder.",
 )
 @click.option(
     "--from",
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Logs for the replay buffer, or a policy whose weights are the start (of a run with"
-    " several seeds, one for each); may be given twice.",
+    help="Logs for the replay buffer, or a policy that initializes the agents (each seed of a"
+    " run one agent); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
-@click.option("--live", is_flag=True, help="Display in Foxglove during training.")
+@click.option("--live", is_flag=True, help="Show the training in Foxglove.")
 @click.option(
     "--port",
     default=8765,
     show_default=True,
     type=click.IntRange(0, 65535),
-    help="With --live: port of 127.0.0.1; 0 for any free one.",
+    help="With --live: port on 127.0.0.1; 0 for any free port.",
 )
+@origin_option
 @sim_options
 def train_online(sim: str | None, out: Path, **request: Any) -> None:
-    """Train a policy by acting in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
+    """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
-    Settings that are omitted are the preset's or, without one, those that were tuned for SIM, or
-    else the defaults of Stable-Baselines3; with --resume, the run's. The best checkpoint is kept:
-    it is selected by some episodes and scored on others.
+    Omitted settings default to those of the preset, else those tuned for SIM, else those of
+    Stable-Baselines3; with --resume, to those of the run. The best checkpoint is kept; it is
+    selected on some episodes and scored on others.
     """
     given = {name: value for name, value in request.items() if value is not None}
     with terminal_progress("steps", "score") as progress:
@@ -101,4 +102,4 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
         ["run", "steps", "best at", "mean return", "random 0, pilot 1", "ends"],
         rows,
     )
-    click.echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")
+    echo(f"curves: {out / 'curve.png'}, or tensorboard --logdir {out}")

@@ -1,4 +1,4 @@
-"""Figures in one style, drawn without a display: as PNG, or as SVG in the colors of its page.
+"""Matplotlib figures in one style, drawn without a display, as PNG or as SVG.
 
 Extra: `report`.
 """
@@ -6,11 +6,13 @@ Extra: `report`.
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 from mcaprl.errors import ReportError, import_extra
 from mcaprl.files import replacing
+from mcaprl.texts import printable, shortened
 
 INK: Final = "#1d2733"
 PALE: Final = "#b9c2cc"
@@ -29,6 +31,10 @@ _STYLE: Final = {
     "legend.frameon": False,
     "font.size": 9,
 }
+# A `$` in a text from data does not begin a formula.
+_LITERAL: Final = {"text.parse_math": False}
+_MAX_LABEL: Final = 200
+_MAX_TICK_LABEL: Final = 40
 _NO_METADATA: Final = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 _SVG_STYLE: Final = {"svg.fonttype": "none", "svg.hashsalt": "mcaprl"}
 
@@ -60,7 +66,9 @@ def save_png(figure: Any, path: Path) -> None:
     Raises:
         ReportError: The file cannot be written.
     """
-    with replacing(path, ReportError) as unfinished:
+    matplotlib = import_extra("matplotlib", "report")
+    _make_literal(figure)
+    with replacing(path, ReportError) as unfinished, matplotlib.rc_context(_LITERAL):
         figure.savefig(unfinished, format="png", bbox_inches="tight", facecolor="white")
 
 
@@ -68,8 +76,23 @@ def to_svg(figure: Any) -> str:
     """Return an SVG element: `INK` becomes the text color, `PALE` the page's `--pale`."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
-    with matplotlib.rc_context(_SVG_STYLE):
+    _make_literal(figure)
+    with matplotlib.rc_context(_SVG_STYLE | _LITERAL):
         figure.savefig(text, format="svg", transparent=True, metadata=_NO_METADATA)
     element = text.getvalue()
     element = element[element.index("<svg") :]
     return element.replace(INK, "currentColor").replace(PALE, "var(--pale)")
+
+
+def tick_labels(names: Iterable[str]) -> list[str]:
+    """Return names from data as they can stand at an axis: short, without control characters."""
+    return [shortened(printable(name), _MAX_TICK_LABEL) for name in names]
+
+
+def _make_literal(figure: Any) -> None:
+    """Draw all texts of a figure as they are: texts from data may contain anything."""
+    for text in figure.findobj(import_extra("matplotlib.text", "report").Text):
+        text.set_parse_math(False)
+        # Matplotlib aligns lines, each of which may be long.
+        lines = printable(text.get_text()).split("\n")
+        text.set_text("\n".join(shortened(line, _MAX_LABEL) for line in lines))

@@ -1,6 +1,6 @@
-"""Reports as one HTML page without network access: sections of text, figures, tables and cards.
+"""Self-contained HTML reports: sections of text, figures, tables and cards.
 
-The page is readable on a phone and follows the system's light or dark mode. Extra: `report`.
+The page adapts to small screens and follows the system's light or dark mode. Extra: `report`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from typing import Any
 from mcaprl.errors import ReportError, import_extra
 from mcaprl.figures import to_svg
 from mcaprl.files import write_atomically
+from mcaprl.texts import encodable
 
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?( [%a-zA-Z]{1,3})?")
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure in a page.
+    """Figure in a page.
 
     Attributes:
         caption: Text above the figure.
@@ -51,14 +52,14 @@ class Table:
 
     @property
     def kinds(self) -> list[str]:
-        """Return `number` for each column of numbers (aligned right), else `text`."""
+        """Kind of each column: `number` (right-aligned) or `text`."""
         cells = [[row[k] for row in self.rows if row[k]] for k in range(len(self.columns))]
         return ["number" if column and all(map(_is_number, column)) else "text" for column in cells]
 
 
 @dataclass(frozen=True)
 class Card:
-    """A small block with a thumbnail, one of several in a grid.
+    """Block with a thumbnail in a grid.
 
     Attributes:
         title: Title of the card.
@@ -75,7 +76,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a page; the parts it has appear in this order."""
+    """Section of a page; its non-empty parts appear in this order."""
 
     title: str
     text: str = ""
@@ -95,7 +96,7 @@ def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("mcaprl").joinpath("page.html").read_text())
     text = template.render(title=title, lead=lead, sections=sections)
-    write_atomically(path, text.encode(), ReportError)
+    write_atomically(path, encodable(text).encode(), ReportError)
 
 
 def _is_number(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""Progress of long work: reported to the caller, or shown in a terminal."""
+"""Progress of long operations, reported to the caller or shown in a terminal."""
 
 from __future__ import annotations
 
@@ -18,10 +18,12 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from mcaprl.texts import printable
+
 Advance = Callable[[int], None]
-"""Called with the amount of work that was done."""
+"""Function called with the amount of completed work."""
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
-"""Opens a progress bar: called with a description and the total; yields an `Advance`."""
+"""Function of a description and a total that opens a progress bar and yields an `Advance`."""
 
 
 @contextmanager
@@ -32,30 +34,30 @@ def no_progress(description: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar on stderr if that is a terminal."""
+    """Show a progress bar if stderr is a terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda amount: None
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(description, total=total)
+        task = bar.add_task(printable(description), total=total)
         yield lambda amount: bar.advance(task, amount)
 
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Progress of one seed, reported after the files of that moment are written.
+    """Progress of one seed, reported after its files are written.
 
     Attributes:
         seed: Seed of the run.
-        done: Number of updates or steps done.
-        total: Number of all updates or steps.
+        done: Number of completed updates or steps.
+        total: Total number of updates or steps.
         terms: Measured values, such as the loss.
     """
 
@@ -66,12 +68,12 @@ class TrainingProgress:
 
 
 ProgressCallback = Callable[[TrainingProgress], None]
-"""Called repeatedly during training; an exception that it raises stops the training."""
+"""Function called repeatedly during training; an exception stops the training."""
 
 
 @contextmanager
 def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
-    """Show a bar per seed with rate, one term and remaining time, if stderr is a terminal.
+    """Show a progress bar per seed with rate, one term and remaining time on a terminal.
 
     Args:
         unit: Unit of the total, such as `updates`.
@@ -93,7 +95,7 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
 
 
 class _SeedBars:
-    """Bars of all seeds; the first report of a seed adds its bar."""
+    """Progress bars, one per seed, created at the first report of the seed."""
 
     def __init__(self, bars: Progress, term: str) -> None:
         self._bars = bars

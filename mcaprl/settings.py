@@ -1,7 +1,6 @@
-"""Settings of learners: frozen dataclasses that are checked when created, with help for each field.
+"""Settings of algorithms: frozen dataclasses that validate themselves, with help for each field.
 
-The string under a field, as in `offline/algorithms/config.py`, describes it; the command line
-prints that string as the help of the field's option.
+The string under a field describes the field and is the help of its command-line option.
 """
 
 from __future__ import annotations
@@ -15,29 +14,33 @@ from typing import Any
 
 from mcaprl.errors import UsageError
 
+_MAX_FRAME_STACK = 1_000
+
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of all learners, offline and online; subclasses choose their own defaults.
+    """Settings of all algorithms, offline and online; subclasses choose their own defaults.
 
     Raises:
         UsageError: A setting is outside its range.
     """
 
     learning_rate: float = 1e-3
-    """step size of Adam at the first update"""
+    """initial learning rate of Adam"""
     final_learning_rate_fraction: float = 1.0
-    """learning rate at the end as a fraction of the first one, to which it falls linearly"""
+    """final learning rate as a fraction of the initial one; the decay is linear"""
     hidden: tuple[int, ...] = (256, 256)
-    """widths of the hidden layers; for images, of those after the convolutions"""
+    """widths of the hidden layers; for images, of the layers after the convolutions"""
     frame_stack: int = 1
     """number of successive observations that the network receives"""
     checkpoint_interval: int = 1_000
-    """updates (offline) or environment steps (online) between two checkpoints"""
+    """number of updates (offline) or environment steps (online) between checkpoints"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the ranges of the settings."""
         self._require_positive("frame_stack", "checkpoint_interval")
+        allowed = f"at most {_MAX_FRAME_STACK}"
+        self._require("frame_stack", self.frame_stack <= _MAX_FRAME_STACK, allowed)
         self._require("learning_rate", self.learning_rate > 0, "above 0")
         self._require_fraction("final_learning_rate_fraction")
         self._require("hidden", all(width >= 1 for width in self.hidden), "widths of at least 1")
@@ -47,7 +50,7 @@ class Settings:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
-        """Refuse a setting.
+        """Validate a setting.
 
         Raises:
             UsageError: The condition does not hold.
@@ -65,7 +68,7 @@ class Settings:
 
 
 def check_settings(algo: str, config: Settings | type[Settings], given: Iterable[str]) -> None:
-    """Refuse settings that an algorithm does not have.
+    """Check that an algorithm has the given settings.
 
     Args:
         algo: Name of the algorithm.
@@ -83,7 +86,7 @@ def check_settings(algo: str, config: Settings | type[Settings], given: Iterable
 
 
 def settings_from_json(found: object) -> dict[str, Any]:
-    """Return the settings in a `config.json`, with lists as tuples again."""
+    """Return the settings in a `config.json`, with lists converted to tuples."""
     settings = found if isinstance(found, dict) else {}
     return {k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()}
 
@@ -104,7 +107,7 @@ def field_help(config_type: type) -> dict[str, str]:
         config_type: Dataclass whose source can be read.
 
     Returns:
-        Line under each field by the field's name.
+        Help text of each field by name.
     """
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
@@ -115,7 +118,7 @@ def field_help(config_type: type) -> dict[str, str]:
 
 
 def _lines_under_fields(config_type: type) -> dict[str, str]:
-    # Python stores no docstring of a field, so the source is parsed.
+    # Python does not store the docstrings of fields, so the source is parsed.
     tree = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body[0]
     assert isinstance(tree, ast.ClassDef)
     lines = {}

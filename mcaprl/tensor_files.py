@@ -1,8 +1,10 @@
-"""Safetensors files with a JSON object in the header; nothing is unpickled."""
+"""Safetensors files with a JSON object in the header; pickle is not used."""
 
 from __future__ import annotations
 
+import itertools
 import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +13,25 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from mcaprl.files import write_atomically
+from mcaprl.errors import TrainingError
+from mcaprl.files import parse_json, write_atomically
 
 _DESCRIPTION = "description"
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Write tensors, and a description in the header of the file, with `replacing`."""
+    """Write tensors atomically, with a description in the header of the file.
+
+    Raises:
+        TrainingError: The file cannot be written.
+    """
     # Safetensors refuses tensors that share storage.
     whole = {
         name: tensor.clone(memory_format=torch.contiguous_format)
         for name, tensor in tensors.items()
     }
-    write_atomically(path, save(whole, {_DESCRIPTION: json.dumps(description)}))
+    content = save(whole, {_DESCRIPTION: json.dumps(description)})
+    write_atomically(path, content, TrainingError)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -36,7 +44,36 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """
     with safe_open(path, framework="pt") as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        description = json.loads((file.metadata() or {}).get(_DESCRIPTION, "null"))
+        description = parse_json((file.metadata() or {}).get(_DESCRIPTION, "null"))
     if not isinstance(description, dict):
         raise ValueError(f"{path} has no description in its header")
     return tensors, description
+
+
+def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
+    """Check, before layers are created, that the weights of a file suffice for them.
+
+    Args:
+        widths: Numbers of inputs, hidden units and outputs of successive layers.
+        weights: Weights by name.
+
+    Raises:
+        ValueError: A layer has more weights than the file, or a width is not a positive integer.
+    """
+    if not all(isinstance(width, int) and width >= 1 for width in widths):
+        raise ValueError(f"layers of widths {list(widths)} cannot be made")
+    present = sum(tensor.numel() for tensor in weights.values())
+    needed = max((first * second for first, second in itertools.pairwise(widths)), default=0)
+    if needed > present:
+        raise ValueError(f"a layer has {needed} weights, more than the {present} of the file")
+
+
+def convolved_features(image_shape: Iterable[int], channels: int = 64) -> int:
+    """Return the number of outputs of the convolutions of Nature DQN; 0 for too small an image.
+
+    Args:
+        image_shape: (height, width, ...) of the image.
+        channels: Output channels of the last convolution.
+    """
+    height, width, *_ = (max((((size - 8) // 4 - 3) // 2) - 1, 0) for size in image_shape)
+    return height * width * channels

@@ -1,4 +1,43 @@
-"""Numbers as text for people."""
+"""Formatting of numbers and of foreign texts for display."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+# Control characters but tab and line feed, marks that reorder text, and halves of surrogate pairs.
+_UNPRINTABLE: Final = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+
+def printable(text: object) -> str:
+    r"""Return a text that cannot control the terminal: its control characters are escaped.
+
+    Line feeds and tabs are kept.
+
+    >>> print(printable(f"a{chr(27)}[2J"))
+    a\x1b[2J
+    """
+    return _UNPRINTABLE.sub(lambda found: _escaped(found[0]), str(text))
+
+
+def encodable(text: str) -> str:
+    """Return a text that UTF-8 can encode: halves of surrogate pairs are escaped."""
+    return text.encode(errors="backslashreplace").decode()
+
+
+def shortened(text: str, most: int) -> str:
+    """Return a text of at most `most` characters.
+
+    >>> shortened("a long text", 7)
+    'a lo...'
+    """
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode()
 
 
 def counted(number: int, noun: str) -> str:

@@ -1,7 +1,7 @@
-"""Trained policies: saved as safetensors and JSON, loaded without running any code from a file.
+"""Trained policies, saved as safetensors and JSON; loading executes no code from a file.
 
 `policy.json` describes the networks and how they select actions; `policy.safetensors` contains
-their weights and the normalization of observations. The selected action is the largest of
+their weights and the normalization of observations. A policy selects the action with the largest
 
     q_values            values Q(s, a)                                    dqn, double-dqn, cql
     logits              log probabilities of actions, unnormalized        bc, iql
@@ -11,6 +11,7 @@ their weights and the normalization of observations. The selected action is the 
 from __future__ import annotations
 
 import json
+import math
 from collections import deque
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -23,16 +24,21 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from mcaprl.errors import PolicyError, SpaceError
-from mcaprl.files import write_json
+from mcaprl.errors import PolicyError, SpaceError, TrainingError
+from mcaprl.files import parse_json, write_json
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
 from mcaprl.offline.algorithms.networks import Architecture, Network
 from mcaprl.offline.batches.buffer import discrete_actions
 from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
-from mcaprl.recorder.format.spaces import space_from_json, space_to_json
+from mcaprl.recorder.format.spaces import (
+    check_elements,
+    observation_leaves,
+    space_from_json,
+    space_to_json,
+)
 from mcaprl.runs import POLICY_NAME
-from mcaprl.tensor_files import read_tensors, write_tensors
+from mcaprl.tensor_files import check_widths, convolved_features, read_tensors, write_tensors
 
 FORMAT_VERSION = 2
 _WEIGHTS_NAME = "policy.safetensors"
@@ -42,7 +48,7 @@ _BAD_CONTENT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, S
 
 
 class Scores(nn.Module):
-    """Networks that map observations to a score per action; the policy selects the largest."""
+    """Networks that map observations to scores of actions; the policy selects the largest."""
 
     def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
         """Wrap the networks `q` or `logits`, or both."""
@@ -74,11 +80,11 @@ class Policy:
 
     Attributes:
         name: Folder names of the run and the seed.
-        algo: Algorithm that trained it.
+        algo: Name of the training algorithm.
         observation_space: Space of one observation.
         action_space: Space of one action.
         env_id: ID of the environment in the training log; empty if unknown.
-        env_kwargs: Keyword arguments to make that environment.
+        env_kwargs: Keyword arguments of that environment.
         frame_stack: Number of successive observations in one input; see `act`.
         encoder: Encoder of observations as tensors.
         scores: Networks that score actions.
@@ -96,11 +102,11 @@ class Policy:
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
-        """Reset the stored frames: the next observations are the first of their episodes."""
+        """Drop the stored frames; the next observations start new episodes."""
         self._seen.clear()
 
     def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the best actions (B,), values of `action_space`; the first of equal ones.
+        """Return the best actions (B,), values of `action_space`; ties go to the lowest.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
         It also accepts (B, k, *shape), oldest first, and then stores nothing.
@@ -159,7 +165,7 @@ class Policy:
             return False
 
     def _inputs(self, observations: Any) -> Observations:
-        """Return the networks' inputs, from these observations alone."""
+        """Return the networks' inputs without using stored frames."""
         if self.frame_stack == 1:
             return self._encode(observations)
         if not self._is_stack(observations):
@@ -170,7 +176,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations, and return the stack that ends with them; the first one repeats."""
+        """Store observations and return the stack that ends with them, padded with the first."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
@@ -219,7 +225,7 @@ def save_policy(
         "observation_space": json.loads(space_to_json(buffer.encoder.space)),
         "action_space": json.loads(space_to_json(buffer.action_space)),
     }
-    write_json(folder / POLICY_NAME, description)
+    write_json(folder / POLICY_NAME, description, TrainingError)
 
 
 def read_policy(folder: Path) -> Policy:
@@ -229,9 +235,9 @@ def read_policy(folder: Path) -> Policy:
         PolicyError: A file is missing or broken.
     """
     try:
-        description = json.loads((folder / POLICY_NAME).read_text())
+        description = parse_json((folder / POLICY_NAME).read_bytes())
         if description["format_version"] != FORMAT_VERSION:
-            raise ValueError(f"format_version {description['format_version']} is not known")
+            raise ValueError(f"format_version {description['format_version']} is not supported")
         return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])
     except FileNotFoundError as error:
         raise PolicyError(
@@ -245,19 +251,26 @@ def read_policy(folder: Path) -> Policy:
 
 def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]) -> Policy:
     if description["acts_by"] not in get_args(ActsBy):
-        raise ValueError(f"acts_by {description['acts_by']!r} is not known")
+        raise ValueError(f"acts_by {description['acts_by']!r} is not supported")
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = discrete_actions(space_from_json(json.dumps(description["action_space"])))
     encoder = ObservationEncoder(observation_space, int(action_space.n))
     encoder.shift = weights.pop("observation.shift").numpy()
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]
+    check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
     lists = {key: tuple(value) for key, value in shape.items() if isinstance(value, list)}
     architecture = Architecture(**{**shape, **lists})
     encoder.image_inputs = [
         _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
     ]
     images = [image.stacked(stack) for image in encoder.image_inputs]
+    inputs = [convolved_features(image.shape, architecture.channels[-1]) for image in images]
+    if images:
+        check_widths(architecture.channels, weights)
+    for outputs in description["outputs"].values():
+        for width in filter(None, [*inputs, encoder.width * stack]):
+            check_widths([width, *architecture.hidden, math.prod(outputs)], weights)
     networks = {
         name: Network(encoder.width * stack, images, tuple(outputs), architecture)
         for name, outputs in description["outputs"].items()
@@ -278,7 +291,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """Return the input with the stored normalization, which is removed from `weights`."""
+    """Move the stored normalization from `weights` into a copy of the input."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()

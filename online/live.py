@@ -1,6 +1,6 @@
 """Live view of training: one of the environments, and the learner's values for it.
 
-Only frames of the view are dropped, never steps; the results are bit for bit the same with and
+The view may drop frames, but training drops no steps; its results are bit-identical with and
 without viewers.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, cast
 
@@ -44,20 +44,28 @@ TRAINING_NAMES = (
     "steps",
     "updates",
 )
-"""The numbers in `/rl/training`."""
+"""Names of the numbers in `/rl/training`."""
 WATCHED = 0
 """Index of the environment in the live view."""
 
 
 class LiveTraining:
-    """The live view of a run, for one seed after the other."""
+    """Live view of a run, for one seed after the other."""
 
-    def __init__(self, task: Task, *, port: int = DEFAULT_PORT, pace: Pace | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        *,
+        port: int = DEFAULT_PORT,
+        origins: Sequence[str] = (),
+        pace: Pace | None = None,
+    ) -> None:
         """Listen for viewers.
 
         Args:
             task: Task of the run.
             port: Port on 127.0.0.1; 0 selects a free one.
+            origins: Origins of web pages that may connect, besides those of known viewers.
             pace: Rate of frames.
 
         Raises:
@@ -74,6 +82,7 @@ class LiveTraining:
                 TRAINING_NAMES,
                 name=f"{task.algo} in {task.sim}",
                 port=port,
+                origins=origins,
                 pace=pace,
             )
         except BaseException:
@@ -101,7 +110,7 @@ class LiveTraining:
 
 
 class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
-    """A wrapper of a batch of environments that shows the first one.
+    """Wrapper of a batch of environments that shows the first one in the live view.
 
     Attributes:
         model: Model of SB3 that trains in these environments; nothing is shown before it is set.
@@ -164,7 +173,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._began_ns = time.time_ns()
 
     def _before_step(self, actions: NDArray[Any]) -> dict[str, Any]:
-        """Return the fields of a live step that are known before the step."""
+        """Return the fields of a `LiveStep` that are known before the step."""
         model = self.model
         assert model is not None
         self._stream.look(self._source(), self._return_so_far)
@@ -214,7 +223,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 class _Mirror:
-    """A single vehicle that copies the state of one in a fleet, for the scene."""
+    """Single vehicle that copies the state of a fleet's vehicle, to draw its scene."""
 
     def __init__(self, fleet: Fleet, single: VehicleEnv[Any, Any]) -> None:
         self._fleet, self._single = fleet, single

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
@@ -26,15 +26,23 @@ from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolic
 from mcaprl.errors import PolicyError, SpaceError
 from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
 from mcaprl.online.zip_file import describe_sb3, read_model, write_model
-from mcaprl.recorder.format.spaces import space_from_json, space_to_json
+from mcaprl.recorder.format.spaces import (
+    check_actions,
+    check_elements,
+    observation_leaves,
+    space_from_json,
+    space_to_json,
+)
 from mcaprl.runs import BEST_NAME
+from mcaprl.tensor_files import check_widths, convolved_features
 
 FORMAT_VERSION = 1
+_LEAST_IMAGE_FEATURES = 256
 _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
     "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
 }
-"""SB3's classes for vectors, images and dicts; a file cannot name any other."""
+"""SB3's classes for vectors, images and dicts; files cannot select other classes."""
 _ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
     "ReLU": torch.nn.ReLU,
     "Tanh": torch.nn.Tanh,
@@ -45,14 +53,14 @@ _ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
 
 @dataclass(frozen=True, eq=False)
 class OnlinePolicy:
-    """A trained policy; NumPy in, NumPy out. B is the number of observations, A of actions.
+    """Trained policy with NumPy inputs and outputs, for B observations and A actions.
 
     Attributes:
         name: Name of the file, or of the folders of the run and the seed.
         algo: Name of the algorithm that trained it.
         observation_space: Space of one observation; None where the file has no bounds.
         action_space: Space of one action.
-        env_id: Gymnasium id of the environment it was trained in; empty if unknown.
+        env_id: Gymnasium id of the training environment; empty if unknown.
         env_kwargs: Arguments of that environment.
         frame_stack: Number of successive observations that the network receives; see `act`.
         network: Policy of SB3.
@@ -69,14 +77,14 @@ class OnlinePolicy:
     _memory: FrameMemory | None
 
     def begin(self) -> None:
-        """Drop the remembered observations: the next ones are the first of their episodes."""
+        """Drop the stored observations; the next observations start new episodes."""
         if self._memory is not None:
             self._memory.frames = {}
 
     def act(self, observations: Any) -> NDArray[np.int64]:
         """Return the best actions (B,), values of `action_space`.
 
-        A policy with `frame_stack` k > 1 remembers the observations of its last k calls since
+        A policy with `frame_stack` k > 1 stores the observations of the last k calls since
         `begin`.
 
         Raises:
@@ -88,7 +96,7 @@ class OnlinePolicy:
         """Return the Q-values (B, A) of all actions, in the order of the action space.
 
         Args:
-            observations: (B, *shape), or (B, k, *shape), oldest first, where k frames are stacked.
+            observations: (B, *shape), or (B, k, *shape), oldest first, for a frame stack of k.
 
         Raises:
             PolicyError: The policy has no Q-values, or the observations do not fit the network.
@@ -98,7 +106,7 @@ class OnlinePolicy:
         return cast(NDArray[np.float32], self._tried(self._outputs, observations))
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """Return the probabilities (B, A) of all actions; a Q-network's best action has 1.
+        """Return the probabilities (B, A) of all actions; 1 for the best action of a Q-network.
 
         Args:
             observations: Observations as for `q_values`.
@@ -114,7 +122,7 @@ class OnlinePolicy:
         return probabilities
 
     def _predicted(self, observations: Any, deterministic: bool) -> Any:
-        """Return the best actions for the remembered observations and these."""
+        """Return the best actions for the stored observations and these."""
         memory = self._memory
         if memory is not None:
             seen, now = (
@@ -208,6 +216,10 @@ def _build(
     observation_space = space_from_json(json.dumps(description["observation_space"]))
     action_space = space_from_json(json.dumps(description["action_space"]))
     frames = int(description.get("frame_stack", 1))
+    check_actions(action_space)
+    check_elements(frames * sum(leaf.size for leaf in observation_leaves(observation_space)))
+    for widths in _layers(observation_space, frames, description["net_arch"]):
+        check_widths(widths, weights)
     shape = channels_first(stacked_space(observation_space, frames))
     policy_type: Any = _policy_type(description["network"], shape)
     network = policy_type(
@@ -234,8 +246,26 @@ def _build(
     )
 
 
+def _layers(space: spaces.Space[Any], frames: int, net_arch: Any) -> Iterator[list[int]]:
+    """Yield the widths of successive layers for each part of the observation.
+
+    Args:
+        space: Space of one observation.
+        frames: Number of successive observations that the network receives.
+        net_arch: Widths of SB3's hidden layers: one list, a dict of lists, or None.
+    """
+    chains = net_arch.values() if isinstance(net_arch, dict) else [net_arch or ()]
+    for leaf in observation_leaves(space):
+        if leaf.encoding is None:
+            yield from ([leaf.size * frames, *chain] for chain in chains)
+        else:
+            # SB3's convolutions end with at least this many features.
+            yield [max(convolved_features(leaf.shape), 1), _LEAST_IMAGE_FEATURES]
+            yield from (list(chain) for chain in chains)
+
+
 def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """Return the space of SB3's networks, whose images have the channels first."""
+    """Return the space as SB3's networks receive it, with image channels first."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict({key: channels_first(part) for key, part in space.items()})
     if is_image_space(space) and not is_image_space_channels_first(cast(spaces.Box, space)):

@@ -3,8 +3,8 @@
 SB3 writes an algorithm as a zip of `data` (JSON in which some values are pickled), `policy.pth`
 (weights) and more. Its own loader unpickles; this one reads only the plain values and the weights.
 Files of this package also contain `mcaprl.json`, a full description of the policy, which SB3
-ignores. In files of plain SB3, the text that SB3 writes beside its pickled spaces and classes and
-the names of the weights replace that description, except for dict observations.
+ignores. For files of plain SB3, the description is derived from the names of the weights and from
+the text beside pickled spaces and classes; dict observations are not supported.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 
-from mcaprl.errors import PolicyError
-from mcaprl.files import write_atomically
+from mcaprl.errors import PolicyError, TrainingError
+from mcaprl.files import parse_json, write_atomically
 from mcaprl.online.centering import plain_weights
-from mcaprl.recorder.format.spaces import space_to_json
 
 OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
+_MAX_JSON_BYTES = 2**24
+_MAX_EXPANSION = 8
 _WEIGHTS_NAME = "policy.pth"
-# SB3 creates these again; stored, they would tie the file to this package's classes.
+# SB3 recreates these; storing them would make the file depend on this package's classes.
 _LEFT_OUT = (
     "replay_buffer_class",
     "replay_buffer_kwargs",
@@ -43,19 +42,19 @@ _KNOWN_KWARGS = {"net_arch", "activation_fn", "optimizer_kwargs", "optimizer_cla
 
 
 def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Save a model so that plain SB3 can load it, and this package without unpickling.
+    """Save a model for plain SB3, and for loading without unpickling in this package.
 
     Args:
         path: File to replace.
         model: Model of SB3.
-        description: JSON object that `read_model` returns again.
+        description: JSON object for `read_model` to return.
     """
     content = io.BytesIO()
     with plain_weights(model.policy):
         model.save(content, exclude=_LEFT_OUT)
     with zipfile.ZipFile(content, "a") as archive:
         archive.writestr(OWN_NAME, json.dumps(description, indent=2))
-    write_atomically(path, content.getvalue())
+    write_atomically(path, content.getvalue(), TrainingError)
 
 
 def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Tensor]]:
@@ -71,11 +70,12 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     try:
         with zipfile.ZipFile(path) as archive:
             names = archive.namelist()
-            own = json.loads(archive.read(OWN_NAME)) if OWN_NAME in names else {}
-            data = json.loads(archive.read(_DATA_NAME))
-            weights = torch.load(
-                io.BytesIO(archive.read(_WEIGHTS_NAME)), map_location="cpu", weights_only=True
-            )
+            own = parse_json(_read(archive, OWN_NAME, _MAX_JSON_BYTES)) if OWN_NAME in names else {}
+            data = parse_json(_read(archive, _DATA_NAME, _MAX_JSON_BYTES))
+            most = _MAX_EXPANSION * path.stat().st_size
+            weights_file = io.BytesIO(_read(archive, _WEIGHTS_NAME, most))
+            _check_size(weights_file, most)
+            weights = torch.load(weights_file, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise PolicyError(f"{path} does not exist") from error
     except KeyError as error:
@@ -83,10 +83,47 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
         raise PolicyError(f"cannot read the model in {path}: {error}") from error
     except pickle.UnpicklingError as error:
-        raise PolicyError(f"{path} has weights that are not plain tensors; not loaded") from error
-    if not (isinstance(own, dict) and isinstance(data, dict) and isinstance(weights, dict)):
-        raise PolicyError(f"{path} is not a model of Stable-Baselines3: its parts have other types")
+        raise PolicyError(f"cannot load {path}: its weights are not plain tensors") from error
+    if not (isinstance(own, dict) and isinstance(data, dict) and _are_weights(weights)):
+        raise PolicyError(f"{path} is not a model of Stable-Baselines3: its parts have wrong types")
     return own, data, weights
+
+
+def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    """Read a part of a zip file.
+
+    Raises:
+        ValueError: The part has more than `most` bytes.
+        KeyError: There is no such part.
+    """
+    # `zipfile` reads at most the declared size.
+    size = archive.getinfo(name).file_size
+    if size > most:
+        raise ValueError(f"'{name}' has {size} bytes, more than the {most} of a real model")
+    return archive.read(name)
+
+
+def _check_size(weights: io.BytesIO, most: int) -> None:
+    """Check the declared sizes in a PyTorch file, which is also a zip file.
+
+    Raises:
+        ValueError: Their sum is more than `most` bytes.
+    """
+    if zipfile.is_zipfile(weights):
+        with zipfile.ZipFile(weights) as archive:
+            size = sum(part.file_size for part in archive.infolist())
+        if size > most:
+            raise ValueError(f"its weights have {size} bytes, more than the {most} of a real model")
+    weights.seek(0)
+
+
+def _are_weights(found: object) -> bool:
+    """Return whether an object is a dict of tensors whose elements are all stored."""
+    return isinstance(found, dict) and all(
+        isinstance(tensor, Tensor)
+        and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
+        for tensor in found.values()
+    )
 
 
 def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,14 +146,14 @@ def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[st
         raise PolicyError(f"policy_kwargs {', '.join(unknown)} of the model are not supported")
     critic = any(name.startswith("action_net.") for name in weights)
     if not critic and not any(name.startswith("q_net.q_net.") for name in weights):
-        raise PolicyError("the model is none of DQN, PPO and A2C")
+        raise PolicyError("the model is not DQN, PPO or A2C")
     return {
         "algo": "actor-critic" if critic else "dqn",
         "network": "actor-critic" if critic else "q-network",
         "net_arch": own.get("net_arch"),
         "activation": _activation(own.get("activation_fn"), "Tanh" if critic else "ReLU"),
-        "observation_space": json.loads(space_to_json(_box(data.get("observation_space")))),
-        "action_space": json.loads(space_to_json(_discrete(data.get("action_space")))),
+        "observation_space": _box(data.get("observation_space")),
+        "action_space": _discrete(data.get("action_space")),
     }
 
 
@@ -125,16 +162,17 @@ def _activation(text: object, default: str) -> str:
     return default if text is None else str(text).rsplit(".", 1)[-1].rstrip("'>")
 
 
-def _box(found: Any) -> spaces.Box:
+def _box(found: Any) -> dict[str, Any]:
+    """Return the description of a Box as `space_from_json` reads it."""
     shape, dtype = _attributes(found, "observation", "box.Box", ("_shape", "dtype"))
-    if dtype == "uint8":
-        return spaces.Box(0, 255, tuple(shape), np.uint8)
-    return spaces.Box(-np.inf, np.inf, tuple(shape), np.dtype(dtype).type)
+    low, high = (0, 255) if dtype == "uint8" else ("-inf", "inf")
+    return {"type": "Box", "low": low, "high": high, "shape": list(shape), "dtype": dtype}
 
 
-def _discrete(found: Any) -> spaces.Discrete:
+def _discrete(found: Any) -> dict[str, Any]:
+    """Return the description of a Discrete as `space_from_json` reads it."""
     count, start = _attributes(found, "action", "discrete.Discrete", ("n", "start"))
-    return spaces.Discrete(int(count), start=int(start))
+    return {"type": "Discrete", "n": int(count), "start": int(start)}
 
 
 def _attributes(found: Any, role: str, kind: str, names: tuple[str, ...]) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Environments: with the options that commands have, or as a log names them."""
+"""Environments from the options of commands or the metadata of logs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import gymnasium as gym
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.sims import make_sim
+from mcaprl.sims import SIMS, make_sim
+from mcaprl.texts import shortened
+
+_MAX_SHOWN = 200
 
 
 def all_options(
@@ -26,30 +29,66 @@ def all_options(
 
 
 def sim_of(
-    dataset: Dataset, path: Path, sim: str | None = None, **others: Any
+    dataset: Dataset,
+    path: Path,
+    sim: str | None = None,
+    *,
+    trust_env: bool = False,
+    **others: Any,
 ) -> gym.Env[Any, Any]:
     """Make the environment in which a log was recorded.
 
     Args:
         dataset: Dataset of the log.
         path: Path of the log.
-        sim: Short name or Gymnasium id that replaces the log's.
-        **others: Arguments added to the log's.
+        sim: Short name or Gymnasium id to use instead of the logged one.
+        trust_env: Whether to import the module that the logged id names, and to pass the logged
+            arguments to environments other than sims of `SIMS`.
+        **others: Additional arguments of the environment.
 
     Raises:
-        UsageError: The log has no environment id, or the environment cannot be made.
+        UsageError: The log has no environment id, or one that must be trusted; or the environment
+            cannot be made.
     """
     name = sim or dataset.env_id
     if not name:
         raise UsageError(f"{path} has no environment id: pass --sim")
+    if not trust_env:
+        _check_needs_no_trust(dataset, path, sim)
     return make_sim(name, **{**dataset.env_kwargs, **others})
+
+
+def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None:
+    """Check that a log makes nobody import a module or call a constructor with its arguments.
+
+    Raises:
+        UsageError: It would.
+    """
+    if sim is None and ":" in dataset.env_id:
+        module = dataset.env_id.partition(":")[0]
+        raise UsageError(
+            f"{path} names the environment {dataset.env_id}, so the module {module} would be"
+            f" imported: if you trust the log, pass --trust-env (trust_env=True in Python) or --sim"
+            f" {dataset.env_id}"
+        )
+    name = sim or dataset.env_id
+    if dataset.env_kwargs and SIMS.find(SIMS.get(name, name), loads=":" not in name) is None:
+        raise UsageError(
+            f"{path} names arguments of {name}: {_shown(dataset.env_kwargs)}; if you trust the log,"
+            " pass --trust-env (trust_env=True in Python)"
+        )
+
+
+def _shown(arguments: Mapping[str, Any]) -> str:
+    text = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
+    return shortened(text, _MAX_SHOWN)
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
     """Check that a log has an episode.
 
     Raises:
-        UsageError: It has fewer episodes.
+        UsageError: The log has fewer episodes.
     """
     last = len(dataset.episodes) - 1
     if episode is not None and not 0 <= episode <= last:

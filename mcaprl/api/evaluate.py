@@ -1,4 +1,4 @@
-"""Evaluation: policies act in a sim, and their returns are compared."""
+"""Evaluation of policies in a sim, and comparison of their returns."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from mcaprl.files import write_json
 from mcaprl.page import Figure
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
@@ -37,7 +38,7 @@ class LoggedReturns:
         data: File, folder or glob.
         episodes: Number of episodes.
         mean_return: Mean of the returns.
-        interval: 95 % interval of that mean.
+        interval: 95 % interval of the mean.
         normalized_score: Mean return on the scale where random is 0 and the pilot is 1; None
             without a pilot.
     """
@@ -93,13 +94,13 @@ def evaluate(
     overwrite: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Evaluation:
-    """Run policies greedily through the same episodes of a sim.
+    """Evaluate policies greedily on the same episodes of a sim.
 
     Random actions and the sim's pilot are always evaluated, too.
 
     Args:
-        policies: `pilot`, `random` or the path of a trained policy, or several of them; of a run
-            with several seeds each is evaluated.
+        policies: `pilot`, `random` or the path of a trained policy, or a list; each seed of a run
+            is evaluated.
         sim: Short name of a sim, or a Gymnasium id.
         episodes: Number of episodes for each policy and training seed.
         seed: Seed of the episodes.
@@ -107,13 +108,13 @@ def evaluate(
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
         behavior: Logs of the sim that the policies are compared with.
-        record: Log to write of the episodes of `policies`.
-        report: Folder for a page, images and JSON.
+        record: Output log of the episodes of `policies`.
+        report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
-        progress: Opens the progress bar.
+        progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: `behavior` is of another sim or would be overwritten, or a number is out of its
+        UsageError: `behavior` is of another sim or would be overwritten, or a number is out of
             range.
         UnknownNameError: There is no such sim or policy.
         PolicyError: A policy has other spaces than the sim.
@@ -150,7 +151,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Runs:
-    """Policies to run in one environment, or in a batch of it where that is possible."""
+    """Policies to run in one environment or in a vector environment."""
 
     env: gym.Env[Any, Any]
     envs: gym.vector.VectorEnv[Any, Any, Any] | None
@@ -161,7 +162,7 @@ class _Runs:
     def scores(
         self, record: Path | None, overwrite: bool, progress: ProgressBar
     ) -> list[PolicyScore]:
-        """Evaluate the policies and then the scale; only the former are recorded."""
+        """Evaluate the policies, and random and the pilot; record only the named ones."""
         found = {name: policies_of(name, self.env) for name in dict.fromkeys(self.names)}
         for name in SCRIPTED:
             if name not in found and (scripted := _scripted(name, self.env)) is not None:
@@ -207,7 +208,7 @@ def _scripted(name: str, env: gym.Env[Any, Any]) -> Any:
 
 
 def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
-    """Return the returns in logs.
+    """Return the returns of the episodes in logs.
 
     Raises:
         UsageError: The logs are of another environment, or would be overwritten.
@@ -216,7 +217,7 @@ def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedR
         raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")
     dataset = open_logs(data)
     env_id = env.spec.id if env.spec else ""
-    if dataset.env_id != env_id:
+    if not same_env(dataset.env_id, env_id):
         raise UsageError(f"--behavior {data} is of {dataset.env_id or 'unknown'}, not of {env_id}")
     returns = dataset.statistics.returns
     interval = bootstrap_interval(returns[None])
@@ -257,7 +258,7 @@ def _write_report(
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return figures of those policies that are a run folder or the folder of a seed.
+    """Return learning curves of the policies that are run or seed folders.
 
     Online runs are compared in one figure; an offline run has one figure for each term of its loss.
     """
@@ -270,7 +271,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
         from mcaprl.online.curves import curve_figure, read_run
 
         runs = [read_run(folder) for folder in online]
-        figures.append(Figure.of("Evaluations while learning", curve_figure(runs, "")))
+        figures.append(Figure.of("Evaluations during training", curve_figure(runs, "")))
     for folder in folders:
         if folder in online:
             continue

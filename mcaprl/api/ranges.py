@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from mcaprl.errors import UsageError
 from mcaprl.settings import flag
 
@@ -29,7 +31,7 @@ def check_fraction(**numbers: float | None) -> None:
     """Check that numbers are from 0 to 1; None is accepted.
 
     Raises:
-        UsageError: A number is not, or is NaN.
+        UsageError: A number is outside the range, or NaN.
     """
     for name, number in numbers.items():
         if number is not None and not 0 <= number <= 1:
@@ -37,21 +39,21 @@ def check_fraction(**numbers: float | None) -> None:
 
 
 def check_positive(**numbers: float) -> None:
-    """Check that numbers are above 0.
+    """Check that numbers are above 0 and finite.
 
     Raises:
-        UsageError: A number is not, or is NaN.
+        UsageError: A number is 0, negative, infinite or NaN.
     """
     for name, number in numbers.items():
-        if not number > 0:
+        if not 0 < number < math.inf:
             raise UsageError(f"{flag(name)} {number}: give a number above 0")
 
 
 def check_port(port: int) -> None:
-    """Check that a port exists.
+    """Check that a port number is valid.
 
     Raises:
-        UsageError: It does not.
+        UsageError: The number is not from 0 to 65535.
     """
     if not 0 <= port <= 65535:
         raise UsageError(f"--port {port}: give a number from 0 to 65535")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,12 +34,14 @@ from mcaprl.recorder.viewer.video import (
 )
 
 Images = Iterator[NDArray[np.uint8]]
+MakeEnv = Callable[[], gym.Env[Any, Any]]
+"""Function that makes the environment of a log."""
 STILLS = 12
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images that were written.
+    """Result of `render`.
 
     Attributes:
         episode: Index of the episode.
@@ -58,9 +63,10 @@ def render(
     contact_sheet: str | Path | None = None,
     overwrite: bool = False,
     sim: str | None = None,
+    trust_env: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Rendering:
-    """Draw one episode of a log, from its scene or, without one, as the sim renders itself.
+    """Render one episode of a log from its scene or, without one, with the sim.
 
     Args:
         file: Path of the log.
@@ -69,13 +75,15 @@ def render(
         video: Video to write: .mp4 or .gif.
         contact_sheet: Image to write, .png, with evenly spaced steps.
         overwrite: Whether existing files are replaced.
-        sim: Short name or Gymnasium id that replaces the log's.
-        progress: Opens the progress bar.
+        sim: Short name or Gymnasium id to use instead of the logged one.
+        trust_env: Whether to import the module that the logged id names, and to pass the logged
+            arguments to any environment.
+        progress: Function that opens a progress bar.
 
     Raises:
         UsageError: There is no output, the log has no such episode, `speed` is not positive, or the
             sim renders no images.
-        LogError: The log has no scene, and the sim does not repeat the episode.
+        LogError: The log has no scene, and the sim does not reproduce the episode.
         OutputExistsError: An output exists.
         MissingExtraError: The packages of the `video` extra are not installed.
     """
@@ -90,26 +98,27 @@ def render(
             check_output(out, kinds, overwrite=overwrite)
     dataset = open_logs(path)
     one = dataset.episodes[episode]
+    make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")
     frames, stills = 0, list[int]()
     if movie is not None:
         step_ns = float(np.median(np.diff(one.log_time_ns)))
         shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
         with progress(f"drawing {movie}", len(shown)) as advance:
-            images = _counted(_images(path, dataset, one, shown, sim), advance)
+            images = _counted(_images(path, dataset, one, shown, make), advance)
             frames = write_video(movie, images, images_per_s)
     if sheet is not None:
         stills = evenly_spaced(one.length, STILLS)
-        write_sheet(sheet, list(_images(path, dataset, one, stills, sim)))
+        write_sheet(sheet, list(_images(path, dataset, one, stills, make)))
     return Rendering(episode, frames, len(stills))
 
 
 def _images(
-    path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], sim: str | None
+    path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], make: MakeEnv
 ) -> Images:
     reader = McapReader(path)
     if reader.channel_of(SCENE) is not None:
         return _of_scene(reader, dataset, episode, steps)
-    return _of_sim(path, dataset, episode, steps, sim)
+    return _of_sim(path, dataset, episode, steps, make)
 
 
 def _of_scene(
@@ -135,11 +144,11 @@ def _of_scene(
 
 
 def _of_sim(
-    path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], sim: str | None
+    path: Path, dataset: Dataset, episode: Episode, steps: Collection[int], make: MakeEnv
 ) -> Images:
-    """Yield the sim's own images while it is stepped through the log."""
+    """Yield the images that the sim renders while it repeats the logged actions."""
     found: list[NDArray[np.uint8]] = []
-    with closing(sim_of(dataset, path, sim, render_mode="rgb_array")) as env:
+    with closing(make()) as env:
 
         def draw(now: Episode, step: int) -> None:
             if now.index == episode.index and step in steps:
@@ -152,7 +161,7 @@ def _of_sim(
     if result.difference is not None:
         raise LogError(f"{path} has no scene, and the sim has changed: {result.difference}")
     if not found:
-        raise LogError(f"{path} has no scene, and no seed of episode {episode.index}")
+        raise LogError(f"{path} has no scene, and episode {episode.index} has no seed")
     yield from found
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from mcaprl.api.data import Paths
 from mcaprl.api.environments import check_episode
+from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
 from mcaprl.files import write_json
 from mcaprl.recorder.dataset.open import find_logs, open_logs
@@ -27,7 +28,7 @@ class LiveAddress:
     """Address at which viewers connect.
 
     Attributes:
-        app_url: Address that opens Foxglove with the connection.
+        app_url: Address that opens Foxglove and connects it.
         url: Address of the server, for any viewer of the Foxglove protocol.
         layout: Path of the layout to import.
     """
@@ -44,10 +45,11 @@ def replay(
     speed: float = 1.0,
     loop: bool = False,
     port: int = DEFAULT_PORT,
+    allow_origin: str | Sequence[str] = (),
     on_open: Callable[[LiveAddress], None] = lambda address: None,
     stop: threading.Event | None = None,
 ) -> None:
-    """Play logs to Foxglove, until `stop` is set or Ctrl-C interrupts it.
+    """Play logs in Foxglove until `stop` is set or Ctrl-C is pressed.
 
     Several logs play side by side: all start at the same time, each with its own topic prefix.
 
@@ -55,13 +57,15 @@ def replay(
         files: File, folder or glob of logs, or several of them.
         episode: Index of the only episode to play; None for all.
         speed: Simulated seconds per second.
-        loop: Whether the replay starts again at the end.
-        port: Port of 127.0.0.1; 0 for any free one.
-        on_open: Called with the address once viewers can connect.
+        loop: Whether the replay restarts at the end.
+        port: Port on 127.0.0.1; 0 for any free port.
+        allow_origin: Origin, or several, of web pages that may connect, besides pages on this
+            machine, Foxglove and Lichtblick.
+        on_open: Function called with the address once viewers can connect.
         stop: Event that ends the replay.
 
     Raises:
-        UsageError: A log does not have the episode, the port is taken, or a number is out of its
+        UsageError: A log does not have the episode, the port is in use, or a number is out of
             range.
         LogError: A log cannot be read.
         MissingExtraError: The packages of the `foxglove` extra are not installed.
@@ -87,6 +91,7 @@ def replay(
         episode_starts_ns=starts,
         name=", ".join(path.name for path in paths),
         port=port,
+        origins=as_names(allow_origin),
     )
     with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
         layout_path = Path(folder) / "foxglove-layout.json"

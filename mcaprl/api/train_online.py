@@ -1,4 +1,4 @@
-"""Online training: a policy from acting in a sim, while its log is written."""
+"""Online training of policies in a sim."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.environments import all_options
-from mcaprl.api.policies import TrainedPolicy, is_policy, load_policies
+from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port
 from mcaprl.api.replay import LiveAddress
 from mcaprl.api.train import torch_threads
@@ -37,6 +37,7 @@ def train_online(
     resume: bool = False,
     live: bool = False,
     port: int = DEFAULT_PORT,
+    allow_origin: str | Sequence[str] = (),
     observation: str | None = None,
     rules: str | None = None,
     sim_options: Mapping[str, Any] | None = None,
@@ -44,28 +45,30 @@ def train_online(
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
 ) -> list[OnlineSummary]:
-    """Train a policy by acting in a sim; the same seed and machine produce the same curve.
+    """Train a policy in a sim; the same seed and machine produce the same curve.
 
     Args:
-        sim: Short name of a sim, or a Gymnasium id; None for that of the preset or of the run that
-            is resumed.
+        sim: Short name of a sim, or a Gymnasium id; None for that of the preset or of the resumed
+            run.
         out: Run folder to create.
         algo: `dqn`, `double-dqn`, `ppo` or `a2c`; None for the default of the preset, run or sim.
         preset: Name of published settings.
         seeds: Number of agents, which are trained one after the other.
         seed: Seed of the first agent; agent k uses seed + k.
         threads: Number of threads of PyTorch.
-        record: Log of every transition; with several seeds a folder.
+        record: Output log of all transitions; with several seeds, a folder.
         sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
             the agents.
         resume: Whether training continues from the checkpoints in `out`.
-        live: Whether viewers can connect during training; frames are dropped, never steps.
-        port: Port of 127.0.0.1 for viewers; 0 for any free one.
+        live: Whether viewers can connect during training; slow viewers miss frames.
+        port: Port on 127.0.0.1 for viewers; 0 for any free port.
+        allow_origin: Origin, or several, of web pages that may connect, besides pages on this
+            machine, Foxglove and Lichtblick.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
-        on_live: Called with the address once viewers can connect.
-        progress: Called repeatedly during training.
+        on_live: Function called with the address once viewers can connect.
+        progress: Function called repeatedly during training.
         **settings: Settings of the algorithm; their defaults are the preset's or the sim's, or
             with `resume` the run's.
 
@@ -74,12 +77,12 @@ def train_online(
 
     Raises:
         UnknownNameError: There is no such sim, algorithm or preset.
-        UsageError: No sim is given, the arguments contradict the preset, or a number is out of its
+        UsageError: No sim is given, the arguments contradict the preset, or a number is out of
             range.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
         PolicyError: The policy's network in `sources` differs from the agent's.
-        TrainingError: `out` cannot be written, or has a run of another task.
+        TrainingError: `out` cannot be written, or contains a run of another task.
         MissingExtraError: The packages of the `online` extra are not installed.
     """
     from mcaprl.online.live import LiveTraining
@@ -97,7 +100,9 @@ def train_online(
         stack.enter_context(torch_threads(threads))
         viewers = None
         if live:
-            viewers = stack.enter_context(closing(LiveTraining(task, port=port)))
+            viewers = stack.enter_context(
+                closing(LiveTraining(task, port=port, origins=as_names(allow_origin)))
+            )
             stream = viewers.stream
             on_live(LiveAddress(stream.app_url, stream.url, out / LAYOUT_NAME))
         return train(
@@ -117,7 +122,7 @@ def train_online(
 def _experience(
     sources: Sequence[str | Path],
 ) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
-    """Return the logs, and the policies of the seeds of a run, among the sources."""
+    """Return the dataset and the policies, one per seed, among the sources."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         names = " and ".join(map(str, policies))

@@ -1,7 +1,7 @@
 """Transitions as tensors, packed once and sampled at random.
 
-Each observation is stored once, as a frame. Observations, next observations and frame stacks are
-indexes of frames; these and the n-step returns are computed when the data are packed.
+Each observation is stored once, as a frame; transitions refer to frames by index. The indexes and
+the n-step returns are computed when the data are packed, frame stacks when a batch is read.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+from mcaprl.recorder.format.spaces import check_actions
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -28,11 +29,11 @@ _ON_DEVICE = ("frames", "starts", "places", "actions", "returns")
 
 @dataclass(frozen=True)
 class Packing:
-    """How transitions are built from a log.
+    """Settings for building transitions from a log.
 
     Attributes:
-        frame_stack: Number of successive observations in one network input; the first of an
-            episode is repeated.
+        frame_stack: Number of successive observations in one network input; an episode's
+            first observation also pads the stacks.
         normalize: Whether network inputs are normalized to mean 0 and standard deviation 1.
         gamma: Discount per step.
         n_steps: Number of rewards in a return; fewer at the end of an episode.
@@ -51,10 +52,10 @@ class Batch:
     Attributes:
         rows: (R,) int64, row numbers in the buffer.
         observations: R observations.
-        actions: (R,) int64, counted from 0.
+        actions: (R,) int64 action indexes, starting at 0.
         rewards: (R,) float32, discounted sums of up to n rewards.
         discounts: (R,) float32, gamma to the power of the number of steps between the two
-            observations; 0 where the episode terminated (and not where it was truncated).
+            observations; 0 if the episode terminated, but not if it was truncated.
         next_observations: R observations, up to n steps later.
     """
 
@@ -68,18 +69,18 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class TransitionBuffer:
-    """All N transitions of a dataset, over F frames.
+    """All N transitions of a dataset, with their F frames.
 
     Attributes:
         encoder: Encoder that created the frames.
         action_space: Action space of the log.
-        packing: How transitions are built.
-        frames: Each observation once.
+        packing: Settings with which the transitions were built.
+        frames: All observations, each stored once.
         starts: (F,) int64, first frame of each frame's episode.
         places: (2, N) int64, frames of each transition's observation and next observation.
-        actions: (N,) int64, counted from 0.
+        actions: (N,) int64 action indexes, starting at 0.
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
-        drawable: (M,) int64, rows whose weight is above 0; None if all are.
+        drawable: (M,) int64, rows whose weight is above 0; None if these are all rows.
         cumulative: (M,) float64, cumulative weights of these rows; None if the weights are equal.
     """
 
@@ -109,12 +110,12 @@ class TransitionBuffer:
             dataset: Dataset with discrete actions.
             packing: How transitions are built; default: single steps, single frames.
             encoder: Encoder of other data, to reuse its normalization; default: a new one.
-            weights: (E,) relative frequencies with which an episode's transitions are drawn;
-                default: all equal.
+            weights: (E,) relative sampling weights of each episode's transitions; default: all
+                equal.
 
         Raises:
-            SpaceError: The actions are not discrete or outside their space, or no network supports
-                the observations.
+            SpaceError: The actions are not discrete or are outside their space, or no network
+                supports the observations.
             TrainingError: There are no transitions, a number is NaN or infinite, a logged action
                 was not allowed, or all weights are 0.
         """
@@ -157,13 +158,13 @@ class TransitionBuffer:
     def to(self, device: torch.device) -> TransitionBuffer:
         """Return the same transitions on another device.
 
-        Rows are still drawn on the CPU, so a seed draws the same ones on any device.
+        Rows are still drawn on the CPU, so a seed draws the same rows for every device.
         """
         parts = {name: getattr(self, name).to(device) for name in _ON_DEVICE}
         return replace(self, **parts)
 
     def sample_rows(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draw row numbers (count,) with replacement, by their weights, on the CPU."""
+        """Draw row numbers (count,) on the CPU, with replacement, in proportion to the weights."""
         if self.cumulative is None:
             total = len(self) if self.drawable is None else len(self.drawable)
             draws = torch.randint(total, (count,), generator=generator)
@@ -181,7 +182,7 @@ class TransitionBuffer:
         return Batch(rows, self.observe(here), actions, rewards, discounts, self.observe(there))
 
     def with_weights(self, weights: NDArray[np.float64]) -> TransitionBuffer:
-        """Return the same transitions, with relative frequencies (N,) of being drawn.
+        """Return the same transitions with relative sampling weights (N,).
 
         Raises:
             TrainingError: All weights are 0.
@@ -217,12 +218,12 @@ class TransitionBuffer:
 
     @property
     def image_inputs(self) -> list[ImageInput]:
-        """Shape and normalization of each image that a network sees."""
+        """Shape and normalization of each image that a network receives."""
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device of a name.
+    """Return the torch device with this name.
 
     Raises:
         UnknownNameError: The name is not in `DEVICES`.
@@ -239,21 +240,22 @@ def choose_device(name: str) -> torch.device:
 
 
 def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
-    """Return the action space, if it is discrete.
+    """Return the action space if it is discrete.
 
     Raises:
-        SpaceError: It is not.
+        SpaceError: The space is not discrete, or has too many actions.
     """
     if not isinstance(space, spaces.Discrete):
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
+    check_actions(space)
     return space
 
 
 def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the places and returns of `TransitionBuffer`, over n steps or to the episode's end.
+    """Compute `places` and `returns` of `TransitionBuffer`, over n steps or to the episode's end.
 
-    Termination ends the return. Truncation only ends the sum of rewards: the value of the state
-    after it still counts.
+    A return that ends with termination has no bootstrap value; one that ends with truncation
+    bootstraps from the last next observation.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)
@@ -272,7 +274,7 @@ def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDAr
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:
-    """Raise if a number is not finite or an action was not allowed; one NaN spoils all weights."""
+    """Raise if a number is not finite or a logged action is masked out."""
     rows = torch.from_numpy(dataset.frame_of_step)
     _check_finite("observations", frames.vector[rows])
     _check_finite("next_observations", frames.vector[rows + 1])
@@ -280,7 +282,7 @@ def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int6
         allowed = frames.mask[rows, torch.from_numpy(actions)]
         if not allowed.all():
             row = int(allowed.int().argmin())
-            raise TrainingError(f"action {dataset.actions[row]} of row {row} is masked out there")
+            raise TrainingError(f"action {dataset.actions[row]} of row {row} is masked out")
 
 
 def _check_finite(column: str, values: Tensor) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mcaprl.errors import ReportError
 from mcaprl.figures import COLORS, new_figure, save_png
 from mcaprl.runs import METRICS_NAME, Curve, read_curves
 
@@ -24,10 +25,12 @@ def draw_curves(folder: Path) -> Path:
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        ReportError: The image cannot be written.
+        ReportError: There are no metrics, or the image cannot be written.
     """
     curves = read_curves(folder, METRICS_NAME)
     names = _drawn_terms(curves)
+    if not names:
+        raise ReportError(f"{folder} has no {METRICS_NAME} to draw: was the folder removed?")
     rows = -(-len(names) // _COLUMNS)
     figure, panels = new_figure((4 * _COLUMNS, 2.4 * rows), rows, _COLUMNS, grid=True)
     for panel in panels.flat[len(names) :]:
@@ -41,7 +44,7 @@ def draw_curves(folder: Path) -> Path:
 
 
 def curve_figures(folder: Path) -> list[tuple[str, Any]]:
-    """Return a small figure for each term with its title, for HTML pages.
+    """Return a title and a small figure for each term, for HTML pages.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

@@ -1,8 +1,9 @@
-"""Opens one or more logs as a Dataset."""
+"""Opening of one or more logs as a Dataset."""
 
 from __future__ import annotations
 
 import glob
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,25 +29,25 @@ def open_logs(
     images: Storage = "auto",
     threads: int = 1,
 ) -> Dataset:
-    """Read logs, or selected columns and episodes of them.
+    """Read logs, or a selection of their columns and episodes.
 
-    All chunks that are read are checked against their CRCs. If a log was cut off or is still being
-    written, its finished episodes are read, with a warning. If there are several logs, those
-    without a finished episode are skipped, with a warning.
+    The CRCs of all chunks that are read are checked. If a log was cut off or is still being
+    written, its finished episodes are read, with a warning. Of several logs, those without a
+    finished episode are skipped, with a warning.
 
     Args:
         data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
-            the same spaces; their episodes follow each other in the order of the files.
-        columns: Keys of a Dict observation space that are read, nested keys as `joints/q`; the
-            dataset's observation space contains only these. An empty sequence reads no
-            observations. Actions, rewards and ends are always read. Default: all keys.
-        episodes: Index, slice or indexes of the episodes that are read, counted over all logs; they
-            are returned in the logs' order. Default: all episodes.
+            the same spaces; their episodes are concatenated in the order of the files.
+        columns: Keys to read of a Dict observation space, nested keys as `joints/q`; the dataset's
+            observation space contains only these. An empty sequence reads no observations. Actions,
+            rewards and end flags are always read. Default: all keys.
+        episodes: Index, slice or indexes of the episodes to read, counted over all logs and
+            returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`; `mapped`, which leaves images on disk and
-            reads them when they are indexed (from the log if it is uncompressed, otherwise from an
-            uncompressed copy beside it that is written once); or `auto`, which is `mapped` if the
-            images would take more than half of the free memory.
-        threads: Number of threads that read the chunks of a file.
+            reads them when they are indexed (from an uncompressed log, otherwise from an
+            uncompressed copy that is written once beside the log); or `auto`, which is `mapped` if
+            the images would take more than half of the free memory.
+        threads: Number of threads that read chunks of a file.
 
     Raises:
         LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
@@ -123,8 +124,8 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         every = [path for part in data for path in find_logs(part)]
         if not every:
             raise LogError("no data: the list of files is empty")
-        # A file that is given twice is read once.
-        return list({path.resolve(): path for path in every}.values())
+        # Paths of the same file are read once.
+        return list({os.path.realpath(path): path for path in every}.values())
     path = Path(data)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))

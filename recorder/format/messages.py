@@ -1,7 +1,7 @@
 """ROS 2 messages of variable length: episodes, log lines, markers, frames.
 
-These topics have few messages or are read by viewers only, so rosbags encodes them, except for the
-messages at each episode's end, which are encoded here because the environment waits for them.
+These topics have few messages or are read by viewers only, so rosbags encodes them. This module
+encodes the messages at each episode's end itself, because the environment waits for them.
 Transitions and images are encoded as fixed-size rows (`schema`).
 """
 
@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.texts import encodable
 
 LOG_TYPE = "rcl_interfaces/msg/Log"
 EPISODE_TYPE = "mcaprl_msgs/msg/Episode"
@@ -48,7 +49,7 @@ _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """Return the type store with ROS 2 message types and ours."""
+    """Return the type store with the message types of ROS 2 and mcaprl."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(EPISODE_TEXT, EPISODE_TYPE))
     return store
@@ -111,7 +112,7 @@ def log_message(time_ns: int, text: str) -> bytes:
     """Encode an `rcl_interfaces/msg/Log` of level INFO as CDR bytes."""
     data = bytearray(_ENCAPSULATION)
     sec, nanosec = divmod(time_ns, 10**9)
-    # ROS's 32-bit seconds wrap around; the record's log_time does not.
+    # The 32-bit seconds of ROS wrap around; the log_time of the record does not.
     data += _LOG_START.pack(sec % 2**32, nanosec, _INFO)
     _append_strings(data, "mcaprl", text, "", "")
     # The value 0 of the field `line`.
@@ -122,7 +123,7 @@ def log_message(time_ns: int, text: str) -> bytes:
 def _append_strings(data: bytearray, *texts: str) -> bytearray:
     """Append CDR strings: length, characters and NUL, each aligned to four bytes."""
     for text in texts:
-        encoded = text.encode() + b"\0"
+        encoded = encodable(text).encode() + b"\0"
         data += bytes(-len(data) % 4)
         data += len(encoded).to_bytes(4, "little")
         data += encoded

@@ -1,10 +1,11 @@
-"""Metadata of a log, so that it opens without the simulator that it was recorded from.
+"""Metadata of a log, with which the log can be read without its simulator.
 
-It is stored twice: as the metadata record `mcaprl.dataset`, the first record after the header, and
-as the channel metadata of `/rl/step`. Both are maps of strings; other values are JSON.
+The metadata is stored twice: in the metadata record `mcaprl.dataset`, the first record after the
+header, and as the channel metadata of `/rl/step`. Both are string maps; other values are JSON.
 
     format_version      "1"
-    env_id              Gymnasium id; empty if unknown
+    env_id              Gymnasium id, as `module:Name-v0` if the import of a module registers it;
+                        empty if unknown
     env_kwargs          JSON object: keyword arguments of gymnasium.make
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
@@ -31,9 +32,13 @@ from gymnasium import spaces
 
 from mcaprl._version import __version__
 from mcaprl.errors import LogError
-from mcaprl.recorder.format.spaces import leaves_of, space_from_json, space_to_json
+from mcaprl.files import parse_json
+from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_json, space_to_json
+from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
+# Numbers as names are of no use in a plot of more actions than this.
+MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
 # Fields that all recordings in one file share; the others describe the first recording.
 SAME_WHEN_APPENDED = (
@@ -47,7 +52,7 @@ SAME_WHEN_APPENDED = (
     "step_duration_ns",
 )
 DEFAULT_STEP_DURATION_NS = 100_000_000
-# Arguments of a spec that concern rendering or vectorization.
+# Arguments of an `EnvSpec` that concern rendering or vectorization.
 _NOT_OF_ONE_ENV = (
     "render_mode",
     "num_envs",
@@ -93,14 +98,16 @@ class LogMetadata:
         """Return the names of the discrete actions by value; empty for other action spaces.
 
         A name is the action's meaning if all meanings are distinct, otherwise its number.
+        More than `MAX_NUMBERED_ACTIONS` actions without meanings have no names.
         """
         space = self.action_space
         if not isinstance(space, spaces.Discrete):
             return {}
-        values = range(int(space.start), int(space.start + space.n))
+        values = range(int(space.start), int(space.start) + int(space.n))
         meanings = self.action_meanings
         if len(meanings) != len(values) or len(set(meanings)) != len(meanings):
-            return {value: str(value) for value in values}
+            shown = values if space.n <= MAX_NUMBERED_ACTIONS else ()
+            return {value: str(value) for value in shown}
         return dict(zip(values, meanings, strict=True))
 
     def to_strings(self) -> dict[str, str]:
@@ -114,7 +121,7 @@ class LogMetadata:
         ]
         return {
             "format_version": FORMAT_VERSION,
-            "env_id": self.env_id,
+            "env_id": encodable(self.env_id),
             "env_kwargs": json.dumps(dict(self.env_kwargs), default=repr),
             "observation_space": space_to_json(self.observation_space),
             "action_space": space_to_json(self.action_space),
@@ -122,7 +129,7 @@ class LogMetadata:
             "observation_names": json.dumps(self.observation_names),
             "action_meanings": json.dumps(self.action_meanings),
             "step_duration_ns": str(self.step_duration_ns),
-            "policy": self.policy,
+            "policy": encodable(self.policy),
             "epsilon": self.epsilon,
             "seed": self.seed,
             "versions": json.dumps(dict(self.versions)),
@@ -133,7 +140,7 @@ class LogMetadata:
         """Parse the map that was read from a file.
 
         Raises:
-            LogError: The format version is newer, or a value cannot be parsed.
+            LogError: The format version is not supported, or a value cannot be parsed.
         """
         found = strings.get("format_version")
         if found is None:
@@ -144,18 +151,20 @@ class LogMetadata:
                 " pip install -U mcaprl"
             )
         try:
+            action_space = space_from_json(strings["action_space"])
+            action_leaf(action_space)
             return cls(
                 observation_space=space_from_json(strings["observation_space"]),
-                action_space=space_from_json(strings["action_space"]),
+                action_space=action_space,
                 env_id=strings.get("env_id", ""),
-                env_kwargs=json.loads(strings.get("env_kwargs", "{}")),
-                observation_names=tuple(json.loads(strings.get("observation_names", "[]"))),
-                action_meanings=tuple(json.loads(strings.get("action_meanings", "[]"))),
+                env_kwargs=_object(strings, "env_kwargs"),
+                observation_names=_texts(strings, "observation_names"),
+                action_meanings=_texts(strings, "action_meanings"),
                 step_duration_ns=int(strings.get("step_duration_ns", DEFAULT_STEP_DURATION_NS)),
                 policy=strings.get("policy", ""),
                 epsilon=strings.get("epsilon", ""),
                 seed=strings.get("seed", ""),
-                versions=json.loads(strings.get("versions", "{}")),
+                versions=_object(strings, "versions"),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -164,7 +173,7 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Keep the fields that are equal in all parts; the spaces have to be equal."""
+        """Return the fields that are equal in all parts, whose spaces have to be equal."""
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
         differing = {
@@ -186,8 +195,8 @@ class LogMetadata:
     ) -> LogMetadata:
         """Create the metadata of an environment's recording.
 
-        A vector environment is described by one of its sub-environments. The duration of a step is
-        the first that is known of: the argument, the environment's `step_duration_s`,
+        A vector environment is described by one of its sub-environments. The step duration is the
+        first available value of: the argument, the environment's `step_duration_s`,
         1 / `metadata["render_fps"]`, 0.1 s.
         """
         one = _one_of(env)
@@ -203,7 +212,7 @@ class LogMetadata:
         return cls(
             observation_space=one.single_observation_space if is_vector else one.observation_space,
             action_space=one.single_action_space if is_vector else one.action_space,
-            env_id=one.spec.id if one.spec else "",
+            env_id=_env_id(one),
             env_kwargs=kwargs,
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
@@ -213,6 +222,50 @@ class LogMetadata:
             seed=seed,
             versions=installed_versions(),
         )
+
+
+def _env_id(env: Any) -> str:
+    """Return the id by which Gymnasium makes an environment; empty if unknown."""
+    if env.spec is None:
+        return ""
+    # The module whose import registers the id, if `make_sim` was given one.
+    module = getattr(env.unwrapped, "env_module", "")
+    return f"{module}:{env.spec.id}" if module else str(env.spec.id)
+
+
+def same_env(first: str, second: str) -> bool:
+    """Return whether two ids name the same environment; ids of older logs have no module.
+
+    >>> same_env("highway_env:racetrack-v1", "racetrack-v1"), same_env("a:Env-v0", "b:Env-v0")
+    (True, False)
+    """
+    if ":" in first and ":" in second:
+        return first == second
+    return first.rpartition(":")[2] == second.rpartition(":")[2]
+
+
+def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
+    """Return a field that is a JSON object.
+
+    Raises:
+        ValueError: The field is not a JSON object.
+    """
+    found = parse_json(strings.get(name, "{}"))
+    if not isinstance(found, dict):
+        raise ValueError(f"{name} is not a JSON object")
+    return found
+
+
+def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
+    """Return a field that is a JSON list of strings.
+
+    Raises:
+        ValueError: The field is not a JSON list of strings.
+    """
+    found = parse_json(strings.get(name, "[]"))
+    if not (isinstance(found, list) and all(isinstance(part, str) for part in found)):
+        raise ValueError(f"{name} is not a JSON list of strings")
+    return tuple(found)
 
 
 def _one_of(env: Any) -> Any:
@@ -229,7 +282,7 @@ def _one_of(env: Any) -> Any:
 
 
 def _names(env: object, attribute: str) -> tuple[str, ...]:
-    """Return a list of names that the environment has as an attribute, otherwise nothing."""
+    """Return the names in an attribute of the environment; () if there are none."""
     found = getattr(env, attribute, ())
     return tuple(map(str, found)) if isinstance(found, list | tuple) else ()
 
@@ -241,7 +294,7 @@ def installed_versions() -> dict[str, str]:
 
 @lru_cache(maxsize=1)
 def _installed_versions() -> tuple[tuple[str, str], ...]:
-    # Cached: each version is read from a file, which would dominate the time to open a log.
+    # Cached: reading each version from a file would dominate the time to open a log.
     found = {"mcaprl": __version__}
     for package in _VERSIONED:
         try:

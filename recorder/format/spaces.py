@@ -19,11 +19,17 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UnknownNameError
+from mcaprl.files import parse_json
 
 # Smallest height and width of a uint8 array that is treated as an image. SB3 has no such limit; its
 # Nature CNN needs 36.
 MIN_IMAGE_EDGE = 8
 IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
+# Limits on the memory that a short description can make a reader allocate. An RGBA image of
+# 3840 x 2160 pixels and one network output per action fit.
+MAX_ELEMENTS = 2**25
+MAX_ACTIONS = 2**20
+_MAX_DIMENSIONS = 64
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,7 @@ def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
         words = path or (("image",) if encoding else ())
         name = _field_name(words if encoding else ("observation", *words), taken)
         found.append(Leaf(name, path, shape, dtype, encoding))
+    check_elements(sum(leaf.size for leaf in found))
     return tuple(found)
 
 
@@ -109,6 +116,38 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
     return [leaf for leaf, name in names.items() if any(_is_below(name, key) for key in keys)]
 
 
+def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    """Return whether values of two spaces have the same shapes and dtypes; bounds may differ.
+
+    >>> same_form(spaces.Box(0, 1, (3,)), spaces.Box(-9, 9, (3,)))
+    True
+    """
+    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
+        return space.keys() == other.keys() and all(
+            same_form(space[key], other[key]) for key in space
+        )
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
+        return (space.shape, space.dtype) == (other.shape, other.dtype)
+    return space == other
+
+
+def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return (N,) whether each of N values (N, *shape) of a space without parts is outside it."""
+    match space:
+        case spaces.Discrete():
+            wrong = (values < space.start) | (values >= space.start + space.n)
+        case spaces.MultiDiscrete():
+            wrong = (values < space.start) | (values >= space.start + space.nvec)
+        case spaces.MultiBinary():
+            wrong = (values != 0) & (values != 1)
+        case spaces.Box():
+            wrong = ~((values >= space.low) & (values <= space.high))
+        case _:
+            wrong = np.zeros(len(values), np.bool_)
+    found: NDArray[np.bool_] = wrong.reshape(len(values), -1).any(1)
+    return found
+
+
 def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
     """Return a Dict space with only these leaves of a Dict space."""
     groups: dict[str, list[Leaf]] = {}
@@ -127,10 +166,40 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
     """Return the single leaf of an action space.
 
     Raises:
-        SpaceError: The space is a Dict, or of a kind that a log cannot store.
+        SpaceError: The space is a Dict, too large, or of a kind that a log cannot store.
     """
     shape, dtype = _shape_and_dtype(space, "action", ())
+    check_elements(math.prod(shape))
+    check_actions(space)
     return Leaf("action", (), shape, dtype)
+
+
+def check_actions(space: spaces.Space[Any]) -> None:
+    """Check that a space has few enough discrete actions for a log or a policy.
+
+    Raises:
+        SpaceError: There are too many.
+    """
+    if isinstance(space, spaces.Discrete) and int(space.n) > MAX_ACTIONS:
+        raise SpaceError(
+            f"the action space is Discrete({space.n}), too large: at most {MAX_ACTIONS} discrete"
+            " actions can be used; group them, or use MultiDiscrete"
+        )
+
+
+def check_elements(count: float) -> None:
+    """Check that a space is small enough for a log or a policy.
+
+    Args:
+        count: Number of elements of one value.
+
+    Raises:
+        SpaceError: There are too many.
+    """
+    if not count <= MAX_ELEMENTS:
+        raise SpaceError(
+            f"a space of {count} elements is too large; at most {MAX_ELEMENTS} can be used"
+        )
 
 
 def nest(leaves: tuple[Leaf, ...], arrays: Sequence[Any]) -> Any:
@@ -159,10 +228,15 @@ def space_from_json(text: str) -> spaces.Space[Any]:
     """Read a space that `space_to_json` wrote.
 
     Raises:
-        SpaceError: The text does not describe a space.
+        SpaceError: The text does not describe a space, or the space is too large.
     """
     try:
-        return _from_plain(json.loads(text))
+        plain = parse_json(text)
+        # Checked first: the bounds of a Box take memory for each element.
+        check_elements(_elements(plain))
+        return _from_plain(plain)
+    except SpaceError:
+        raise
     # NumPy and Gymnasium raise many types of errors; each means that the text is invalid.
     except Exception as error:
         raise SpaceError(f"not a description of a space: {text[:80]!r}") from error
@@ -194,7 +268,7 @@ def _shape_and_dtype(
         raise SpaceError(f"{where} is a {type(space).__name__} space; a log can store {allowed}")
     shape = tuple(space.shape or ())
     if math.prod(shape) == 0:
-        raise SpaceError(f"{where} has shape {shape}, so no elements; leave it out of the space")
+        raise SpaceError(f"{where} has shape {shape}, so no elements; remove it from the space")
     dtype = np.dtype(space.dtype)
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
         raise SpaceError(f"{where} has dtype {dtype}; a log can store bool, integers and floats")
@@ -255,15 +329,15 @@ def _to_plain(space: spaces.Space[Any]) -> dict[str, Any]:
 def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
     match plain["type"]:
         case "Box":
-            shape, dtype = tuple(plain["shape"]), np.dtype(plain["dtype"])
+            shape, dtype = tuple(plain["shape"]), _dtype(plain)
             low = _bounds(plain["low"], shape, dtype)
             high = _bounds(plain["high"], shape, dtype)
             return spaces.Box(low, high, shape, dtype.type)
         case "Discrete":
-            kind = {"dtype": np.dtype(plain["dtype"]).type} if "dtype" in plain else {}
+            kind: dict[str, Any] = {"dtype": _dtype(plain).type} if "dtype" in plain else {}
             return spaces.Discrete(plain["n"], start=plain["start"], **kind)
         case "MultiDiscrete":
-            dtype = np.dtype(plain["dtype"])
+            dtype = _dtype(plain)
             return spaces.MultiDiscrete(plain["nvec"], dtype=dtype.type, start=plain["start"])
         case "MultiBinary":
             return spaces.MultiBinary(plain["n"])
@@ -273,9 +347,30 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
             raise ValueError(other)
 
 
+def _dtype(plain: dict[str, Any]) -> np.dtype[Any]:
+    """Return the dtype of a described space; refuse strings, which can have any length."""
+    dtype: np.dtype[Any] = np.dtype(plain["dtype"])
+    if dtype.kind not in "biuf":
+        raise ValueError(f"dtype {dtype}")
+    return dtype
+
+
+def _elements(plain: dict[str, Any]) -> int:
+    """Return the number of elements of a described space."""
+    if plain["type"] == "Dict":
+        return sum(_elements(part) for _, part in plain["spaces"])
+    if plain["type"] not in ("Box", "MultiBinary"):
+        return 1
+    shape = plain["shape"] if plain["type"] == "Box" else plain["n"]
+    sizes = [int(size) for size in (shape if isinstance(shape, list) else [shape])]
+    if min(sizes, default=1) < 0 or len(sizes) > _MAX_DIMENSIONS:
+        raise ValueError(f"shape {sizes}")
+    return math.prod(sizes)
+
+
 def _numbers(bounds: NDArray[Any]) -> Any:
     """Return bounds as JSON: a single number if all are equal; infinities as strings."""
-    # The bounds of images are many numbers and nearly always equal: avoid the list.
+    # Image spaces have many bounds, nearly always equal: avoid the list.
     if bounds.size and (bounds == bounds.flat[0]).all():
         return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]

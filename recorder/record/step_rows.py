@@ -1,9 +1,9 @@
 """Buffers for the values of an open episode, copied per step and written as whole columns.
 
-Per step, a value costs little more than its copy: times, counters, constants and the layout of a
-message are filled in when a chunk is written. A buffer has no row counter: its values belong to the
-steps from the first one that is not on disk, and a step is valid only when all its values are
-there. The only counter is the recorder's; values beyond it are dropped.
+A step only copies its values; times, counters, constants and the message layout are filled in when
+a chunk is written. Buffers have no row counter: their first value belongs to the first step that is
+not on disk. Only the recorder counts steps, once all their values are stored; values beyond its
+counter are dropped.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
 
 Store = Callable[[Any], None]
-"""A function that stores a copy of a value.
+"""Function that stores a copy of a value.
 
 Raises:
     SpaceError: The value does not belong to its space.
 """
 Converter = Callable[[Any], NDArray[Any]]
-"""A function that returns a leaf's value, in the dtype and shape that its space declares."""
+"""Function that reads a leaf's value from an observation, in the declared dtype and shape."""
 
 
 class Arrays:
-    """A buffer of arrays of one dtype and size, as bytes."""
+    """A byte buffer of arrays of one dtype and size."""
 
     def __init__(self, dtype: np.dtype[Any], size: int) -> None:
-        """Create an empty buffer of arrays with `size` numbers each."""
+        """Create an empty buffer of arrays of `size` numbers."""
         self._dtype, self._bytes_each = dtype, dtype.itemsize * size
         self._waiting = BytesIO()
 
@@ -111,13 +111,13 @@ class Integers:
 
 
 class StepColumns:
-    """The rows of `/rl/step` that are not on disk yet, all of one episode.
+    """The rows of `/rl/step` of one episode that are not on disk yet.
 
     Attributes:
-        take_action: Function that stores an action. It raises TypeError or OverflowError where only
-            `store_action` can store it, and saves a function call for integers.
+        take_action: Fast function that stores an action; raises TypeError or OverflowError for
+            actions that only `store_action` accepts.
         store_action: Function that stores an action of any type.
-        store_reward: Function that stores the reward, a number of any type.
+        store_reward: Function that stores a reward of any numeric type.
     """
 
     def __init__(self, log: LogTopics) -> None:
@@ -133,7 +133,7 @@ class StepColumns:
         self.store_reward: Store = self._rewards.append
 
     def store_behavior_prob(self, prob: float) -> None:
-        """Store the probability of the latest action; those without one are unknown."""
+        """Store the latest action's probability, and NaN for earlier actions without one."""
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
@@ -147,7 +147,7 @@ class StepColumns:
         return waiting.store(leaf)
 
     def begin(self, episode: int, start_ns: int, step_ns: int) -> None:
-        """Begin an episode: `start_ns` is the log_time of its first row."""
+        """Begin an episode whose first row has the log_time `start_ns`."""
         self._episode, self._start_ns, self._step_ns = episode, start_ns, step_ns
         self._first_step, self._total_reward = 0, 0.0
         self._drop(None)
@@ -160,7 +160,7 @@ class StepColumns:
     def make_room(self, step: int) -> None:
         """Write all rows before the transition that leads to `step`.
 
-        That one stays in memory, because its episode may end there.
+        This transition stays in memory, because it may end the episode.
         """
         count = step - self._first_step - 1
         self._total_reward = self.total_reward(step - 1)
@@ -170,12 +170,12 @@ class StepColumns:
         self._drop(count)
 
     def end(self, steps: int, terminated: bool, truncated: bool) -> None:
-        """Mark the last transition and the final row, and write all.
+        """Mark the last transition and the final row, and write the rows.
 
         Args:
             steps: Number of transitions in the episode, 1 or more.
-            terminated: Whether the last one reached a terminal state.
-            truncated: Whether the episode was cut off there.
+            terminated: Whether the last transition reached a terminal state.
+            truncated: Whether the episode was truncated.
         """
         final = steps - self._first_step
         assert final >= 1, "the last transition stays in memory"
@@ -234,7 +234,7 @@ class ImageColumn:
         return self._images.store(leaf)
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Begin an episode: `start_ns` is the log_time of its first image."""
+        """Begin an episode whose first image has the log_time `start_ns`."""
         self._start_ns, self._step_ns, self._first_step = start_ns, step_ns, 0
         self._images.drop()
 
@@ -276,17 +276,17 @@ def observation_store(
 
 
 def converters(space: spaces.Space[Any]) -> list[Converter]:
-    """Return for each leaf the function that reads its value from an observation."""
+    """Return the function of each leaf that reads its value from an observation."""
     return [_converter(leaf) for leaf in observation_leaves(space)]
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     """Return a value in the dtype and shape that its space declares.
 
-    Floats may lose digits, with a warning; any other change is an error.
+    An array of floats that loses precision causes a warning; other values must convert exactly.
 
     Raises:
-        SpaceError: The value has another shape, or does not fit.
+        SpaceError: The value has another shape, or does not convert exactly.
     """
     where = _where(leaf)
     try:
@@ -302,15 +302,27 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     if array.dtype == leaf.dtype:
         return cast
     if array.dtype.kind == leaf.dtype.kind == "f":
-        # A list of floats has no declared dtype.
+        # Only arrays declare a dtype, so lists cause no warning.
         if array.ndim and isinstance(value, np.ndarray):
             warnings.warn(
-                f"{where} is {array.dtype}, its space declares {leaf.dtype}: logged as such",
+                f"{where} is {array.dtype}; converted to its space's {leaf.dtype}",
                 stacklevel=2,
             )
     elif not np.array_equal(cast, array):
-        raise SpaceError(f"{where} is {value!r:.60}, which its space's {leaf.dtype} cannot hold")
+        raise SpaceError(f"{where} is {value!r:.60}, which does not fit its space's {leaf.dtype}")
     return cast
+
+
+def reward_number(reward: Any) -> float:
+    """Return a reward that is an array of one number as a number.
+
+    Raises:
+        SpaceError: It is anything else.
+    """
+    array = np.asarray(reward)
+    if array.size != 1 or array.dtype.kind not in "biuf":
+        raise SpaceError(f"the reward is {reward!r:.60}; a log can store one number")
+    return float(array.item())
 
 
 def _converter(leaf: Leaf) -> Converter:

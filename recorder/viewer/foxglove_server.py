@@ -1,17 +1,23 @@
-"""A server of the Foxglove WebSocket protocol on 127.0.0.1, and its channels."""
+"""A Foxglove WebSocket server on 127.0.0.1, and its channels."""
 
 from __future__ import annotations
 
+import secrets
+from collections.abc import Sequence
+from functools import partial
+from socket import create_server
 from typing import Any
+from urllib.parse import quote
 
 from mcaprl.errors import UsageError, import_extra
+from mcaprl.recorder.viewer.origin_filter import VIEWER_ORIGINS, OriginFilter
 
 HOST = "127.0.0.1"
 DEFAULT_PORT = 8765
 
 
 class ViewerServer:
-    """Foxglove server that listens on 127.0.0.1 only.
+    """A Foxglove server that listens only on 127.0.0.1.
 
     Attributes:
         foxglove: The module `foxglove`.
@@ -29,6 +35,8 @@ class ViewerServer:
         self._context = self.foxglove.Context()
         self._channels: list[Any] = []
         self._server: Any = None
+        self._inner = ""
+        self._filter: OriginFilter | None = None
 
     def add_channel(
         self,
@@ -39,7 +47,7 @@ class ViewerServer:
         encoding: str = "cdr",
         schema_encoding: str = "ros2msg",
     ) -> Any:
-        """Advertise a topic; returns a channel with `log(data, log_time=...)` and `has_sinks()`."""
+        """Advertise a topic and return its `foxglove.Channel`."""
         schema = self.foxglove.Schema(name=type_name, encoding=schema_encoding, data=definition)
         channel = self.foxglove.Channel(
             topic, message_encoding=encoding, schema=schema, context=self._context
@@ -47,48 +55,74 @@ class ViewerServer:
         self._channels.append(channel)
         return channel
 
-    def start(self, name: str, port: int, listener: Any, **options: Any) -> Any:
+    def start(
+        self, name: str, port: int, listener: Any, *, origins: Sequence[str] = (), **options: Any
+    ) -> Any:
         """Start the server.
 
         Args:
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
             listener: Callbacks for viewers' requests; see `foxglove.websocket.ServerListener`.
+            origins: Additional origins of web pages that may connect.
             **options: Further arguments of `foxglove.start_server`.
 
         Returns:
-            Handle of the server, for `broadcast_time` etc.
+            Handle of the server, such as for `broadcast_time`.
 
         Raises:
             UsageError: The port is in use.
         """
         try:
-            self._server = self.foxglove.start_server(
-                name=name,
-                host=HOST,
-                port=port,
-                server_listener=listener,
-                supported_encodings=["cdr"],
-                context=self._context,
-                **options,
-            )
-        except (OSError, RuntimeError) as error:
+            socket = create_server((HOST, port))
+        except OSError as error:
             raise UsageError(f"cannot listen on {HOST}:{port}: {error}; pass --port") from error
+        start = partial(
+            self.foxglove.start_server,
+            name=name,
+            port=0,
+            server_listener=listener,
+            supported_encodings=["cdr"],
+            context=self._context,
+            **options,
+        )
+        host = _hidden_host()
+        try:
+            self._server = start(host=host)
+        except (OSError, RuntimeError):
+            # Some systems have only one loopback address.
+            host = HOST
+            self._server = start(host=host)
+        self._inner = f"{host}:{self._server.port}"
+        target = (host, self._server.port)
+        self._filter = OriginFilter(socket, target, [*VIEWER_ORIGINS, *origins])
         return self._server
 
     @property
     def url(self) -> str:
         """WebSocket URL of the server."""
-        return f"ws://{HOST}:{self._server.port}"
+        return f"ws://{self._outer}"
 
     @property
     def app_url(self) -> str:
         """Link that opens Foxglove connected to the server."""
-        return str(self._server.app_url())
+        return str(self._server.app_url()).replace(quote(self._inner), quote(self._outer))
+
+    @property
+    def _outer(self) -> str:
+        assert self._filter is not None, "the server is not started"
+        return f"{HOST}:{self._filter.port}"
 
     def close(self) -> None:
         """Stop the server and close its channels."""
         if self._server is not None:
             self._server.stop()
+        if self._filter is not None:
+            self._filter.close()
         for channel in self._channels:
             channel.close()
+
+
+def _hidden_host() -> str:
+    """Return a loopback address that no web page can guess, to bypass the filter."""
+    return "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))

@@ -1,12 +1,12 @@
-"""Shows an environment to viewers while it runs, as many frames as there is time for.
+"""Live stream of a running environment to viewers, at a limited share of the run time.
 
-Viewers receive the topics of a log, as `log_writer` and `display` describe them, and one more:
+Viewers receive the topics of a log (see `log_writer` and `display`) and one more:
 
-    /rl/training    mcaprl_msgs/msg/Telemetry...    numbers of the learner: loss, epsilon, ...
+    /rl/training    mcaprl_msgs/msg/Telemetry...    metrics of the learner: loss, epsilon, ...
 
-Nothing is stored, and the environment never waits for a viewer. Times are those of the wall clock,
-because simulated time is meaningless where whole episodes are skipped. Static shapes and frames are
-sent to each new viewer, and again when they change.
+Nothing is stored, and the environment never waits for a viewer. Timestamps are wall-clock times,
+because whole episodes can be skipped. Static shapes and frames are sent to each new viewer, and
+again when they change.
 """
 
 from __future__ import annotations
@@ -49,32 +49,32 @@ from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 
 _SHARE = 0.025
-"""Largest share of all time that is spent on frames."""
+"""Largest share of the run time that is spent on frames."""
 _PERIOD_S = 1 / 20
 """Shortest time between two frames."""
 _STATIC_PERIOD_S = 10.0
-"""Time after which the static scene is compared again."""
+"""Time after which the static scene is checked for changes."""
 _ROW = slice(1)
-"""The one row of each topic that is reserved."""
+"""The only row that is reserved for each topic."""
 
 
 @dataclass(frozen=True)
 class LiveStep:
-    """One transition of the watched environment, and the learner's numbers at that step.
+    """A transition of the streamed environment, and the learner's metrics at that step.
 
     Attributes:
         episode: Number of the episode, from 0.
-        step: Steps since the episode's start.
+        step: Number of steps since the episode's start.
         observation: Observation, in the environment's space.
-        action: Action taken there.
+        action: Action taken.
         reward: Reward of the action.
         terminated: Whether the transition reached a terminal state.
-        truncated: Whether the episode was cut off there.
-        behavior_prob: Probability of the action under the policy that took it; NaN if unknown.
+        truncated: Whether the episode was truncated.
+        behavior_prob: Probability of the action under the behavior policy; NaN if unknown.
         epsilon: Probability of a random action; NaN if unknown.
         policy_version: Number of updates of the policy so far.
         values: Fields of `schema.values_schema`; empty if unknown.
-        training: The learner's numbers, by the names given to `LiveStream`.
+        training: Metrics of the learner, by the names passed to `LiveStream`.
     """
 
     episode: int
@@ -100,7 +100,7 @@ class Pace:
         period_s: float = _PERIOD_S,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        """Limit frames to `share` of all time and one per `period_s`; `clock` returns seconds."""
+        """Limit frames to `share` of the run time and one per `period_s`; `clock` is in seconds."""
         self._share, self._period_s, self._clock = share, period_s, clock
         self._next_s = -math.inf
         self._began_s = 0.0
@@ -111,15 +111,15 @@ class Pace:
         return self._clock() >= self._next_s
 
     def begin(self) -> None:
-        """Start or continue the time of a frame."""
+        """Start or continue the timer of a frame."""
         self._began_s = self._clock()
 
     def pause(self) -> None:
-        """Stop the time of a frame, while the environment is stepped."""
+        """Stop the timer of a frame while the environment is stepped."""
         self._spent_s += self._clock() - self._began_s
 
     def end(self) -> None:
-        """End a frame, and set when the next one is due."""
+        """End a frame and schedule the next one."""
         self.pause()
         rest_s = self._spent_s * (1 / self._share - 1)
         self._next_s = self._clock() + max(rest_s, self._period_s - self._spent_s)
@@ -137,23 +137,25 @@ class LiveStream:
         *,
         name: str = "mcaprl",
         port: int = DEFAULT_PORT,
+        origins: Sequence[str] = (),
         pace: Pace | None = None,
     ) -> None:
         """Announce the topics and listen.
 
         Args:
             metadata: Metadata of the environment.
-            source: Unwrapped environment, after a reset. What it shows depends on which protocols
-                of `scene` it has.
-            training: Names of the learner's numbers.
-            name: Name that viewers show.
-            port: Port on 127.0.0.1; 0 selects a free one.
+            source: Unwrapped environment after a reset, which implements any of the protocols in
+                `scene.py`.
+            training: Names of the learner's metrics.
+            name: Name of the server, as viewers display it.
+            port: Port on 127.0.0.1; 0 selects a free port.
+            origins: Additional origins of web pages that may connect.
             pace: Limit on the time spent on frames.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
             UsageError: The port is in use.
-            SpaceError: A log cannot contain the spaces.
+            SpaceError: The log format does not support the spaces.
         """
         self._pace = pace or Pace()
         self._viewers = ViewerServer()
@@ -168,20 +170,20 @@ class LiveStream:
             self._static_messages(source)
         self._time_ns = 0
         self._finished: list[EpisodeSummary] = []
-        self._viewers.start(name, port, self)
+        self._viewers.start(name, port, self, origins=origins)
 
     @property
     def url(self) -> str:
-        """Address that viewers connect to."""
+        """WebSocket URL of the server."""
         return self._viewers.url
 
     @property
     def app_url(self) -> str:
-        """Link that opens Foxglove with this connection."""
+        """Link that opens Foxglove connected to the server."""
         return self._viewers.app_url
 
     def due(self) -> bool:
-        """Return whether there is time for a frame and a viewer to show it to."""
+        """Return whether there is time for a frame and a viewer is subscribed."""
         if not self._pace.due():
             return False
         self._pace.begin()
@@ -191,7 +193,7 @@ class LiveStream:
         return False
 
     def look(self, source: object, return_so_far: float) -> None:
-        """Store what the environment shows before a step; call it when a frame is due."""
+        """Store the environment's display messages before a step, if a frame is due."""
         self._time_ns = max(time.time_ns(), self._time_ns + 1)
         seen = []
         if isinstance(source, SceneSource) and SCENE in self._topics:
@@ -208,7 +210,7 @@ class LiveStream:
         self._pace.pause()
 
     def show(self, step: LiveStep) -> None:
-        """Send what `look` stored, and the step that was taken there."""
+        """Send the messages that `look` stored, and the step taken after it."""
         self._pace.begin()
         time_ns, topics = self._time_ns, self._topics
         self._sink.write_messages([(topics[t], time_ns, data) for t, data in self._seen])
@@ -225,7 +227,7 @@ class LiveStream:
         self._pace.end()
 
     def end_episode(self, summary: EpisodeSummary) -> None:
-        """Send the summary of a finished episode with the next frame; of several, only the last."""
+        """Send the summary of the latest finished episode with the next frame."""
         self._finished = [summary]
 
     def layout(self) -> dict[str, Any]:
@@ -250,7 +252,7 @@ class LiveStream:
         """Do nothing: messages are sent only to subscribers."""
 
     def _static_messages(self, source: SceneSource) -> list[tuple[str, bytes]]:
-        """Return the static scene for new viewers; from time to time for all, if it changed."""
+        """Return the static scene if there are new viewers or a periodic check finds a change."""
         age_s = time.monotonic() - self._static_at_s
         if not (self._newcomers or age_s > _STATIC_PERIOD_S):
             return []
@@ -267,7 +269,7 @@ class LiveStream:
         return self._static
 
     def _announce(self, source: object) -> None:
-        """Announce all topics, and reserve a row of each topic of fixed-size messages."""
+        """Announce all topics, and reserve a row for each topic of fixed-size messages."""
         log = self._log
         self._shown = ShownTopics(log, source)
         self._topics = dict(self._shown.channels)
@@ -288,7 +290,7 @@ class LiveStream:
         }
 
     def _send_step(self, step: LiveStep) -> None:
-        """Send the transition as a log would contain it."""
+        """Send the transition in the messages of a log."""
         columns = {name: getattr(step, name) for name in ("reward", "behavior_prob")}
         columns["action"] = as_declared(step.action, self._log.action)
         for leaf in observation_leaves(self._log.metadata.observation_space):
@@ -314,7 +316,7 @@ class LiveStream:
 
 
 class _ViewerSink(MessageSink):
-    """Sends a log's messages to viewers."""
+    """A sink that sends a log's messages to viewers."""
 
     def __init__(self, viewers: ViewerServer) -> None:
         self._viewers = viewers
@@ -324,7 +326,7 @@ class _ViewerSink(MessageSink):
         return any(channel.has_sinks() for channel in self._channels)
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Do nothing: viewers have no use for metadata."""
+        """Do nothing: viewers do not use metadata."""
 
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None

@@ -1,11 +1,12 @@
 """A live server that plays logs to Foxglove, with play, pause, speed and seek.
 
-Messages are sent as they are stored in the file. If several logs are played at once, messages that
-name frames are re-encoded with a prefix per log, so that the frames of two cars differ.
+Messages are sent as they are stored in the file. If several logs are played at once, frame names in
+messages get a prefix per log, so that the frames of two cars differ.
 """
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Sequence
 from typing import Any
@@ -16,10 +17,12 @@ from mcaprl.recorder.viewer.playback import Played, Player
 from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 
 _PERIOD_S = 1 / 30
+# Range of speeds that a viewer may request; others are ignored.
+MIN_SPEED, MAX_SPEED = 1e-3, 1e3
 
 
 class LiveServer:
-    """Server that plays logs to all connected viewers; the clock starts with the first subscriber.
+    """Server that plays logs to all connected viewers, starting with the first subscriber.
 
     Viewers can set two parameters: `episode`, which seeks to the episode's start, and `loop`.
     """
@@ -32,15 +35,17 @@ class LiveServer:
         episode_starts_ns: Sequence[int] = (),
         name: str = "mcaprl",
         port: int = DEFAULT_PORT,
+        origins: Sequence[str] = (),
     ) -> None:
         """Start the server.
 
         Args:
             player: Clock and messages of the logs.
-            prefixes: Prefix of each log's topics; empty for no prefix.
+            prefixes: Prefix of each log's topics; an empty string adds none.
             episode_starts_ns: Start of each episode on the player's clock, nanoseconds.
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
+            origins: Additional origins of web pages that may connect.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -61,6 +66,7 @@ class LiveServer:
             name,
             port,
             self,
+            origins=origins,
             capabilities=[can.Time, can.Parameters, can.PlaybackControl],
             playback_time_range=(player.start_ns, player.end_ns),
         )
@@ -81,7 +87,7 @@ class LiveServer:
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the messages that have become due."""
+        """Send the messages that are due."""
         with self._lock:
             restarts = self._player.ended and self._player.loops and self._player.playing
             if restarts:
@@ -93,10 +99,10 @@ class LiveServer:
             due += self._player.advance(elapsed_s)
             time_ns, stopped = self._player.time_ns, was_playing and not self._player.playing
             state = self._state(did_seek=restarts)
-            # The lock is held until everything is sent: messages from before a seek must not
-            # follow the answer to it.
+            # The lock is held until all is sent, so that no message from before a seek follows the
+            # response to the seek.
             if restarts:
-                # Viewers without a seek bar drop what they have drawn.
+                # Clear the display of viewers without a seek bar.
                 self._server.clear_session()
             for message in due:
                 self._send(message)
@@ -112,7 +118,7 @@ class LiveServer:
         """Play, pause, change the speed, or seek."""
         with self._lock:
             player = self._player
-            if request.playback_speed > 0:
+            if MIN_SPEED <= request.playback_speed <= MAX_SPEED:
                 player.speed = request.playback_speed
             if request.seek_time is not None:
                 player.seek(request.seek_time)
@@ -124,7 +130,7 @@ class LiveServer:
             return self._state(did_seek=self._seeked, request_id=request.request_id)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Send a new subscriber the current state, and start the clock for the first one."""
+        """Send the current state with the next tick, and start the clock on the first call."""
         with self._lock:
             if not self._looked_at:
                 self._looked_at = self._player.playing = True
@@ -134,7 +140,7 @@ class LiveServer:
         """Do nothing: messages are sent to subscribers only."""
 
     def on_get_parameters(self, client: Any, names: list[str], request_id: Any = None) -> list[Any]:
-        """Return the requested parameters; all of them if none is named."""
+        """Return the requested parameters, or all if no name is given."""
         with self._lock:
             return [p for p in self._parameters() if not names or p.name in names]
 
@@ -147,12 +153,12 @@ class LiveServer:
                 value = parameter.get_value()
                 if parameter.name == "loop":
                     self._player.loops = bool(value)
-                elif parameter.name == "episode" and isinstance(value, int | float):
+                elif parameter.name == "episode" and _is_number(value):
                     self._jump(int(value))
             return self._parameters()
 
     def on_parameters_subscribe(self, names: list[str]) -> None:
-        """Do nothing: values are returned when they are set."""
+        """Do nothing: `on_set_parameters` returns new values."""
 
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
         """Do nothing."""
@@ -210,3 +216,7 @@ class LiveServer:
 
     def _reader(self, number: int) -> McapReader:
         return self._player.tracks[number].reader
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)

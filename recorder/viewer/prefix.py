@@ -1,4 +1,4 @@
-"""Several logs in one viewer: the topics and frames of each have a prefix."""
+"""Prefixes for the topics and frames of several logs in one viewer."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 from mcaprl.recorder.format import messages
 
 WORLD = "map"
-"""The frame that all logs share."""
+"""Name of the frame that all logs share."""
 _MARKERS, _FRAMES = "visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"
 PREFIXED_TYPES = (_MARKERS, _FRAMES)
-"""Messages that name frames of moving bodies, and so cannot be passed on as they are."""
+"""Types of messages that contain names of frames, which get a prefix."""
 
 
 def prefixes_of(paths: Sequence[Path]) -> list[str]:
-    """A word for each file; none for a single one.
+    """Return a unique prefix for each file, or an empty one for a single file.
 
     >>> prefixes_of([Path("runs/a.mcap"), Path("b/a.mcap"), Path("C-1.mcap")])
     ['a', 'a_2', 'c_1']
@@ -37,13 +37,13 @@ def prefixes_of(paths: Sequence[Path]) -> list[str]:
 
 
 def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) -> bytes:
-    """A message whose frames, all but the world, stand below a prefix, and whose stamps are moved.
+    """Return a message with prefixed frame names, except `WORLD`, and shifted stamps.
 
     Args:
-        data: CDR bytes of one of `PREFIXED_TYPES`.
-        type_name: which.
-        prefix: the log's word.
-        shift_ns: added to stamps; those that are 0 stay so.
+        data: CDR bytes of the message.
+        type_name: Type of the message, one of `PREFIXED_TYPES`.
+        prefix: Prefix of the log.
+        shift_ns: Time to add to nonzero stamps.
     """
     message = messages.decode(data, type_name)
     parts = message.markers if type_name == _MARKERS else message.transforms
@@ -58,12 +58,12 @@ def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) ->
 
 
 def side_by_side(layouts: Sequence[dict[str, Any]], prefixes: Sequence[str]) -> dict[str, Any]:
-    """One layout that shows several logs beside each other."""
+    """Return a layout that shows several logs side by side."""
     parts = [_prefixed_layout(*pair) for pair in zip(layouts, prefixes, strict=True)]
-    *firsts, root = [part["layout"] for part in parts]
+    *firsts, root = [part.get("layout") for part in parts]
     for count, first in enumerate(reversed(firsts), start=2):
         root = {"first": first, "second": root, "direction": "row", "splitPercentage": 100 / count}
-    panels = {name: panel for part in parts for name, panel in part["configById"].items()}
+    panels = {name: panel for part in parts for name, panel in part.get("configById", {}).items()}
     return {**parts[0], "configById": panels, "layout": root}
 
 
@@ -71,7 +71,7 @@ def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
     if not prefix:
         return layout
     text = json.dumps(layout)
-    # Topics begin with a slash, wherever they stand; panels are named Kind!what.
+    # Every string that begins with a slash is a topic; panels are named Kind!what.
     text = re.sub(r'"(/[a-z])', rf'"/{prefix}\1', text)
     text = re.sub(r'"(\w+)!', rf'"\1!{prefix} ', text)
     text = re.sub(r'("followTf": ")(?!map")', rf"\1{prefix}/", text)

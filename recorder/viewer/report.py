@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, to_svg
+from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
@@ -23,7 +23,7 @@ Positions = NDArray[np.float64]
 _POSITION = ("x_m", "y_m")
 _BINS = 30
 _SHOWN_EPISODES: Final = 3
-"""Number of best episodes, and of worst episodes, that the page shows."""
+"""Maximum number of best episodes, and of worst episodes, on the page."""
 _MAP_CELLS = 80
 _MAX_ROWS = 60
 
@@ -64,7 +64,7 @@ def dataset_page(
         path: Path of the HTML file.
         dataset: Dataset to report on.
         title: Title of the page.
-        facts: Names and values of the table of facts.
+        facts: Names and values for the table of facts.
         findings: Findings of `lint`.
 
     Raises:
@@ -162,7 +162,7 @@ def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
 
 
 def _commands(dataset: Dataset) -> list[str]:
-    """Return the command that replays each episode; empty if an episode's file is unknown."""
+    """Return the command that replays each episode; empty if the file is unknown."""
     counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
     if sum(counts) != len(dataset.episodes):
         return [""] * len(dataset.episodes)
@@ -183,7 +183,7 @@ def _card(kind: str, episode: Episode, track: Positions, places: Positions, comm
 
 
 def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
-    """Plot an episode's track over all positions; without positions, its cumulative reward."""
+    """Plot an episode's track over all positions, or its cumulative reward without positions."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)
@@ -200,7 +200,7 @@ def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
 
 
 def _columns(dataset: Dataset) -> Table:
-    """Return the table of the observations' ranges."""
+    """Return a table of the observations' statistics."""
     rows = []
     for name, column in dataset.statistics.observations.items():
         names = dataset.observation_names
@@ -230,7 +230,8 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
         axes.set_axis_off()
         axes.text(0.5, 0.5, f"{label or 'actions'}: continuous", ha="center", color=INK)
         return
-    axes.barh(list(counts), list(counts.values()), color=COLORS[0], height=0.7)
+    axes.barh(range(len(counts)), list(counts.values()), color=COLORS[0], height=0.7)
+    axes.set_yticks(range(len(counts)), tick_labels(counts))
     axes.set_ylim(max(len(counts), 3) - 0.5, -0.5)
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel(label)
@@ -258,7 +259,7 @@ def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
 def _positions_at(
     times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
 ) -> Positions:
-    """Return the positions at exactly these times: all topics of a step share one."""
+    """Return the positions at exactly these times, or an empty array if no log has them."""
     for known, positions in logs:
         start = int(np.searchsorted(known, times[0]))
         stop = start + len(times)

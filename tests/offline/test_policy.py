@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import tracemalloc
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.api.policies import load_policies, load_policy
-from mcaprl.errors import PolicyError
+from mcaprl.errors import PolicyError, ReportError
 from mcaprl.offline.algorithms.bc import BC, BCConfig
 from mcaprl.offline.algorithms.bcq import BCQ
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -27,6 +28,7 @@ from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 from mcaprl.offline.policy import Policy, read_policy, save_policy
+from mcaprl.offline.training.curves import draw_curves
 from mcaprl.offline.training.train import train
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support.offline_tasks import ACTION_SPACE, N_CELLS, corridor, inner_observations
@@ -254,7 +256,7 @@ def test_observations_are_not_modified(tmp_path: Path) -> None:
 @pytest.mark.parametrize("shape", [(N_CELLS,), (3, N_CELLS + 1), (3, 1, N_CELLS), ()])
 def test_observations_of_another_shape_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
     policy = saved_and_loaded(tmp_path, learner_with_outputs(CQL, [1.0, 2.0]))
-    with pytest.raises(PolicyError, match=r"takes observations \(B, 5\), got"):
+    with pytest.raises(PolicyError, match=r"expects observations \(B, 5\), got"):
         policy.act(np.zeros(shape, np.float32))
 
 
@@ -332,3 +334,39 @@ def test_nothing_is_unpickled(cql_run: Path) -> None:
     (cql_run / "seed-0" / "policy.safetensors").write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(PolicyError):
         load_policy(cql_run)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("frame_stack", 10**9),
+        ("observation_space", {"type": "MultiBinary", "n": 3 * 10**8}),
+        ("action_space", {"type": "Discrete", "n": 10**12, "start": 0}),
+        ("architecture", {"hidden": [10**9]}),
+        ("architecture", {"hidden": [16, 10**5, 10**5]}),
+        ("outputs", {"q": [10**9]}),
+    ],
+)
+def test_sizes_are_refused_before_memory_is_taken(cql_run: Path, key: str, value: Any) -> None:
+    path = cql_run / "seed-0" / "policy.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}))
+    tracemalloc.start()
+    try:
+        with pytest.raises(PolicyError) as error:
+            read_policy(path.parent)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+    assert "\n" not in str(error.value)
+
+
+def test_deep_json_is_refused(cql_run: Path) -> None:
+    (cql_run / "seed-0" / "policy.json").write_text("[" * 100_000 + "]" * 100_000)
+    with pytest.raises(PolicyError, match="nested"):
+        read_policy(cql_run / "seed-0")
+
+
+def test_curves_of_a_removed_run_are_one_clear_error(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    with pytest.raises(ReportError, match="was the folder removed"):
+        draw_curves(tmp_path / "removed")

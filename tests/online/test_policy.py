@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -181,7 +182,7 @@ def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
         ({"policy_pth": None}, "is not a model of Stable-Baselines3: .*policy.pth"),
         ({"data": None}, "is not a model of Stable-Baselines3: .*data"),
         ({"data": b"{"}, "cannot read the model"),
-        ({"data": b"[]"}, "its parts have other types"),
+        ({"data": b"[]"}, "its parts have wrong types"),
         ({"policy_pth": b"PK"}, "cannot read the model|not plain tensors"),
         ({"mcaprl_json": b'{"format_version": 9}'}, "format_version 9 is not supported"),
         ({"mcaprl_json": b'{"format_version": 1}'}, "cannot load the policy .* KeyError"),
@@ -217,7 +218,7 @@ def test_files_that_are_not_zip_are_refused(tmp_path: Path) -> None:
 
 def test_other_algorithms_are_refused(tmp_path: Path) -> None:
     SAC("MlpPolicy", gym.make("Pendulum-v1"), buffer_size=10, **small()).save(tmp_path / "sac.zip")
-    with pytest.raises(PolicyError, match="none of DQN, PPO and A2C"):
+    with pytest.raises(PolicyError, match="not DQN, PPO or A2C"):
         read_policy(tmp_path / "sac.zip")
 
 
@@ -262,3 +263,86 @@ def test_sb3_loads_the_model_without_this_package(tmp_path: Path) -> None:
     )
     action = model.predict(np.array([0.1, 0.2, 0.3, 0.4]), deterministic=True)[0]
     assert int(done.stdout) == int(action)
+
+
+def edited(path: Path, out: Path, name: str, **changes: Any) -> Path:
+    """A copy of a model file with other values in one of its JSON parts."""
+    with zipfile.ZipFile(path) as archive:
+        content = {**json.loads(archive.read(name)), **changes}
+    return rewrite(path, out, **{name.replace(".", "_"): json.dumps(content).encode()})
+
+
+LARGE_BOX = {"type": "Box", "low": 0, "high": 1, "shape": [3 * 10**8], "dtype": "float32"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"frame_stack": 10**9},
+        {"observation_space": LARGE_BOX},
+        {"observation_space": {**LARGE_BOX, "shape": [2**24]}},
+        {"action_space": {"type": "Discrete", "n": 10**12, "start": 0}},
+        {"net_arch": [10**9]},
+        {"net_arch": [8, 10**5, 10**5]},
+        {"net_arch": ["8"]},
+        {"net_arch": {"pi": [10**9]}},
+    ],
+)
+def test_sizes_are_refused_before_memory_is_taken(tmp_path: Path, changes: Any) -> None:
+    model = dqn()
+    path = ours(tmp_path / "ours.zip", model, gym.make("CartPole-v1"))
+    tracemalloc.start()
+    try:
+        with pytest.raises(PolicyError) as error:
+            read_policy(edited(path, tmp_path / "large.zip", OWN_NAME, **changes))
+        # The bounds of the largest space that is accepted take less.
+        assert tracemalloc.get_traced_memory()[1] < 400e6
+    finally:
+        tracemalloc.stop()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("role", "name", "value"),
+    [("observation_space", "_shape", [3 * 10**8]), ("action_space", "n", 10**12)],
+)
+def test_sizes_in_files_of_sb3_are_refused(
+    tmp_path: Path, role: str, name: str, value: Any
+) -> None:
+    dqn().save(tmp_path / "sb3.zip")
+    with zipfile.ZipFile(tmp_path / "sb3.zip") as archive:
+        space = {**json.loads(archive.read("data"))[role], name: value}
+    with pytest.raises(PolicyError, match="too large"):
+        read_policy(edited(tmp_path / "sb3.zip", tmp_path / "large.zip", "data", **{role: space}))
+
+
+@pytest.mark.parametrize("name", ["data", "policy_pth"])
+def test_compressed_blanks_are_not_unpacked(tmp_path: Path, name: str) -> None:
+    dqn().save(tmp_path / "sb3.zip")
+    path = rewrite(tmp_path / "sb3.zip", tmp_path / "large.zip", **{name: None})
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name.replace("_", "."), b" " * 10**8)
+    tracemalloc.start()
+    try:
+        with pytest.raises(PolicyError, match="100000000 bytes, more than the"):
+            read_policy(path)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_weights_compressed_within_are_not_unpacked(tmp_path: Path) -> None:
+    dqn().save(tmp_path / "sb3.zip")
+    inner = io.BytesIO()
+    with zipfile.ZipFile(inner, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(10**8))
+    path = rewrite(tmp_path / "sb3.zip", tmp_path / "large.zip", policy_pth=inner.getvalue())
+    with pytest.raises(PolicyError, match="more than the"):
+        read_policy(path)
+
+
+def test_deep_json_is_refused(tmp_path: Path) -> None:
+    dqn().save(tmp_path / "sb3.zip")
+    deep = b"[" * 100_000 + b"]" * 100_000
+    with pytest.raises(PolicyError, match="nested"):
+        read_policy(rewrite(tmp_path / "sb3.zip", tmp_path / "deep.zip", data=deep))

@@ -80,6 +80,7 @@ def test_configs_cannot_be_changed() -> None:
         (BCConfig, "log_interval", 0),
         (BCConfig, "weight_decay", -0.1),
         (BCConfig, "frame_stack", 0),
+        (BCConfig, "frame_stack", 10**9),
         (BCConfig, "held_out", 1.0),
         (DQNConfig, "n_steps", 0),
         (DQNConfig, "n_quantiles", 0),
