@@ -11,7 +11,6 @@ RUN/seed-K/best_model.zip               policy of an online run, as Stable-Basel
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, TrainingError
-from mcaprl.files import write_json
+from mcaprl.files import parse_json, write_json
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -141,7 +140,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG_NAME
     try:
-        found = json.loads(path.read_text())
+        found = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise TrainingError(f"cannot resume: {path} cannot be read: {error}") from error
     if not isinstance(found, dict):

@@ -20,7 +20,12 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
-from mcaprl.recorder.record.step_rows import ImageColumn, StepColumns, observation_store
+from mcaprl.recorder.record.step_rows import (
+    ImageColumn,
+    StepColumns,
+    observation_store,
+    reward_number,
+)
 
 _UNKNOWN = math.nan
 
@@ -171,17 +176,22 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._store_observation(observation)
-            self._store_reward(reward)
+            try:
+                self._store_reward(reward)
+                number = reward
+            except TypeError:
+                number = reward_number(reward)
+                self._store_reward(number)
             if terminated or truncated or step >= self._full_at:
                 # No signal may interrupt the writes or separate them from the step counter.
                 with HoldSignals():
                     self._make_room(step)
-                    self._count(episode, step, float(reward))
+                    self._count(episode, step, float(number))
                     if terminated or truncated:
                         reason = reason_of(info.get("reason"), bool(terminated))
                         self._end(bool(terminated), bool(truncated), reason)
             elif self._shows_steps:
-                self._count(episode, step, float(reward))
+                self._count(episode, step, float(number))
             else:
                 episode.steps = step
         except BaseException:
