@@ -235,13 +235,28 @@ def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
     """
     for role in ("observation_space", "action_space"):
         trained, actual = getattr(policy, role, None), getattr(env, role)
-        if trained is not None and trained != actual:
+        if trained is not None and not same_form(trained, actual):
             name = env.spec.id if env.spec else "the environment"
             kind = getattr(policy, "env_kwargs", {}).get("observation")
             hint = f"; try --observation {kind}" if kind and role == "observation_space" else ""
             raise PolicyError(
                 f"{policy.name} was trained on {role} {trained}; {name} has {actual}{hint}"
             )
+
+
+def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    """Return whether values of two spaces have the same shapes and dtypes; bounds may differ.
+
+    >>> same_form(spaces.Box(0, 1, (3,)), spaces.Box(-9, 9, (3,)))
+    True
+    """
+    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
+        return space.keys() == other.keys() and all(
+            same_form(space[key], other[key]) for key in space
+        )
+    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
+        return (space.shape, space.dtype) == (other.shape, other.dtype)
+    return space == other
 
 
 def _batch(observation: Any) -> Any:

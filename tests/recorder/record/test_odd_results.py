@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 import mcaprl
 from mcaprl.errors import SpaceError
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, rollout
 
 
 class Returning(gym.Env[Any, Any]):
@@ -44,6 +45,12 @@ def test_rewards_of_one_number_are_stored(log_path: Path, reward: Any) -> None:
     with closing(mcaprl.RecordMcap(Returning(reward), log_path)) as env:
         play(env)
     assert mcaprl.open(log_path).rewards.tolist() == [1.5, 1.5]
+
+
+def test_rollouts_accept_rewards_of_one_number(log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(Returning(np.array([1.5])), log_path)) as env:
+        (result,) = rollout(env, EpsilonGreedy(None, 1.0, env.action_space), seed=0, episodes=1)
+    assert result.total_reward == 3.0
 
 
 @pytest.mark.parametrize("reward", [None, np.array([1.0, 2.0]), "1", np.array([]), {}])
