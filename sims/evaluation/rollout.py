@@ -129,7 +129,7 @@ def run_episode(
             on_action(probability)
         observation, reward, terminated, truncated, info = env.step(action)
         positions.append(_position(telemetry))
-        total += float(reward)
+        total += float(reward.item() if isinstance(reward, np.ndarray) else reward)
         length += 1
         if terminated or truncated:
             reason = str(info.get("reason") or ("terminated" if terminated else "time_limit"))
