@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -85,7 +84,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     """
     found = mcaprl.recover(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
     if as_json:
-        print_json({"ok": not found.has_losses, **asdict(found)})
+        print_json(found.to_json())
     else:
         ended = f", {found.ended} of them without their end" if found.ended else ""
         episodes = counted(found.episodes, "episode")

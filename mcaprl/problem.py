@@ -1,24 +1,33 @@
-"""What `check`, `recover`, `verify` and `info` report about a log or a dataset."""
+"""Defects and notes that `check`, `recover`, `verify` and `info` report."""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, TypeVar
 
 Severity = Literal["problem", "note"]
+LISTED = 10
+"""Number of findings of one kind that are listed; the others are counted."""
+# Kinds are told apart by texts from the file, so their number is limited, too.
+_MAX_KINDS = 100
+_OTHERS = "other findings"
+_NUMBER = re.compile(r"-?\d[\d.,]*")
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something in a log or a dataset that is wrong, or that its user should know.
+    """Defect of a log or a dataset, or note about it.
 
     Attributes:
         what: Description of the defect.
         where: Place in the file or dataset: a byte, a topic, an episode.
-        effect: Consequence; empty if `what` says it.
+        effect: Consequence; empty if `what` implies it.
         next: Action that the user can take; empty if there is none.
         file: Path of the file; empty for a dataset.
-        severity: `problem` for a defect, `note` for what may be intended.
+        severity: `problem` for a defect, `note` for a possibly intended property.
     """
 
     what: str
@@ -38,3 +47,51 @@ class Problem:
     def to_json(self) -> dict[str, str]:
         """Return the fields that `check --json` has for each problem."""
         return {"file": self.file, "what": self.what, "where": self.where, "next": self.next}
+
+
+class Finding(Protocol):
+    """Anything with a description of what was found."""
+
+    @property
+    def what(self) -> str:
+        """Description; descriptions that differ only in numbers are of one kind."""
+
+
+F = TypeVar("F", bound=Finding)
+
+
+class Shortlist(list[F]):
+    """List that stores the first findings of each kind and counts the others."""
+
+    def __init__(self, found: Iterable[F] = ()) -> None:
+        """Start with some findings."""
+        super().__init__()
+        self._counts: Counter[str] = Counter()
+        self.extend(found)
+
+    def append(self, finding: F) -> None:
+        """Store or count a finding."""
+        kind = _NUMBER.sub("#", finding.what)
+        if kind not in self._counts and len(self._counts) >= _MAX_KINDS:
+            kind = _OTHERS
+        self._counts[kind] += 1
+        if self._counts[kind] <= LISTED:
+            super().append(finding)
+
+    def extend(self, found: Iterable[F]) -> None:
+        """Store or count findings."""
+        for finding in found:
+            self.append(finding)
+
+    @property
+    def total(self) -> int:
+        """Number of all findings."""
+        return self._counts.total()
+
+    def rest(self) -> list[Problem]:
+        """Return one finding for each kind that has more than are listed."""
+        return [
+            Problem(f"{count - LISTED} more findings of the kind: {kind}", "not listed")
+            for kind, count in self._counts.items()
+            if count > LISTED
+        ]

@@ -1,4 +1,4 @@
-"""Policies by name: `pilot`, `random`, or the path of a trained one."""
+"""Policies by name: `pilot`, `random`, or the path of a trained policy."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from mcaprl.errors import PolicyError, UnknownNameError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
-from mcaprl.sims.evaluation.rollout import Policy, check_fit
+from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
 
 SCRIPTED = ("pilot", "random")
 Names = str | Path | Sequence[str | Path]
-"""A policy, `pilot`, `random` or a path, or several of them."""
+"""`pilot`, `random` or the path of a policy, or several of them."""
 
 
 def as_names(policies: Names) -> list[str]:
@@ -30,19 +30,19 @@ def as_names(policies: Names) -> list[str]:
 
 
 class TrainedPolicy(Policy, Protocol):
-    """A loaded policy; NumPy in, NumPy out. B is the number of observations, A of actions.
+    """Loaded policy with NumPy inputs and outputs; B observations, A actions.
 
-    A policy that stacks k > 1 frames remembers the observations of its last k calls of `act` since
-    `begin`; its other methods accept (B, k, *shape), oldest frame first.
+    A policy that stacks k > 1 frames stores the observations of its last k calls of `act` since
+    `begin`; the other methods accept (B, k, *shape), oldest frame first.
     """
 
     @property
     def algo(self) -> str:
-        """Name of the algorithm that trained it."""
+        """Name of the training algorithm."""
 
     @property
     def observation_space(self) -> spaces.Space[Any] | None:
-        """Space of one observation; None where the file has no bounds."""
+        """Space of one observation; None if the file has no bounds."""
 
     @property
     def action_space(self) -> spaces.Space[Any]:
@@ -50,18 +50,18 @@ class TrainedPolicy(Policy, Protocol):
 
     @property
     def env_id(self) -> str:
-        """Gymnasium id of the environment it was trained for; empty if unknown."""
+        """Gymnasium id of the training environment; empty if unknown."""
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Arguments of that environment."""
+        """Arguments of the training environment."""
 
     @property
     def frame_stack(self) -> int:
-        """Number of successive observations that its networks receive."""
+        """Number of successive observations that the networks receive."""
 
     def begin(self) -> None:
-        """Drop the remembered observations, because an episode begins."""
+        """Drop the stored observations at the start of an episode."""
 
     def q_values(self, observations: Any) -> NDArray[Any]:
         """Return Q-values (B, A), in the order of the action space.
@@ -71,7 +71,7 @@ class TrainedPolicy(Policy, Protocol):
         """
 
     def action_probabilities(self, observations: Any) -> NDArray[Any]:
-        """Return the probabilities (B, A) of all actions; a greedy policy's are 0 and 1.
+        """Return the probabilities (B, A) of all actions; of a greedy policy, 0 and 1.
 
         Raises:
             PolicyError: The observations have another shape.
@@ -79,11 +79,11 @@ class TrainedPolicy(Policy, Protocol):
 
 
 def load_policy(path: str | Path) -> TrainedPolicy:
-    """Load a trained policy; nothing in its files is unpickled or executed.
+    """Load a trained policy, without unpickling or executing anything in its files.
 
     Args:
-        path: Run folder of `train-offline` or `train-online`, which means its first seed; the
-            folder of one seed (`RUN/seed-2`); or a `.zip` file of Stable-Baselines3.
+        path: Run folder (its first seed is loaded), folder of one seed (`RUN/seed-2`), or `.zip`
+            file of Stable-Baselines3.
 
     Raises:
         PolicyError: The path contains no policy, or a file is broken.
@@ -93,12 +93,12 @@ def load_policy(path: str | Path) -> TrainedPolicy:
 
 
 def load_policies(path: str | Path) -> list[TrainedPolicy]:
-    """Load the policies of all seeds of a run, by rising seed; see `load_policy`."""
+    """Load the policies of all seeds of a run, sorted by seed; see `load_policy`."""
     return [_load(file) for file in _found_files(Path(path))]
 
 
 def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
-    """Return the policies of a name in an environment: one, or one per training seed of a run.
+    """Return the policies that a name refers to: one, or one per training seed of a run.
 
     Args:
         name: `pilot`; `random`, which is [None]; or a path.
@@ -107,7 +107,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     Raises:
         UnknownNameError: There is no such policy.
         UsageError: The sim has no pilot.
-        PolicyError: The path contains no policy, or one of other spaces.
+        PolicyError: The path contains no policy, or one with other spaces.
     """
     if name == "random":
         return [None]
@@ -129,12 +129,12 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
 
 
 def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
-    """Return the policies of all seeds of a run, to evaluate them on a log.
+    """Load the policies of all seeds of a run, and check that they fit a log.
 
     Raises:
-        UsageError: The name is that of a scripted policy.
+        UsageError: The policy is scripted.
         UnknownNameError: There is no such path.
-        PolicyError: The path contains no policy, or one trained on other spaces than the log's.
+        PolicyError: The path contains no policy, or one trained on spaces other than the log's.
     """
     if name in SCRIPTED:
         raise UsageError(
@@ -144,13 +144,13 @@ def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:
     for policy in policies:
         for role in ("observation_space", "action_space"):
             trained, logged = getattr(policy, role), getattr(dataset, role)
-            if trained not in (None, logged):
+            if trained is not None and not same_form(trained, logged):
                 raise PolicyError(f"{name} was trained on {role} {trained}; the log has {logged}")
     return policies
 
 
 def policy_names(names: Sequence[str]) -> dict[str, str]:
-    """Return the short names for tables: a path's last part, or the path where that is not unique.
+    """Return names for tables: the last part of each path, or the path if that is not unique.
 
     >>> policy_names(["random", "a/run", "b/run", "b/other"])
     {'random': 'random', 'a/run': 'a/run', 'b/run': 'b/run', 'b/other': 'other'}
@@ -168,7 +168,7 @@ def is_policy(path: Path) -> bool:
 
 
 def _existing(name: str, others: Sequence[str]) -> Path:
-    """Return a name as a path; runs beside a path that does not exist may have been meant."""
+    """Return a name as an existing path; otherwise, raise an error that lists runs beside it."""
     path = Path(name)
     if path.exists():
         return path
@@ -182,7 +182,7 @@ def _found_files(path: Path) -> list[Path]:
     if not files:
         raise PolicyError(
             f"{path} has no policy: neither {POLICY_NAME} nor {BEST_NAME}, nor a seed-K folder with"
-            " one; training writes them with its first checkpoint"
+            " one; training writes the policy with its first checkpoint"
         )
     return files
 

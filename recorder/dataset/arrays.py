@@ -1,11 +1,13 @@
-"""Arrays of transitions become columns of episodes, with spaces made up where none are given."""
+"""Conversion of arrays of transitions to columns of episodes, with inferred spaces if needed."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import closing
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -30,14 +32,18 @@ def columns_of_arrays(
     observation_space: spaces.Space[Any] | None,
     action_space: spaces.Space[Any] | None,
 ) -> tuple[Transitions, LogMetadata]:
-    """See `Dataset.from_arrays`, whose arguments these are.
+    """Return the columns and metadata of arrays; arguments are those of `Dataset.from_arrays`.
 
     Raises:
-        SpaceError: lengths or shapes do not agree with each other or with the spaces.
+        SpaceError: Lengths or shapes do not agree with each other or with the spaces.
     """
+    derived = _space_of(observations)
+    registered, of_actions = _registered_spaces(env_id)
+    if registered is not None and not _same_shapes(registered, derived):
+        registered, of_actions = None, None
     description = LogMetadata(
-        observation_space=observation_space or _space_of(observations),
-        action_space=action_space or action_space_of(np.asarray(actions)),
+        observation_space=observation_space or registered or derived,
+        action_space=action_space or of_actions or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
     )
@@ -62,8 +68,29 @@ def columns_of_arrays(
     return transitions, description
 
 
+def _registered_spaces(
+    env_id: str,
+) -> tuple[spaces.Space[Any], spaces.Space[Any]] | tuple[None, None]:
+    """Return the spaces of a registered environment; None if it is unknown or cannot be created."""
+    if env_id not in gym.registry:
+        return None, None
+    try:
+        with closing(gym.make(env_id)) as env:
+            return env.observation_space, env.action_space
+    # An environment may lack its own dependencies.
+    except Exception:
+        return None, None
+
+
+def _same_shapes(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
+    mine, others = observation_leaves(space), observation_leaves(other)
+    return [(leaf.path, leaf.shape) for leaf in mine] == [
+        (leaf.path, leaf.shape) for leaf in others
+    ]
+
+
 def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
-    """The same columns with log_times that rise by one step from frame to frame."""
+    """Return the columns with log_times that increase by one step from frame to frame."""
     times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
     first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
     episodes = tuple(
@@ -74,7 +101,7 @@ def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Trans
 
 
 def _reason(terminated: bool, truncated: bool) -> str:
-    """Why an episode ended, as far as its flags tell."""
+    """Return why an episode ended, according to its flags."""
     return "terminated" if terminated else "truncated" if truncated else ""
 
 
@@ -86,26 +113,26 @@ def _space_of(observations: Any) -> spaces.Space[Any]:
 
 
 def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
-    """Discrete up to the largest of integers, an unbounded Box for all else.
+    """Return a Discrete space up to the largest integer, or an unbounded Box.
 
     Raises:
-        SpaceError: an integer is negative, or the array is of no number type.
+        SpaceError: An integer is negative, or the array is not numeric.
     """
     if actions.ndim == 1 and actions.dtype.kind in "iu" and actions.size:
         if actions.min() < 0:
-            raise SpaceError(f"action {actions.min()} is negative; give action_space")
+            raise SpaceError(f"action {actions.min()} is negative; pass action_space")
         return spaces.Discrete(int(actions.max()) + 1)
     return box_of(actions)
 
 
 def box_of(array: NDArray[Any]) -> spaces.Box:
-    """A Box without bounds: the whole range of an integer, infinity for a float."""
+    """Return a Box without bounds: the dtype's range for integers, infinity for floats."""
     kind = array.dtype.kind
     if kind in "iu":
         low, high = int(np.iinfo(array.dtype).min), int(np.iinfo(array.dtype).max)
         return spaces.Box(low, high, array.shape[1:], array.dtype.type)
     if kind != "f":
-        raise SpaceError(f"an array of {array.dtype} has no Box; give the space")
+        raise SpaceError(f"no Box for an array of {array.dtype}; pass the space")
     return spaces.Box(-np.inf, np.inf, array.shape[1:], array.dtype.type)
 
 
@@ -130,7 +157,7 @@ def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
 
 
 def _exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Cast without losing anything."""
+    """Cast an array exactly, or raise an error."""
     if array.dtype == dtype:
         return array.copy()
     with np.errstate(all="ignore"):
@@ -143,7 +170,7 @@ def _exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[A
 def _last_steps(
     ends: NDArray[np.bool_], here: list[NDArray[Any]], there: list[NDArray[Any]]
 ) -> NDArray[np.int64]:
-    """The last transition of each episode."""
+    """Return the index of each episode's last transition."""
     last = ends.copy()
     last[-1] = True
     for observation, following in zip(here, there, strict=True):
@@ -153,7 +180,7 @@ def _last_steps(
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Rows as bytes, so that NaN equals itself."""
+    """Return rows as bytes, so that NaN equals NaN."""
     return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 
-# Rows that are hashed at a time, so that images on disk do not have to fit into memory.
+# Number of rows hashed at a time, so that images on disk need not fit into memory.
 _BLOCK_ROWS = 1024
 
 
@@ -64,25 +64,25 @@ class Dataset:
         observation_space: spaces.Space[Any] | None = None,
         action_space: spaces.Space[Any] | None = None,
     ) -> Dataset:
-        """Create a dataset of N transitions, given in the order in which they happened.
+        """Create a dataset of N transitions in chronological order.
 
-        An episode ends where `terminated` or `truncated` is set, or where the next transition's
-        observation differs from this one's next observation.
+        An episode ends where `terminated` or `truncated` is set, or where a transition's next
+        observation differs from the following transition's observation.
 
         Args:
-            observations: (N, *shape), or nested dicts of such arrays.
-            actions: (N,) integers, or (N, *shape).
-            rewards: (N,).
-            terminated: (N,) bool.
-            truncated: (N,) bool.
-            next_observations: like `observations`.
-            behavior_probs: (N,) probability of each action under the policy that took it; default:
-                NaN (unknown).
+            observations: (N, *shape) array, or nested dicts of such arrays.
+            actions: (N,) integers, or (N, *shape) array.
+            rewards: (N,) rewards.
+            terminated: (N,) bool; whether the transition led to a terminal state.
+            truncated: (N,) bool; whether the episode was truncated after the transition.
+            next_observations: Next observations, in the form of `observations`.
+            behavior_probs: (N,) probability of each action under the behavior policy; default: NaN
+                (unknown).
             env_id: Gymnasium id of the environment.
-            observation_space: Space of the observations; default: unbounded Boxes with the arrays'
-                shapes and dtypes.
-            action_space: Space of the actions; default: Discrete up to the largest action, or an
-                unbounded Box.
+            observation_space: Space of the observations; default: that of the environment if
+                `env_id` is registered, else unbounded Boxes with the arrays' shapes and dtypes.
+            action_space: Space of the actions; default: that of the environment if `env_id` is
+                registered, else Discrete up to the largest integer action, or an unbounded Box.
 
         Raises:
             SpaceError: Lengths or shapes do not agree with each other or with the spaces.
@@ -107,7 +107,7 @@ class Dataset:
     def concatenate(cls, parts: Sequence[Dataset]) -> Dataset:
         """Concatenate the episodes of several datasets.
 
-        Metadata fields that differ between the datasets are left empty.
+        Metadata fields that differ between the datasets are empty in the result.
 
         Raises:
             SpaceError: The datasets' spaces differ.
@@ -120,8 +120,8 @@ class Dataset:
             for role in ("observation_space", "action_space"):
                 if getattr(first, role) != getattr(other, role):
                     raise SpaceError(
-                        f"{first._name()} and {other._name()} do not fit together: {role}"
-                        f" {getattr(first, role)} against {getattr(other, role)}"
+                        f"{first._name()} and {other._name()} differ in {role}:"
+                        f" {getattr(first, role)} and {getattr(other, role)}"
                     )
         if len(parts) == 1:
             return first
@@ -140,18 +140,18 @@ class Dataset:
     def observations(self) -> Any:
         """(N, *shape) in the space's dtype, or nested dicts of such arrays.
 
-        Images that stay on disk are read when this is indexed, or by `batch`.
+        Images on disk are read by indexing the array and by `batch`.
         """
         return self._frames(self._frame_of_step)
 
     @cached_property
     def next_observations(self) -> Any:
-        """Like `observations`, one step later; at an episode's end, its last observation."""
+        """Next observation of each transition, in the form of `observations`."""
         return self._frames(self._frame_of_step + 1)
 
     @property
     def storage(self) -> str:
-        """Where the observations are stored: `memory`, or the files that images are read from."""
+        """Storage of the observations: `memory`, or the files that contain the images."""
         mapped = [leaf for leaf in self._transitions.frames if isinstance(leaf, MappedImages)]
         names = list(dict.fromkeys(name for leaf in mapped for name in leaf.names))
         more = f" and {len(names) - 1} more" if len(names) > 1 else ""
@@ -161,23 +161,23 @@ class Dataset:
     def frames(self) -> Any:
         """(N + E, *shape) observations without duplicates, or nested dicts of such arrays.
 
-        Each of the E episodes contributes its T + 1 observations, in order. Not a copy.
+        Each of the E episodes has T + 1 observations, in order. The arrays are not copied.
         """
         return nest(self._leaves, list(self._transitions.frames))
 
     @property
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) index into `frames` of each transition's observation; + 1 for the next one."""
+        """(N,) index k of each transition in `frames`: observation k, next observation k + 1."""
         return self._transitions.frame_of_step()
 
     @property
     def episode_lengths(self) -> NDArray[np.int64]:
-        """(E,) transitions of each episode."""
+        """(E,) number of transitions of each episode."""
         return self._transitions.lengths
 
     @property
     def actions(self) -> NDArray[Any]:
-        """(N,) int64 for a Discrete space, otherwise (N, *shape)."""
+        """(N,) int64 actions for a Discrete space, otherwise (N, *shape)."""
         return self._transitions.actions
 
     @property
@@ -197,7 +197,7 @@ class Dataset:
 
     @property
     def behavior_probs(self) -> NDArray[np.float32]:
-        """(N,) float32 probability of each action under the policy that took it; NaN if unknown."""
+        """(N,) float32 probability of each action under the behavior policy; NaN if unknown."""
         return self._transitions.behavior_probs
 
     @property
@@ -207,7 +207,7 @@ class Dataset:
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of `gymnasium.make` that created the environment."""
+        """Keyword arguments passed to `gymnasium.make` for the environment."""
         return dict(self._description.env_kwargs)
 
     @property
@@ -246,7 +246,7 @@ class Dataset:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of spaces and transitions, independent of the file that stores them."""
+        """SHA-256 of spaces and transitions, independent of their file."""
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
@@ -266,7 +266,7 @@ class Dataset:
         return self._take([episode.index for episode in self.episodes if keep(episode)])
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
-        """Copy a batch of transitions; images that stay on disk are read.
+        """Copy a batch of transitions, reading images from disk if needed.
 
         Args:
             steps: (B,) indexes of the transitions.
@@ -286,9 +286,9 @@ class Dataset:
         )
 
     def split(self, fraction: float, *, seed: int = 0) -> tuple[Dataset, Dataset]:
-        """Split the episodes at random into about `fraction` of them and the rest.
+        """Split the episodes at random into two datasets.
 
-        Both parts keep the log's order. With two or more episodes, neither part is empty.
+        Both keep the order of the episodes. With two or more episodes, neither is empty.
 
         Args:
             fraction: Share of the episodes in the first part, between 0 and 1 (exclusive).
@@ -298,7 +298,7 @@ class Dataset:
             ValueError: `fraction` is not between 0 and 1.
         """
         if not 0 < fraction < 1:
-            raise ValueError(f"fraction {fraction}: give a number between 0 and 1")
+            raise ValueError(f"fraction is {fraction}, expected a number between 0 and 1")
         count = len(self.episodes)
         first_count = min(max(round(count * fraction), 1), max(count - 1, 1))
         order = np.random.default_rng(seed).permutation(count)
@@ -311,7 +311,7 @@ class Dataset:
         Args:
             path: Path of the log.
             compression: `zstd`, `lz4` or `none`.
-            overwrite: Whether an existing file is replaced.
+            overwrite: Whether to replace an existing file.
 
         Raises:
             OutputExistsError: The file exists and `overwrite` is not set.
@@ -328,7 +328,7 @@ class Dataset:
 
         Raises:
             MissingExtraError: PyArrow is not installed.
-            UnknownNameError: `table` is not one of the two names.
+            UnknownNameError: `table` is neither `transitions` nor `episodes`.
         """
         from mcaprl.recorder.dataset.tables import episode_table, transition_table
 
@@ -396,5 +396,5 @@ class Dataset:
         return str(self.sources[0]) if self.sources else repr(self)
 
 
-# The public path, for reprs and pickles.
+# Public import path, for reprs and pickles.
 Dataset.__module__ = "mcaprl"

@@ -116,21 +116,6 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
     return [leaf for leaf, name in names.items() if any(_is_below(name, key) for key in keys)]
 
 
-def same_form(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
-    """Return whether values of two spaces have the same shapes and dtypes; bounds may differ.
-
-    >>> same_form(spaces.Box(0, 1, (3,)), spaces.Box(-9, 9, (3,)))
-    True
-    """
-    if isinstance(space, spaces.Dict) and isinstance(other, spaces.Dict):
-        return space.keys() == other.keys() and all(
-            same_form(space[key], other[key]) for key in space
-        )
-    if isinstance(space, spaces.Box) and isinstance(other, spaces.Box):
-        return (space.shape, space.dtype) == (other.shape, other.dtype)
-    return space == other
-
-
 def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
     """Return (N,) whether each of N values (N, *shape) of a space without parts is outside it."""
     match space:

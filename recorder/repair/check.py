@@ -20,7 +20,8 @@ from pathlib import Path
 from mcap.records import ChunkIndex
 
 from mcaprl.errors import CorruptLogError, LogError, SpaceError
-from mcaprl.problem import Problem
+from mcaprl.problem import Problem, Shortlist
+from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import (
     McapReader,
     Scratch,
@@ -50,30 +51,50 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
         action = _recover(path) if isinstance(error, CorruptLogError) else "restore it from a copy"
         what = _without_path(error, path)
         return [Problem(what, "opening the file", next=action, file=str(path))]
-    found = [*check_file(reader)]
+    found = Shortlist(check_file(reader))
+    action = _recover(path)
     try:
-        found += _check_contents(reader, whole=not found, threads=threads)
+        _check_contents(reader, found, threads=threads)
     except (LogError, SpaceError) as error:
+        if not found and METADATA_NAME not in reader.metadata:
+            action = "the MCAP file itself is valid, but it is not an mcaprl log"
         found.append(Problem(_without_path(error, path), STEP_TOPIC))
-    return [replace(problem, next=_recover(path), file=str(path)) for problem in found]
+    problems = [*found, *found.rest()]
+    return [replace(problem, next=action, file=str(path)) for problem in problems]
 
 
-def _check_contents(reader: McapReader, *, whole: bool, threads: int) -> list[Problem]:
-    """Check each chunk, and then the log if all chunks are valid."""
-    found: list[Problem] = []
-    log = EpisodeCheck(reader) if whole else None
+def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: int) -> None:
+    """Check each chunk, and then the log if all chunks are valid.
+
+    Args:
+        reader: Reader of the file.
+        found: Problems of the file so far, to which others are added.
+        threads: Number of threads that decompress chunks.
+
+    Raises:
+        LogError, SpaceError: The file is not a valid log.
+    """
+    log, refusal = None, None
+    if not found:
+        try:
+            log = EpisodeCheck(reader)
+        except (LogError, SpaceError) as error:
+            # The chunks of a file that is not a log are checked as well.
+            refusal = error
     for chunk, read in _decompressed(reader, threads):
         try:
             records = read()
-            found += check_chunk(reader, chunk, records)
+            found.extend(check_chunk(reader, chunk, records))
         except CorruptLogError as error:
             found.append(Problem(_without_path(error, reader.path), place(reader, chunk)))
             continue
         if log is not None and not found:
             log.take(chunk, records)
+    if refusal is not None:
+        raise refusal
     if log is not None and not found:
-        found += [*check_statistics(reader), *log.finish()]
-    return found
+        found.extend(check_statistics(reader))
+        found.extend(log.finish())
 
 
 def _decompressed(

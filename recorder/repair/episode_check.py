@@ -13,7 +13,7 @@ from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, NoEpisodesError, NoStepsError
-from mcaprl.problem import Problem
+from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.episodes import (
     COUNTERS,
@@ -33,10 +33,10 @@ from mcaprl.recorder.format.reading import (
     Topic,
 )
 from mcaprl.recorder.format.schema import step_schema
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
-_FIELDS = ("reward", "terminated", "truncated", *COUNTERS)
+_FIELDS = ("action", "reward", "terminated", "truncated", *COUNTERS)
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
 # A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
@@ -68,6 +68,7 @@ class EpisodeCheck:
         # Logs of other writers are validated by `LogReader`.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
+        self._problems = Shortlist[Problem]()
         self._places: dict[int, list[_Place]] = defaultdict(list)
         if self._has_our_form:
             self._prepare()
@@ -96,6 +97,7 @@ class EpisodeCheck:
                 dataset = LogReader(self._reader.path).read()
             yield from (found for e in dataset.episodes for found in _check_return(e))
             return
+        yield from self._problems
         columns, path = self._columns, str(self._reader.path)
         lengths = episode_lengths(columns, path)
         frames = int(lengths.sum()) + len(lengths)
@@ -140,9 +142,9 @@ class EpisodeCheck:
         for leaf, topic in self._images:
             for decoder, messages in topic.parts:
                 self._place(decoder, messages, leaf)
-        self._columns = {name: np.empty(start, self._steps.fields[name]) for name in _FIELDS} | {
-            LOG_TIME: self._steps.times
-        }
+        self._columns = {
+            name: np.empty(start, self._steps.fields[name]) for name in _FIELDS[1:]
+        } | {LOG_TIME: self._steps.times}
 
     def _place(self, decoder: Decoder, messages: MessageRange, where: slice | Leaf) -> None:
         if messages.chunk is None:
@@ -153,8 +155,17 @@ class EpisodeCheck:
     def _take_steps(self, found: NDArray[Any] | None, rows: slice) -> None:
         if found is None:
             raise CorruptLogError(f"messages of {STEP_TOPIC} do not match their schema")
-        for name in _FIELDS:
+        for name in _FIELDS[1:]:
             self._columns[name][rows] = found[name]
+        assert self._metadata is not None
+        wrong = outside(self._metadata.action_space, found["action"]) & ~found["final"].astype(bool)
+        for row in np.flatnonzero(wrong)[:LISTED].tolist():
+            self._problems.append(
+                Problem(
+                    f"action {found['action'][row]} is outside of {self._metadata.action_space}",
+                    f"episode {found['episode'][row]} step {found['step'][row]}",
+                )
+            )
 
     def _take_images(self, found: NDArray[Any] | None, leaf: Leaf) -> None:
         if found is None or not _is_image(found, leaf):

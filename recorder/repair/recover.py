@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mcap.records import Channel, Metadata
 
-from mcaprl.errors import LogError, NoEpisodesError, UsageError
+from mcaprl.errors import CorruptLogError, LogError, NoEpisodesError, NoStepsError, UsageError
 from mcaprl.files import locked_file, replacing
-from mcaprl.problem import Problem
+from mcaprl.problem import Problem, Shortlist
 from mcaprl.recorder.format.metadata import METADATA_NAME
 from mcaprl.recorder.format.reading import Damage, McapReader
 from mcaprl.recorder.format.topics import STEP_TOPIC
@@ -31,6 +32,8 @@ from mcaprl.recorder.repair.whole_episodes import (
     plan_episodes,
     write_planned,
 )
+
+_LISTS = ("damages", "dropped")
 
 
 @dataclass
@@ -50,8 +53,8 @@ class Recovery:
     source: str
     messages: int = 0
     episodes: int = 0
-    damages: list[Damage] = field(default_factory=list)
-    dropped: list[DroppedEpisode] = field(default_factory=list)
+    damages: Shortlist[Damage] = field(default_factory=Shortlist)
+    dropped: Shortlist[DroppedEpisode] = field(default_factory=Shortlist)
     ended: int = 0
     strays: int = 0
 
@@ -59,6 +62,15 @@ class Recovery:
     def has_losses(self) -> bool:
         """Whether anything in the old file is missing in the new one."""
         return bool(self.damages or self.dropped or self.ended or self.strays)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `recover --json` prints."""
+        return {
+            "ok": not self.has_losses,
+            **{name: value for name, value in vars(self).items() if name not in _LISTS},
+            **{name: [asdict(one) for one in getattr(self, name)] for name in _LISTS},
+            "not_listed": [problem.what for problem in self.damages.rest() + self.dropped.rest()],
+        }
 
     @property
     def problems(self) -> list[Problem]:
@@ -70,10 +82,11 @@ class Recovery:
         ]
         if self.strays:
             found.append((f"{self.strays} messages", "/rl/ topics", "part of dropped episodes"))
-        return [
+        problems = [
             Problem(f"lost: {what}", where, effect, file=self.source)
             for what, where, effect in found
         ]
+        return problems + self.damages.rest() + self.dropped.rest()
 
 
 def recover_log(
@@ -119,8 +132,13 @@ def _keep_whole_episodes(
     reader = McapReader(copied)
     recovery.messages = _count_messages(reader)
     if recovery.messages == 0:
-        raise LogError(f"{recovery.source} cannot be recovered: it has no readable message")
+        raise NoStepsError(f"{recovery.source} cannot be recovered: it has no readable message")
     plan = plan_episodes(reader, keep_unfinished=keep_unfinished)
+    if plan is None and not recovery.damages and _is_complete(recovery.source):
+        raise LogError(
+            f"{recovery.source} is a valid MCAP file, but not an mcaprl log: there is nothing to"
+            " recover"
+        )
     if plan is None:
         os.replace(copied, result)
         return
@@ -135,8 +153,15 @@ def _keep_whole_episodes(
         raise LogError(f"{recovery.source} cannot be recovered: {what} ({where})")
 
 
+def _is_complete(source: str) -> bool:
+    try:
+        return McapReader(source).complete
+    except CorruptLogError:
+        return False
+
+
 def _restore_metadata(
-    damages: list[Damage], metadata: list[Metadata], channels: Iterable[Channel]
+    damages: Shortlist[Damage], metadata: list[Metadata], channels: Iterable[Channel]
 ) -> list[Metadata]:
     """Replace the metadata record with its copy in the channel of `/rl/step`, if it exists."""
     for channel in channels:

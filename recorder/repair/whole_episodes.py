@@ -7,7 +7,7 @@ end, can be kept with its last record as the end. Other runs have lost their beg
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -18,6 +18,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.problem import Shortlist
 from mcaprl.recorder.dataset.log_reader import described
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
@@ -37,6 +38,8 @@ from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Prefix of topics whose messages belong to episodes; other topics are copied unchanged.
 _EPISODE_TOPICS = "/rl/"
+# More missing episodes in a row are taken for another recording.
+_MAX_GAP = 10**6
 
 Place = tuple[int, int]
 """Offset of a chunk and id of a channel, which identify a message index."""
@@ -68,6 +71,11 @@ class DroppedEpisode:
     can_end: bool
     why: str
 
+    @property
+    def what(self) -> str:
+        """Description of the loss."""
+        return f"episode {self.number}: {self.why}{', it can be ended' if self.can_end else ''}"
+
 
 @dataclass
 class EpisodePlan:
@@ -85,7 +93,7 @@ class EpisodePlan:
 
     actions: dict[Place, NDArray[np.uint8]] = field(default_factory=dict)
     spans: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
-    dropped: list[DroppedEpisode] = field(default_factory=list)
+    dropped: Shortlist[DroppedEpisode] = field(default_factory=Shortlist)
     ended: int = 0
     new_summaries: list[EpisodeSummary] = field(default_factory=list)
     strays: int = 0
@@ -127,7 +135,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
     columns = steps.read(_FIELDS, order)
     plan, actions = EpisodePlan(), np.zeros(len(steps), np.uint8)
     plan.is_in_order = bool((np.diff(order) > 0).all())
-    listed, spans = _listed_ends(reader), []
+    listed, spans = _listed_episodes(reader), []
     for run in _runs(reader, columns, steps.channel_ids[order]):
         can_end = run.can_end and all(map(_message_dtype, _schemas(reader)))
         if not run.is_whole and not (can_end and keep_unfinished):
@@ -143,6 +151,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
         spans.append(columns[LOG_TIME][[run.start, run.last]])
         if int(spans[-1][1]) not in listed:
             plan.new_summaries.append(run.summary(columns))
+    plan.dropped.extend(_missing(columns, listed.values()))
     plan.spans = np.array(sorted(map(tuple, spans)), np.int64).reshape(-1, 2)
     plan.actions = dict(_by_place(steps, actions))
     plan.strays = _count_strays(reader, plan)
@@ -264,10 +273,27 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
     return complete
 
 
-def _listed_ends(reader: McapReader) -> set[int]:
-    """Return the last log_times of the episodes on `/rl/episode`."""
-    topic, name = Topic(reader, EPISODE_TOPIC), "end_time_ns"
-    return set(topic.read([name])[name].tolist()) if name in topic.fields else set()
+def _listed_episodes(reader: McapReader) -> dict[int, int]:
+    """Return the numbers of the episodes on `/rl/episode` by their last log_times."""
+    topic, names = Topic(reader, EPISODE_TOPIC), ("end_time_ns", "episode")
+    if not set(names) <= set(topic.fields):
+        return {}
+    found = topic.read(names)
+    return dict(zip(found["end_time_ns"].tolist(), found["episode"].tolist(), strict=True))
+
+
+def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
+    """Yield the episodes without any record: listed ones, and those between others."""
+    known = np.unique(columns["episode"]).astype(np.int64)
+    gaps = np.diff(known)
+    between = [
+        np.arange(number + 1, number + gap)
+        for number, gap in zip(known[:-1], gaps, strict=True)
+        if 1 < gap < _MAX_GAP
+    ]
+    expected = np.concatenate([np.array(list(listed), np.int64), *between])
+    for number in np.setdiff1d(expected, known).tolist():
+        yield DroppedEpisode(number, 0, False, "all of its records are missing")
 
 
 def _count_strays(reader: McapReader, plan: EpisodePlan) -> int:

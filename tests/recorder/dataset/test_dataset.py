@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -233,3 +234,21 @@ def test_image_table(log_path: Path) -> None:
     assert table.column("action.1").to_pylist() == data.actions[:, 1].tolist()
     flat = table.column("observation_camera").to_pylist()
     assert flat == data.observations["camera"].reshape(3, -1).tolist()
+
+
+def test_arrays_of_a_registered_environment_have_its_spaces() -> None:
+    env = gym.make("CartPole-v1")
+    arrays = {
+        "observations": np.zeros((3, 4)),
+        "next_observations": np.zeros((3, 4)),
+        "actions": np.zeros(3, np.int64),
+        "rewards": np.ones(3),
+        "terminated": np.array([False, False, True]),
+        "truncated": np.zeros(3, bool),
+    }
+    data = mcaprl.Dataset.from_arrays(**arrays, env_id="CartPole-v1")
+    assert data.observation_space == env.observation_space
+    assert data.action_space == env.action_space
+    other = mcaprl.Dataset.from_arrays(**arrays, env_id="Pendulum-v1")
+    assert other.observation_space == spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    assert other.action_space == spaces.Discrete(1)

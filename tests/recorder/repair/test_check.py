@@ -5,15 +5,19 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+import mcaprl
 from mcaprl.errors import LogError
+from mcaprl.problem import LISTED, Problem, Shortlist
 from mcaprl.recorder.columns import chunk_check, chunks
 from mcaprl.recorder.columns import reader as mcap_reader
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER
@@ -263,3 +267,57 @@ def test_arrays_find_what_a_scan_finds(
             assert check_log(log_path) == together
         found |= {problem.what for problem in together}
     assert len(found) > 10, found
+
+
+def test_many_problems_of_one_kind_are_counted() -> None:
+    found = Shortlist(Problem(f"chunk {number} is damaged", "") for number in range(1000))
+    assert (len(found), found.total) == (LISTED, 1000)
+    assert [str(problem) for problem in found.rest()] == [
+        "990 more findings of the kind: chunk # is damaged (not listed)"
+    ]
+    many = Shortlist(Problem(f"kind {chr(k) * 3}", "") for k in range(1000, 3000))
+    assert many.total == 2000
+    assert len(many) < 200
+    assert len(many.rest()) == 1
+
+
+def test_a_valid_file_of_another_kind_is_not_to_be_recovered(tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    writer = McapWriter(other)
+    channel = writer.add_channel("/chatter", "std_msgs/msg/String", "string data")
+    writer.write_messages([(channel, 5, b"\0\1\0\0" + bytes(8))])
+    writer.close()
+    (problem,) = check_log(other)
+    assert "no topic /rl/step" in problem.what
+    assert problem.next == "the MCAP file itself is valid, but it is not an mcaprl log"
+    with pytest.raises(LogError, match="there is nothing to recover"):
+        recover_log(other, tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+    # A damaged chunk is found, and its file recovered.
+    content = bytearray(other.read_bytes())
+    content[McapReader(other).chunks[0].chunk_start_offset + 60] ^= 1
+    other.write_bytes(content)
+    assert "recover" in check_log(other)[-1].next
+
+
+def test_actions_outside_their_space_are_found(log_path: Path) -> None:
+    class Careless(gym.Env[Any, Any]):
+        observation_space = spaces.Box(-1, 1, (1,))
+        action_space = spaces.Discrete(3)
+
+        def reset(self, **_: Any) -> Any:
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action: Any) -> Any:
+            return np.zeros(1, np.float32), 1.0, bool(action == 0), False, {}
+
+    with closing(mcaprl.RecordMcap(Careless(), log_path)) as env:
+        env.reset()
+        for action in (1, 7, 2, 0):
+            env.step(action)
+    (problem,) = check_log(log_path)
+    assert str(problem.what) == "action 7 is outside of Discrete(3)"
+    assert problem.where == "episode 0 step 1"
+    found = [one for one in mcaprl.info(log_path).findings if one.severity == "problem"]
+    assert [one.what for one in found] == ["1 action outside of Discrete(3)"]
+    assert found[0].where == "episode 0 step 1"

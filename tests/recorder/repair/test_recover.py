@@ -358,7 +358,7 @@ def test_command_output_and_exit_codes(
     assert run(["recover", str(log_path), str(out), "--overwrite", "--json"]) == 3
     reported = json.loads(capsys.readouterr().out)
     assert reported["ok"] is False
-    assert {"episodes", "messages", "damages", "dropped", "ended"} <= set(reported)
+    assert {"episodes", "messages", "damages", "dropped", "ended", "not_listed"} <= set(reported)
     log_path.write_bytes(b"nonsense")
     assert run(["recover", str(log_path), str(out), "--overwrite"]) == 1
     assert "cannot be recovered" in capsys.readouterr().err
@@ -402,3 +402,22 @@ def test_scanning_for_records_does_not_copy_the_file(log_path: Path) -> None:
     assert found > 5
     assert damages == []
     assert peak < 300_000
+
+
+def test_an_episode_without_any_record_is_named(log_path: Path) -> None:
+    """Its chunk is damaged, so that only `/rl/episode` and the gap in the numbers show it."""
+    with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), log_path)) as recorder:
+        for seed in range(30):
+            recorder.reset(seed=seed)
+            while not any(recorder.step(seed % 2)[2:4]):
+                pass
+        # Each episode is one chunk of `/rl/step` while the log is open.
+        content = bytearray(log_path.read_bytes())
+    start, length = chunks_of(bytes(content), "/rl/step", log_path)[12]
+    content[start + length - 5] ^= 1
+    log_path.write_bytes(content)
+    recovery = recover_log(log_path, log_path.with_name("out.mcap"))
+    assert recovery.episodes == 29
+    (lost,) = recovery.dropped
+    assert (lost.number, lost.records) == (12, 0)
+    assert any("lost: episode 12" in str(problem) for problem in recovery.problems)
