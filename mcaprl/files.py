@@ -64,8 +64,8 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
     try:
         if descriptor >= 0 and not try_lock(descriptor):
             raise error_type(
-                f"{folder} is being written by another process: wait until it ends, or choose"
-                " another folder"
+                f"{folder} is in use by another recording or training: wait until it ends, or"
+                " choose another folder"
             )
         yield
     finally:

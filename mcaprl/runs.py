@@ -1,4 +1,4 @@
-"""Run folders of offline and online training, and what both report of a run.
+"""Run folders and summaries of offline and online training.
 
 RUN/config.json                         algorithm, settings, and the source of experience
 RUN/seed-K/checkpoint.safetensors       state to resume from
@@ -11,7 +11,9 @@ RUN/seed-K/best_model.zip               policy of an online run, as Stable-Basel
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import OutputExistsError, TrainingError
-from mcaprl.files import parse_json, write_json
+from mcaprl.files import locked_folder, parse_json, write_json
 
 CONFIG_NAME = "config.json"
 CHECKPOINT_NAME = "checkpoint.safetensors"
@@ -34,15 +36,15 @@ Curve = dict[str, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class RunSummary:
-    """The outcome of training one seed.
+    """Result of training one seed.
 
     Attributes:
         folder: Folder of the seed, RUN/seed-K.
         algo: Name of the algorithm.
-        seed: K.
-        steps: Steps done by all sessions: gradient updates offline, environment steps online.
-        resumed_at: Steps done by earlier sessions; 0 for a fresh start.
-        seconds: Wall time of this session; offline, seeds that are trained together share it.
+        seed: Seed K.
+        steps: Number of gradient updates (offline) or environment steps (online) of all sessions.
+        resumed_at: Number of steps of earlier sessions; 0 for a new run.
+        seconds: Wall time of this session; offline, the same for seeds trained together.
     """
 
     folder: Path
@@ -55,7 +57,7 @@ class RunSummary:
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """What has to be the same for a run to be resumed.
+    """Parts of a run that must match for the run to be resumed.
 
     Attributes:
         parts: Algorithm (`algo`), settings (`config`) and source of experience as plain JSON types.
@@ -66,14 +68,14 @@ class RunIdentity:
     other_data: bool = False
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Compare with the identity in a file.
+        """Check that the identity in a file is the same.
 
         Args:
             found: Identity in the file; it may have further parts.
             where: Path of the file.
 
         Raises:
-            TrainingError: They differ; the message names the first difference.
+            TrainingError: The identities differ; the message names the first difference.
         """
         mine = self.parts
         theirs: dict[str, Any] = {name: found.get(name) for name in mine}
@@ -94,42 +96,90 @@ class RunIdentity:
             )
 
 
+@contextmanager
+def locked_run(folder: Path, resume: bool) -> Iterator[None]:
+    """Lock a run folder against other trainings; create it if it is missing and not resumed.
+
+    Raises:
+        OutputExistsError: `folder` is a file.
+        TrainingError: Another training is writing the folder, it cannot be created, or there is no
+            run to resume.
+    """
+    if resume:
+        run_to_resume(folder)
+    elif folder.is_file():
+        raise OutputExistsError(f"{folder} is a file: choose another path")
+    is_new = not folder.exists()
+    with locked_folder(folder, TrainingError):
+        try:
+            yield
+        finally:
+            if is_new:
+                # A refused request leaves no empty folder.
+                with suppress(OSError):
+                    folder.rmdir()
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report an OSError of the body as a TrainingError: `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise TrainingError(f"cannot write {path}: {error.strerror or error}") from error
+
+
 def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -> None:
-    """Create a run folder, or check that it is this run's, and write its `config.json`.
+    """Create a run folder, or check that it belongs to this run, and write `config.json`.
 
     Files of a run that ended before its first checkpoint are removed.
 
     Args:
         folder: Folder of the run.
         identity: Identity of the run.
-        resume: Whether the folder may contain this run.
+        resume: Whether the folder contains this run, which may have ended before its first write.
         **source: Further entries of `config.json`.
 
     Raises:
-        OutputExistsError: The folder contains something else.
-        TrainingError: The folder is another run's, or cannot be written.
+        OutputExistsError: The folder contains other files.
+        TrainingError: The folder belongs to another run, or cannot be written.
     """
+    found = run_to_resume(folder) if resume else {}
     leftovers = _leftovers(folder)
-    if leftovers is not None:
-        for path in leftovers:
-            path.unlink()
-    elif resume and (folder / CONFIG_NAME).exists():
-        identity.check_same(read_config(folder), folder / CONFIG_NAME)
-    else:
-        hint = "; it contains no run to resume" if resume else ", or resume its run (--resume)"
-        raise OutputExistsError(f"{folder} exists: choose another folder{hint}")
-    try:
+    if leftovers is None and not resume:
+        raise OutputExistsError(
+            f"{folder} exists: choose another folder, or resume its run (--resume)"
+        )
+    if leftovers is None:
+        identity.check_same(found, folder / CONFIG_NAME)
+    with writing(folder):
+        for path in leftovers or ():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / CONFIG_NAME, {**identity.parts, **source})
-    except OSError as error:
-        raise TrainingError(f"cannot write {folder}: {error.strerror}") from error
+    write_json(folder / CONFIG_NAME, {**identity.parts, **source}, TrainingError)
 
 
 def seed_folder(run: Path, seed: int) -> Path:
-    """Create the folder of a seed where there is none, and return it."""
+    """Return the folder of a seed; create it if it is missing."""
     folder = run / f"seed-{seed}"
-    folder.mkdir(exist_ok=True)
+    with writing(folder):
+        folder.mkdir(exist_ok=True)
     return folder
+
+
+def run_to_resume(folder: Path) -> dict[str, Any]:
+    """Return the config of a run; empty if the run ended before it was written.
+
+    Raises:
+        TrainingError: There is no run in the folder, or its config cannot be read.
+    """
+    if (folder / CONFIG_NAME).exists():
+        return read_config(folder)
+    if not folder.is_dir() or _leftovers(folder) is None:
+        raise TrainingError(
+            f"{folder} holds no run to resume: check the path, or start a new run without --resume"
+        )
+    return {}
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -149,14 +199,14 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def broken_checkpoint(path: Path, error: Exception) -> TrainingError:
-    """Return the error that reports a checkpoint which cannot be read."""
+    """Return the error for an unreadable checkpoint."""
     return TrainingError(
         f"cannot resume: {path} is broken ({error}); delete it to restart this seed"
     )
 
 
 def policy_files(path: Path) -> list[Path]:
-    """Return the policy files of a run's seeds by rising seed; none where there are none.
+    """Return the existing policy files of a run, sorted by seed.
 
     Args:
         path: Run folder, folder of one seed, or a file, which is returned as it is.
@@ -188,7 +238,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def read_curves(run: Path, name: str) -> list[Curve]:
-    """Read a curves file, `metrics.csv` or `curve.csv`, of all seeds of a run that have one."""
+    """Read the curves file, `metrics.csv` or `curve.csv`, of each seed that has one."""
     return [read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))]
 
 
@@ -206,5 +256,7 @@ def _leftovers(folder: Path) -> list[Path] | None:
 
 
 def _is_leftover(path: Path) -> bool:
-    names = (CONFIG_NAME, METRICS_NAME)
-    return path.is_file() and (path.name in names or path.name.startswith("events.out.tfevents"))
+    if path.is_dir():
+        # Work folder of a file that a killed run was about to write.
+        return path.name.startswith(".") and path.name.endswith(".part")
+    return path.name in (CONFIG_NAME, METRICS_NAME) or path.name.startswith("events.out.tfevents")

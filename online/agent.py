@@ -1,4 +1,4 @@
-"""One agent: it acts, learns, is evaluated and recorded, and writes checkpoints."""
+"""Agent of one seed: training, evaluation, recording and checkpoints."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from mcaprl.errors import TrainingError
+from mcaprl.files import write_atomically
 from mcaprl.online.algorithms import make_model
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
@@ -33,16 +35,16 @@ from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.online.warm_start import fill_buffer, take_weights
 from mcaprl.progress import ProgressCallback, TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME
+from mcaprl.runs import BEST_NAME, CHECKPOINT_NAME, CURVE_NAME, writing
 from mcaprl.sims.evaluation.rollout import episode_seed
 
 LOG_INTERVAL = 1_000
-"""Environment steps between two rows of scalars, and two calls of the progress callback."""
+"""Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
 
 
 class Agent:
-    """An agent of a run, with its environments.
+    """Agent of a run, with its environments.
 
     Attributes:
         model: Model of SB3.
@@ -117,8 +119,8 @@ class Agent:
     def start_from(self, data: Dataset | None, policy: Any) -> None:
         """Start with logged transitions in the replay buffer, with a policy's weights, or both.
 
-        With data, the random steps at the start are omitted. With a policy, the agent explores as
-        at the end of training, and acts for `learning_starts` steps before it learns.
+        With data, the random steps at the start are omitted. With a policy, the agent uses the
+        final epsilon, and acts for `learning_starts` steps before learning.
 
         Args:
             data: Logged transitions, if any.
@@ -144,7 +146,7 @@ class Agent:
         self._envs.close()
 
     def learn(self, report: ProgressCallback) -> None:
-        """Train until all steps are done, with evaluations.
+        """Train and evaluate until all steps are done.
 
         Args:
             report: Callback for progress, called every `LOG_INTERVAL` steps.
@@ -173,7 +175,8 @@ class Agent:
         ]
         if isinstance(config, DQNConfig) and config.target_update_episodes:
             callbacks.append(_TargetUpdateByEpisodes(config.target_update_episodes))
-        self.model.set_logger(_logger(self._folder, done))
+        with writing(self._folder):
+            self.model.set_logger(_logger(self._folder, done))
         try:
             self.model.learn(
                 config.steps - done,
@@ -182,7 +185,8 @@ class Agent:
                 reset_num_timesteps=done == 0,
             )
         finally:
-            self.model.logger.close()
+            with writing(self._folder):
+                self.model.logger.close()
         self._save()
 
     @property
@@ -192,16 +196,23 @@ class Agent:
     def _save(self) -> None:
         points = [asdict(point) for point in self.points]
         extra = {"points": points, "began_with_policy": self._has_pretrained_weights}
-        save_checkpoint(self._checkpoint, self.model, self._task, extra)
+        best = self._folder / BEST_NAME
+        content = best.read_bytes() if self.points and best.exists() else b""
+        save_checkpoint(self._checkpoint, self.model, self._task, extra, content)
 
     def _load(self, evaluation: Evaluation) -> None:
-        extra = load_checkpoint(self._checkpoint, self.model, self._task)
+        extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
+        if best:
+            # The file may be of an evaluation after the checkpoint, which is repeated.
+            write_atomically(self._folder / BEST_NAME, best, TrainingError)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:
             self._use_final_exploration()
         done, envs = self.model.num_timesteps, self._task.config.envs
-        evaluation.resume(done // envs, max(p.mean_return for p in self.points))
-        # Environments have no state to restore; another seed avoids repeating the first episodes.
+        evaluation.resume(
+            done // envs, max((p.mean_return for p in self.points), default=-math.inf)
+        )
+        # Environment states cannot be restored; another seed avoids repeating the first episodes.
         assert self.model.env is not None
         self.model.env.seed(episode_seed(self._seed, done))
 
@@ -220,24 +231,27 @@ class Agent:
             self._watched.score = point.score
         write_curve(self._folder / CURVE_NAME, self.points)
         self.model.logger.record("eval/score", point.score)
-        self.model.logger.dump(point.step)
+        with writing(self._folder):
+            self.model.logger.dump(point.step)
         if self._describer is not None:
             self._describer.reset()
             folder = self._folder / EVALUATIONS_NAME
-            folder.mkdir(exist_ok=True)
+            with writing(folder):
+                folder.mkdir(exist_ok=True)
             path = folder / f"step-{point.step:09d}.mcap"
             self._evaluated.dataset().save(path, overwrite=True)
 
     def _report(self, report: ProgressCallback) -> None:
         model: Any = self.model
-        model.dump_logs()
+        with writing(self._folder):
+            model.dump_logs()
         score = self.points[-1].score if self.points else math.nan
         steps = self._task.config.steps
         report(TrainingProgress(self._seed, model.num_timesteps, steps, {"score": score}))
 
 
 class _EveryInterval(BaseCallback):
-    """A callback that calls a function every `interval` environment steps, and at the end."""
+    """Callback that calls a function every `interval` environment steps, and at the end."""
 
     def __init__(self, interval: int, function: Callable[[], None]) -> None:
         super().__init__()
@@ -263,7 +277,7 @@ class _EveryInterval(BaseCallback):
 
 
 class _TargetUpdateByEpisodes(BaseCallback):
-    """A callback that updates a DQN's target network every `episodes` finished episodes."""
+    """Callback that updates a DQN's target network every `episodes` finished episodes."""
 
     def __init__(self, episodes: int) -> None:
         super().__init__()
@@ -280,7 +294,7 @@ class _TargetUpdateByEpisodes(BaseCallback):
 
 
 class _BetweenRollouts(_EveryInterval):
-    """A callback between two rollouts, when all steps have been processed."""
+    """Callback that calls a function between rollouts, when all steps have been processed."""
 
     def _on_step(self) -> bool:
         return True

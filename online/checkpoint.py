@@ -1,8 +1,8 @@
 """Checkpoints from which a killed run resumes.
 
 `checkpoint.safetensors` contains weights, target network, optimizer, replay buffer and generators,
-and in its header the counters, the curve so far and the task. One file holds all of them, because a
-kill between two writes could separate them. The environments start new episodes, because Gymnasium
+and in its header the counters, the curve so far and the task. All are in one file, because a kill
+between two writes would leave them inconsistent. Environments start new episodes, because Gymnasium
 has no interface for their state.
 """
 
@@ -29,6 +29,7 @@ from mcaprl.tensor_files import read_tensors, write_tensors
 
 # NumPy's stubs lack the global generator, from which SB3 draws.
 _NUMPY_RANDOM: Any = np.random
+_BEST = "best"
 _COUNTERS = (
     "num_timesteps",
     "_n_updates",
@@ -40,14 +41,21 @@ _COUNTERS = (
 )
 
 
-def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[str, Any]) -> None:
+def save_checkpoint(
+    path: Path, model: BaseAlgorithm, task: Task, extra: dict[str, Any], best: bytes
+) -> None:
     """Replace a checkpoint with the current state of a model.
 
     Args:
         path: Path of the file.
         model: Model between two rollouts.
         task: Task of the run.
-        extra: JSON object that `load_checkpoint` returns again.
+        extra: JSON object for `load_checkpoint` to return.
+        best: File of the best policy so far, for `load_checkpoint` to return; empty if there is
+            none.
+
+    Raises:
+        TrainingError: The file cannot be written.
     """
     generators, states = _generators(model)
     tensors = {
@@ -55,6 +63,7 @@ def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[st
         **_optimizer_tensors(model.policy.optimizer),
         **{f"generator.{name}": value for name, value in generators.items()},
         **{f"buffer.{name}": value for name, value in _buffer_tensors(model).items()},
+        _BEST: torch.from_numpy(np.frombuffer(best, np.uint8).copy()),
     }
     counters = {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
     description = {
@@ -66,11 +75,11 @@ def save_checkpoint(path: Path, model: BaseAlgorithm, task: Task, extra: dict[st
     write_tensors(path, tensors, description)
 
 
-def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, Any]:
+def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> tuple[dict[str, Any], bytes]:
     """Load the state of a checkpoint into a fresh model.
 
     Returns:
-        The argument `extra` of `save_checkpoint`.
+        The arguments `extra` and `best` of `save_checkpoint`.
 
     Raises:
         TrainingError: The checkpoint is of another task, or broken.
@@ -84,7 +93,8 @@ def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> dict[str, A
         for name, value in description["counters"].items():
             setattr(model, name, value)
         _load_generators(model, _below(tensors, "generator"), description["generators"])
-        return cast(dict[str, Any], description["extra"])
+        best = tensors[_BEST].numpy().tobytes() if _BEST in tensors else b""
+        return cast(dict[str, Any], description["extra"]), best
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise broken_checkpoint(path, error) from error
 

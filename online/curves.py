@@ -1,4 +1,4 @@
-"""Learning curves: `curve.csv`, and the image of all seeds of runs (extra `report`)."""
+"""Learning curves: `curve.csv`, and an image of all seeds (needs the extra `report`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VALUES: Final = {
     "mean_progress_m": "meters along the path per episode",
     "mean_length": "steps per episode",
 }
-"""Columns of a curve that can be drawn, and the label of the axis."""
+"""Columns of a curve that can be drawn, with their axis labels."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class RunCurve:
     Attributes:
         name: Name of the run folder.
         seeds: Columns of each seed's curve.
-        finals: Scores of the seeds' best checkpoints on new episodes, where they are known.
+        finals: Scores of the seeds' best checkpoints on new episodes, where known.
     """
 
     name: str
@@ -76,7 +76,7 @@ def write_curve(path: Path, points: Sequence[CurvePoint]) -> None:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow([field.name for field in fields(CurvePoint)])
     rows.writerows([*astuple(point)[:-1], int(point.best)] for point in points)
-    write_atomically(path, text.getvalue().encode())
+    write_atomically(path, text.getvalue().encode(), TrainingError)
 
 
 def read_run(folder: Path) -> RunCurve:
@@ -94,7 +94,7 @@ def read_run(folder: Path) -> RunCurve:
 def draw_curves(path: Path, runs: Sequence[RunCurve], title: str, value: str | None = None) -> None:
     """Draw curves of runs: each seed, the median over the seeds, and their range.
 
-    Dots to the right of scores are the best checkpoints on new episodes.
+    Dots to the right of score curves are the best checkpoints on new episodes.
 
     Args:
         path: PNG file to write.

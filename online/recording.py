@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,24 +12,25 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.errors import LogError, NoStepsError, NotMcapError, OutputExistsError, UsageError
 from mcaprl.online.double_dqn import WarmDQN
 from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
 from mcaprl.recorder.repair.recover import recover_log
 
 
 def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
-    """Return the log of each seed: the file, or seed-K.mcap in a folder for several seeds.
+    """Return the log of each seed: `record` if it ends in .mcap, else `record`/seed-K.mcap.
 
     Raises:
-        UsageError: One file was given for several seeds.
-        OutputExistsError: A file exists, and no run is resumed.
+        UsageError: `record` is one file for several seeds.
+        OutputExistsError: A log exists, and `resume` is false.
     """
     if len(seeds) > 1 and record.suffix == ".mcap":
         raise UsageError(
@@ -46,7 +48,7 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
 def recorded(
     env: VectorEnv[Any, Any, Any], path: Path, *, algo: str, seed: int, resume: bool = False
 ) -> RecordVecMcap:
-    """Record a batch of environments, with a row for each step of training.
+    """Wrap a batch of environments to record each step of training.
 
     Args:
         env: Environments to record.
@@ -54,7 +56,7 @@ def recorded(
         algo: Name of the algorithm.
         seed: Seed of the agent.
         resume: Whether to append to an existing log. The log of a killed recorder is recovered
-            first, and the damaged file is renamed to `*.damaged`.
+            first, and the damaged file is kept as `*.damaged`.
 
     Raises:
         SpaceError, OutputExistsError, LogError: As for `RecordVecMcap`.
@@ -68,23 +70,41 @@ def recorded(
     try:
         return wrap(append=True)
     except LogError:
-        whole = path.with_name(f"{path.name}.whole")
-        recover_log(path, whole, overwrite=True)
-        os.replace(path, path.with_name(f"{path.name}.damaged"))
+        whole, damaged = (path.with_name(f"{path.name}.{kind}") for kind in ("whole", "damaged"))
+        try:
+            recover_log(path, whole, overwrite=True)
+        except (NoStepsError, NotMcapError):
+            # The recorder was killed before its first episode ended.
+            with path.open("rb") as file:
+                if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):
+                    raise
+            os.replace(path, damaged)
+            return wrap(append=False)
+        _keep(path, damaged)
         os.replace(whole, path)
         return wrap(append=True)
 
 
+def _keep(path: Path, kept: Path) -> None:
+    """Link or copy a file to a second path, so that the first path can be replaced atomically."""
+    kept.unlink(missing_ok=True)
+    try:
+        os.link(path, kept)
+    except OSError:
+        # Some file systems do not support links.
+        shutil.copyfile(path, kept)
+
+
 class ActionDescriber:
-    """A callback for each step that gives the recorder the probabilities of the actions."""
+    """Callback for each step that passes the probabilities of the actions to the recorder."""
 
     def __init__(self, recorder: RecordVecMcap, model: BaseAlgorithm) -> None:
         """Describe the actions of `model` to `recorder`."""
         self._recorder, self._model = recorder, model
         self._were_greedy = False
         if isinstance(model, DQN):
-            # SB3 evaluates the network only where it does not explore. Another forward pass at
-            # each step, to find the greedy action, would cost more than recording.
+            # SB3 runs the network only for greedy actions, which a hook detects. A second forward
+            # pass at each step to find the greedy action would cost more than recording.
             model.q_net.register_forward_hook(self._on_forward)
 
     def __call__(self, actions: NDArray[Any]) -> None:
@@ -100,7 +120,7 @@ class ActionDescriber:
         self.reset()
 
     def reset(self) -> None:
-        """Ignore a forward pass that was not for the next actions."""
+        """Ignore the last forward pass, because it did not select the next actions."""
         self._were_greedy = False
 
     def _on_forward(self, network: nn.Module, *_: Any) -> None:
@@ -121,8 +141,8 @@ def exploration(model: BaseAlgorithm) -> float:
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the probabilities with which the model chose these actions.
 
-    With a Q-network and A actions it is epsilon / A, plus 1 - epsilon for the greedy action. SB3
-    draws once for all environments whether to explore; the probability is that of one environment.
+    With a Q-network and A actions, each is epsilon / A, plus 1 - epsilon for the greedy action. SB3
+    decides once for all environments whether to explore; the result is the marginal probability.
 
     Args:
         model: Model in training; the actions are for its last observations.

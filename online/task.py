@@ -13,7 +13,7 @@ from mcaprl.errors import TrainingError, UsageError
 from mcaprl.online.algorithms import find_algorithm
 from mcaprl.online.config import OnlineConfig
 from mcaprl.online.presets import find_preset, settings_for
-from mcaprl.runs import CONFIG_NAME, RunIdentity, read_config
+from mcaprl.runs import CONFIG_NAME, RunIdentity, read_config, run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 from mcaprl.sims import make_sims
 
@@ -44,7 +44,7 @@ class Task:
         sim_options: Mapping[str, Any] | None = None,
         **settings: Any,
     ) -> Task:
-        """Return a task with the settings in `SIM_SETTINGS`, or else those of SB3.
+        """Return a task with the settings in `SIM_SETTINGS`, or else SB3's defaults.
 
         Args:
             sim: Short name or Gymnasium id.
@@ -80,7 +80,7 @@ class Task:
 
         Args:
             folder: Folder of the run.
-            **settings: Settings that the user repeats; a run with different ones cannot be resumed.
+            **settings: Settings that the user repeats; a run with other settings cannot be resumed.
 
         Raises:
             TrainingError: The folder has no online run.
@@ -116,7 +116,7 @@ class Task:
 
     @property
     def identity(self) -> RunIdentity:
-        """What has to be the same for a run of this task to be resumed."""
+        """Parts that must be unchanged for a run of this task to be resumed."""
         parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
         return RunIdentity({**parts, "config": self.config.to_json()})
 
@@ -133,19 +133,19 @@ def choose_task(
     """Return the task of a command line.
 
     Args:
-        sim: Short name or Gymnasium id; None is that of the preset or the run.
-        algo: Name of the algorithm; None is that of the preset or the run.
+        sim: Short name or Gymnasium id; None selects that of the preset or the run.
+        algo: Name of the algorithm; None selects that of the preset or the run.
         sim_options: Arguments of the environment.
         given: Settings of the algorithm.
         preset: Name of published settings.
-        resumed: Folder of a run to resume, if it contains one.
+        resumed: Folder of a run to resume; None for a new run.
 
     Raises:
         UnknownNameError: There is no such algorithm or preset.
-        UsageError: There is no sim, or the arguments contradict the preset.
-        TrainingError: The arguments contradict the run.
+        UsageError: No sim is given, or the arguments contradict the preset.
+        TrainingError: The arguments contradict the run, or the folder holds none.
     """
-    if resumed is not None and (resumed / CONFIG_NAME).exists():
+    if resumed is not None and run_to_resume(resumed):
         task = Task.of_run(resumed, **given)
         options = {**task.sim_options, **sim_options}
         task = Task(algo or task.algo, task.config, sim or task.sim, options)

@@ -3,7 +3,7 @@
 `mcaprl.runs` lists the files of a run folder; an online run also writes
 
     RUN/seed-K/evaluations/step-N.mcap      episodes of each evaluation, if training is recorded
-    RUN/seed-K/progress.csv                 SB3's scalars; the same for TensorBoard
+    RUN/seed-K/progress.csv                 SB3's scalars, which TensorBoard files also contain
     RUN/scores.json                         score of each seed's best checkpoint on new episodes
     RUN/curve.png                           curves of all seeds
     RUN/foxglove-layout.json                layout for live viewers
@@ -34,20 +34,20 @@ from mcaprl.online.task import Task
 from mcaprl.progress import ProgressCallback, terminal_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.record.layout import LAYOUT_NAME
-from mcaprl.runs import BEST_NAME, RunSummary, open_run, seed_folder
+from mcaprl.runs import BEST_NAME, RunSummary, locked_run, open_run, seed_folder, writing
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.evaluate import evaluate
 
 
 @dataclass(frozen=True)
 class OnlineSummary(RunSummary):
-    """The outcome of training one seed online.
+    """Outcome of training one seed online.
 
     Attributes:
         best_step: Number of environment steps before the best checkpoint.
         mean_return: Mean return of the best checkpoint on new episodes.
-        score: The mean return on the scale random = 0, pilot = 1; NaN without a pilot.
-        ends: Number of those episodes by the reason they ended.
+        score: Mean return on the scale random = 0, pilot = 1; NaN without a pilot.
+        ends: Numbers of these episodes by the reason for their end.
     """
 
     best_step: int
@@ -76,10 +76,10 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of agents to train, one after the other.
         seed: Seed of the first agent; agent k uses seed + k.
-        record: Log of every transition, written during the training; with several seeds a folder.
-        data: Logged transitions with which the replay buffer starts.
-        policy: Trained policy with Q-values whose weights the agents start with, or a list with one
-            for each seed.
+        record: Log of every transition, written during training; a folder for several seeds.
+        data: Logged transitions that initialize the replay buffer.
+        policy: Trained policy with Q-values whose weights initialize the agents, or a list with one
+            policy for each seed.
         resume: Whether to resume from the checkpoints in `out`. Seeds without one start at step 0.
         live: Live view of the training; its layout is written into `out`.
         progress: Callback for progress; None shows a bar if stderr is a terminal.
@@ -92,16 +92,18 @@ def train(
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
-        TrainingError: `out` cannot be written, or has a run of another task.
+        TrainingError: `out` cannot be written, is being written by another training, or has a run
+            of another task; or there is no run to resume.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
     numbers = range(seed, seed + seeds)
     logs = log_paths(Path(record), numbers, resume) if record is not None else {}
     config = task.config
-    with closing(make_sim(task.sim, **task.sim_options)) as env:
+    folder = Path(out)
+    with locked_run(folder, resume), closing(make_sim(task.sim, **task.sim_options)) as env:
         check_spaces(task.algo, env.observation_space, env.action_space)
-        run = _Run(Path(out), task, env, logs, data, policy, live, seed)
+        run = _Run(folder, task, env, logs, data, policy, live, seed)
         run.open(resume)
         selection = measure_scale(env, episodes=config.eval_episodes, seed=SELECTION_SEED)
         fresh = measure_scale(env, episodes=config.final_episodes, seed=FRESH_SEED)
@@ -110,13 +112,13 @@ def train(
             summaries = [
                 run.train_seed(number, selection, fresh, report, resume) for number in numbers
             ]
-    run.conclude(summaries, fresh)
+        run.conclude(summaries, fresh)
     return summaries
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A run folder, and the state that all its seeds share."""
+    """Run folder, and the state that all seeds share."""
 
     folder: Path
     task: Task
@@ -128,15 +130,13 @@ class _Run:
     first_seed: int
 
     def open(self, resume: bool) -> None:
-        """Create the folder, or check that it is this run's, and the folders of the logs."""
+        """Create the run folder, or check that it is of this run; create the log folders."""
         open_run(self.folder, self.task.identity, resume)
-        try:
-            for path in self.logs.values():
+        for path in self.logs.values():
+            with writing(path.parent):
                 path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise TrainingError(f"cannot write {error.filename}: {error.strerror}") from error
         if self.live is not None:
-            write_json(self.folder / LAYOUT_NAME, self.live.stream.layout())
+            write_json(self.folder / LAYOUT_NAME, self.live.stream.layout(), TrainingError)
 
     def train_seed(
         self, seed: int, selection: Scale, fresh: Scale, report: ProgressCallback, resume: bool
@@ -196,7 +196,7 @@ class _Run:
         }
         scale = {"random": fresh.random, "pilot": fresh.pilot}
         written = {"episodes": self.task.config.final_episodes, "scale": scale, "seeds": seeds}
-        write_json(self.folder / SCORES_NAME, written)
+        write_json(self.folder / SCORES_NAME, written, TrainingError)
         if find_spec("matplotlib") is not None:
             title = f"{self.task.algo} in {self.task.sim}"
             draw_curves(self.folder / IMAGE_NAME, [read_run(self.folder)], title)

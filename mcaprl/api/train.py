@@ -1,4 +1,4 @@
-"""Offline training: a policy from logs."""
+"""Offline training of policies from logs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mcaprl.api.ranges import check_least
 from mcaprl.errors import MissingExtraError, UsageError
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.runs import CONFIG_NAME, read_config
+from mcaprl.runs import run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 
 if TYPE_CHECKING:
@@ -37,24 +37,24 @@ def train(
 ) -> list[OfflineSummary]:
     """Train a policy offline; the same seed, data and machine produce the same weights.
 
-    The run folder gets the policy, checkpoints and metrics of each seed, and `curves.png` if
+    The run folder contains the policy, checkpoints and metrics of each seed, and `curves.png` if
     matplotlib is installed.
 
     Args:
-        data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` is a path whose
-            transitions are drawn twice as often as others.
+        data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
+            the transitions of PATH twice as often as others.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`; None for that of the run that is
-            resumed, or else `cql`.
-        seeds: Number of networks, which are trained side by side.
+        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`; None for that of the resumed
+            run, or else `cql`.
+        seeds: Number of networks, which are trained in parallel.
         seed: Seed of the first network; network k uses seed + k.
         threads: Number of threads of PyTorch and of the reader.
         device: `cpu` or `cuda`.
         resume: Whether training continues from the checkpoints in `out`.
-        follow: Whether episodes that another process adds to the logs are used, too.
-        other_data: Whether `resume` accepts checkpoints of other data.
-        on_data: Called with the algorithm and the dataset before the first update.
-        progress: Called with each row of metrics.
+        follow: Whether episodes that another process adds to the logs are used.
+        other_data: Whether `resume` accepts checkpoints trained on other data.
+        on_data: Function called with the algorithm and the dataset before the first update.
+        progress: Function called with each row of metrics.
         **settings: Settings of the algorithm; their defaults are the algorithm's, or with `resume`
             the run's.
 
@@ -64,11 +64,11 @@ def train(
     Raises:
         UnknownNameError: There is no such algorithm.
         UsageError: The algorithm has no such setting, there is no such device, or a number is out
-            of its range.
+            of range.
         OutputExistsError: `out` contains a run.
         LogError: The logs cannot be read.
         SpaceError: The algorithm does not support the observations or actions.
-        TrainingError: The loss is not finite, or `out` has a run of other data or settings.
+        TrainingError: The loss is not finite, or `out` has a run with other data or settings.
         MissingExtraError: The packages of the `offline` extra are not installed.
     """
     from mcaprl.offline.algorithms.registry import choose_algorithm
@@ -80,8 +80,8 @@ def train(
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
     out = Path(out)
-    if resume and (out / CONFIG_NAME).exists():
-        earlier = read_config(out)
+    if resume:
+        earlier = run_to_resume(out)
         algo = algo or earlier.get("algo")
         settings = {**settings_from_json(earlier.get("config")), **settings}
     algo = algo or "cql"
@@ -92,7 +92,7 @@ def train(
         growing, weights = None, None
         if isinstance(data, Dataset):
             if follow:
-                raise UsageError("a dataset does not grow: follow needs the paths of the logs")
+                raise UsageError("follow needs the paths of logs, not a dataset")
             dataset = data
         elif follow:
             growing = GrowingLogs(_names(data))
@@ -108,7 +108,7 @@ def train(
             seed=seed,
             weights=weights,
             resume=resume,
-            # The checkpoints are of the logs as they were before they grew.
+            # The checkpoints were trained on the logs before they grew.
             other_data=other_data or follow,
             follow=growing,
             device=device,

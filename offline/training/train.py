@@ -35,7 +35,14 @@ from mcaprl.offline.training.watch import (
     largest_return,
 )
 from mcaprl.progress import ProgressCallback, TrainingProgress, terminal_progress
-from mcaprl.runs import CHECKPOINT_NAME, RunIdentity, open_run, policy_files, seed_folder
+from mcaprl.runs import (
+    CHECKPOINT_NAME,
+    RunIdentity,
+    locked_run,
+    open_run,
+    policy_files,
+    seed_folder,
+)
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
@@ -63,13 +70,12 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of networks to train in parallel; they are independent of each other.
         seed: Seed of the first network; network k uses seed + k.
-        weights: (E,) relative frequencies with which an episode's transitions are drawn; default:
-            all equal.
+        weights: (E,) relative sampling weights of each episode's transitions; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without one start from
             update 0.
-        other_data: Whether to resume even from checkpoints of other data.
-        follow: Growing logs from which `dataset` was read; episodes finished during the training
-            are added to it.
+        other_data: Whether to accept checkpoints trained on other data when resuming.
+        follow: Growing logs from which `dataset` was read; episodes finished during training
+            are added.
         device: Device of the data, the networks and the updates, `cpu` or `cuda`.
         progress: Callback for each row of metrics; None shows a bar if stderr is a terminal.
 
@@ -81,7 +87,9 @@ def train(
         UsageError: There is no such device.
         OutputExistsError: `out` exists and is not empty.
         SpaceError: The algorithm does not support these observations or actions.
-        TrainingError: The loss is NaN or infinite, or `out` has a run with other data or settings.
+        TrainingError: The loss is NaN or infinite; `out` cannot be written, is being written by
+            another training, or has a run with other data or settings; or there is no run to
+            resume.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
@@ -93,22 +101,23 @@ def train(
     parts = {"algo": learner_type.name, "config": config.to_json(), "data": data}
     identity = RunIdentity(parts, other_data)
     folder = Path(out)
-    held_out = choose_held_out(len(weights), config.held_out)
-    buffer = TransitionBuffer.from_dataset(
-        dataset,
-        config.packing,
-        encoder=_earlier_encoder(folder) if resume and other_data else None,
-        weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
-    ).to(place)
-    open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
-    if message := horizon_warning(config):
-        warnings.warn(message, stacklevel=2)
-    gamma = buffer.packing.gamma
-    validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
-    limit = largest_return(dataset, gamma)
-    run = _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
-    with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
-        return run.train(learner_type, config, range(seed, seed + seeds), report)
+    with locked_run(folder, resume):
+        held_out = choose_held_out(len(weights), config.held_out)
+        buffer = TransitionBuffer.from_dataset(
+            dataset,
+            config.packing,
+            encoder=_earlier_encoder(folder) if resume and other_data else None,
+            weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
+        ).to(place)
+        open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
+        if message := horizon_warning(config):
+            warnings.warn(message, stacklevel=2)
+        gamma = buffer.packing.gamma
+        validation = HeldOut(dataset, buffer, held_out, gamma) if len(held_out) else None
+        limit = largest_return(dataset, gamma)
+        run = _Run(folder, identity, dataset, buffer, validation, limit, held_out, follow)
+        with nullcontext(progress) if progress else terminal_progress("updates", "loss") as report:
+            return run.train(learner_type, config, range(seed, seed + seeds), report)
 
 
 @dataclass(frozen=True)
@@ -212,7 +221,7 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """Return the learner, with newly logged episodes every `CHECK_INTERVAL` updates."""
+        """Return the learner, with new episodes added every `CHECK_INTERVAL` updates."""
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
         return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
@@ -220,8 +229,8 @@ class _Run:
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.
 
-        The checkpoint is last: a kill before it costs updates, but a finished run never has an
-        outdated policy.
+        The checkpoint is written last: a kill before that loses updates, but a finished run never
+        has an outdated policy.
         """
         for seed in learner.seeds:
             folder = seed_folder(self.folder, seed)
@@ -229,7 +238,7 @@ class _Run:
             save_checkpoint(folder, learner, seed, self.identity)
 
     def _update(self, learner: Learner) -> dict[str, Tensor]:
-        """Make one update; report a loss that is not finite with the last good checkpoint."""
+        """Run one update; if the loss is not finite, raise an error with the last checkpoint."""
         try:
             return learner.update()
         except NotFiniteError as error:
@@ -252,13 +261,13 @@ class _Run:
 
 
 def _earlier_encoder(folder: Path) -> ObservationEncoder | None:
-    """Return the normalization with which the weights in a run folder were trained."""
+    """Return the encoder, with its normalization, of the run in a folder; None if there is none."""
     policies = policy_files(folder)
     return read_policy(policies[0].parent).encoder if policies else None
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Return a hash of the data, and of their weights where these differ."""
+    """Return a hash of the data, and of the weights unless all are equal."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()

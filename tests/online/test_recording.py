@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,13 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.buffers import ReplayBuffer
 
 import mcaprl
-from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.offline.algorithms.cql import CQLConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import FirstEpisodes, Scale
 from mcaprl.online.policy import read_policy
-from mcaprl.online.recording import behavior_probabilities, log_paths
+from mcaprl.online.recording import behavior_probabilities, log_paths, recorded
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.online.vec_env import BatchedVecEnv
@@ -100,6 +101,59 @@ def test_the_log_is_sb3s_replay_buffer_row_for_row(tmp_path: Path, envs: int) ->
     timeouts = [episode.truncated[-1] for episode in log.episodes]
     reported = [part["timeouts"][-1] == 1 or part["dones"][-1] == 0 for part in episodes]
     assert timeouts == reported
+
+
+def killed_log(path: Path, episodes: int) -> bytes:
+    """Create the log of a recorder that was killed; returns its bytes."""
+    with closing(recorded(Task.for_sim("lane").batch(1), path, algo="dqn", seed=0)) as env:
+        env.reset(seed=0)
+        while env.episodes < episodes:
+            env.step(np.zeros(1, np.int64))
+        content = path.read_bytes()
+    path.write_bytes(content)
+    return content
+
+
+@pytest.mark.parametrize("operation", ["unlink", "link", "replace"])
+def test_a_log_is_in_its_place_throughout_its_recovery(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, operation: str
+) -> None:
+    path = tmp_path / "log.mcap"
+    content = killed_log(path, 2)
+    (tmp_path / "log.mcap.damaged").write_bytes(b"of an earlier kill")
+
+    def killed(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    batch = Task.for_sim("lane").batch(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(*((Path, "unlink") if operation == "unlink" else (os, operation)), killed)
+        with pytest.raises(KeyboardInterrupt):
+            recorded(batch, path, algo="dqn", seed=0, resume=True)
+    assert path.read_bytes() == content
+    with closing(recorded(batch, path, algo="dqn", seed=0, resume=True)) as env:
+        assert env.episodes == 2
+    assert (tmp_path / "log.mcap.damaged").read_bytes() == content
+
+
+@pytest.mark.parametrize("length", [0, 5, 100, None])
+def test_a_log_killed_in_its_first_episode_begins_again(tmp_path: Path, length: int | None) -> None:
+    path = tmp_path / "log.mcap"
+    content = killed_log(path, 0)[:length]
+    path.write_bytes(content)
+    batch = Task.for_sim("lane").batch(1)
+    with closing(recorded(batch, path, algo="dqn", seed=0, resume=True)) as env:
+        env.reset(seed=0)
+        env.step(np.zeros(1, np.int64))
+    assert len(mcaprl.open(path)) == 1
+
+
+def test_a_file_that_is_no_log_is_not_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_text("thesis")
+    with pytest.raises(LogError, match="cannot be recovered"):
+        recorded(Task.for_sim("lane").batch(1), path, algo="dqn", seed=0, resume=True)
+    assert path.read_text() == "thesis"
 
 
 def test_the_log_can_be_trained_on_offline(tmp_path: Path) -> None:

@@ -113,6 +113,44 @@ def test_a_stopped_run_continues_from_its_last_checkpoint(tmp_path: Path) -> Non
     assert names == ["progress-from-800.csv", "progress.csv"]
 
 
+def test_a_run_stopped_before_its_first_evaluation_continues(tmp_path: Path) -> None:
+    settings = {**SHORT, "checkpoint_interval": 200, "eval_interval": 2_000}
+    task = Task.for_sim("lane", "dqn", **settings)
+    with pytest.raises(Stopped):
+        train(task, tmp_path / "run", progress=stop_at(1_000))
+    (summary,) = train(task, tmp_path / "run", resume=True, progress=silent)
+    assert (summary.resumed_at, summary.best_step) == (800, 2_000)
+
+
+def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+    (first,) = train(task, tmp_path / "run", progress=silent)
+    best = first.folder / "best_model.zip"
+    content = best.read_bytes()
+    best.write_bytes(b"of an evaluation after the checkpoint")
+    train(task, tmp_path / "run", resume=True, progress=silent)
+    assert best.read_bytes() == content
+
+
+def test_resuming_a_missing_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["train-online", "lane", "--out", str(tmp_path / "rum"), "--resume"]) == 1
+    assert "rum holds no run to resume: check the path" in capsys.readouterr().err
+    assert not (tmp_path / "rum").exists()
+
+
+def test_a_second_training_in_the_folder_is_refused(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", "dqn", **SHORT)
+
+    def begin_another(now: TrainingProgress) -> None:
+        with pytest.raises(TrainingError, match="run is in use by another"):
+            train(task, tmp_path / "run", resume=True, progress=silent)
+
+    (summary,) = train(task, tmp_path / "run", progress=begin_another)
+    assert summary.steps == 2_000
+
+
 def test_epsilon_and_learning_rate_continue_to_decay(tmp_path: Path) -> None:
     settings = {**SHORT, "exploration_fraction": 1.0, "final_learning_rate_fraction": 0.1}
     task = Task.for_sim("lane", "dqn", **settings)

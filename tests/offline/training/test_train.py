@@ -218,6 +218,7 @@ def test_a_run_killed_at_random_moments_resumes_bit_for_bit(tmp_path: Path) -> N
     """
     command = [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "cut")]
     root = ROOT
+    (tmp_path / "cut").mkdir()
     for moment in np.random.default_rng().uniform(0, 0.4, 2):
         with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=root) as child:
             assert child.stdout is not None
@@ -309,14 +310,52 @@ def test_an_existing_run_is_not_replaced(tmp_path: Path) -> None:
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_without_a_run_is_not_touched(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(OutputExistsError, match="choose another folder"):
+    message = "holds no run to resume" if resume else "choose another folder"
+    with pytest.raises(TrainingError if resume else OutputExistsError, match=message):
         train(corridor(), SHORT_CQL, tmp_path, resume=resume, progress=silent)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_resuming_a_missing_run_starts_it(tmp_path: Path) -> None:
-    (summary,) = train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+def test_resuming_a_missing_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="run holds no run to resume: check the path"):
+        train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_run_killed_before_its_first_write_starts_again(tmp_path: Path, resume: bool) -> None:
+    (tmp_path / ".config.json.part").mkdir()
+    (tmp_path / ".config.json.part" / "config.json").write_text("{")
+    (summary,) = train(corridor(), SHORT_CQL, tmp_path, resume=resume, progress=silent)
     assert (summary.resumed_at, summary.steps) == (0, 100)
+    assert not (tmp_path / ".config.json.part").exists()
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_second_training_in_the_folder_is_refused_before_the_first_checkpoint(
+    tmp_path: Path, resume: bool
+) -> None:
+    run = tmp_path / "run"
+    refused = []
+
+    def begin_another(now: TrainingProgress) -> None:
+        before = (run / "config.json").read_bytes()
+        if not (run / "seed-0" / "checkpoint.safetensors").exists():
+            with pytest.raises(TrainingError, match="run is in use by another") as caught:
+                train(corridor(), BCConfig(**SHORT), run, resume=resume, progress=silent)
+            refused.append(caught.value)
+        assert (run / "config.json").read_bytes() == before
+
+    train(corridor(), SHORT_CQL, run, progress=begin_another)
+    assert refused
+    train(corridor(), SHORT_CQL, tmp_path / "alone", progress=silent)
+    assert_same_result(run, tmp_path / "alone")
+
+
+def test_a_file_is_no_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputExistsError, match="is a file"):
+        train(corridor(), SHORT_CQL, tmp_path / "file", progress=silent)
 
 
 def test_a_loss_that_is_not_finite_stops_with_step_term_and_checkpoint(tmp_path: Path) -> None:
