@@ -3,15 +3,15 @@
 Each maps a table of episodes to a `RatioEstimate`, which has a value and an interval:
 
     TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
-    WIS     weighted                               the same, over the sum of all rho
+    WIS     weighted                               TIS with rho divided by the sum of all rho
     PDIS    per-decision importance sampling       sum_t gamma^t rho_t r_t
-    WPDIS   weighted                               each step's rho_t over their sum at that step
+    WPDIS   weighted                               PDIS with rho_t divided by their sum at t
     DR      doubly robust                          PDIS of the residuals of a model Q
-    WDR     weighted doubly robust                 WPDIS of the same
+    WDR     weighted doubly robust                 WPDIS of these residuals
 
 with rho_t the product of pi(a|s) / mu(a|s) up to step t, pi the evaluated policy and mu the
 behavior policy. TIS, PDIS and DR are unbiased with a large variance; the weighted (self-normalized)
-ones have a small bias and a smaller variance.
+estimators have a small bias and a smaller variance.
 
     Precup, Sutton and Singh, "Eligibility traces for off-policy policy evaluation", ICML 2000
     Jiang and Li, "Doubly robust off-policy value evaluation", https://arxiv.org/abs/1511.03722
@@ -32,7 +32,7 @@ from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate, divid
 
 @dataclass(frozen=True, eq=False)
 class EpisodeTable:
-    """E episodes, padded to T steps: one more than the longest episode has.
+    """E episodes, padded to T steps, one more than the longest episode.
 
     Attributes:
         rewards: (E, T) reward of step t; 0 past the end.
@@ -63,7 +63,8 @@ class EpisodeTable:
     @property
     def rho(self) -> Floats:
         """Products (E, T) of the ratios up to and including step t."""
-        return np.cumprod(self.ratios, axis=1, dtype=np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.cumprod(self.ratios, axis=1, dtype=np.float64)
 
     @property
     def rho_before(self) -> Floats:
@@ -96,7 +97,7 @@ def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
 def doubly_robust(episodes: EpisodeTable) -> RatioEstimate:
     """Return DR: the mean of sum_t gamma^t (rho_{t-1} V(s_t) + rho_t (r_t - Q(s_t, a_t))).
 
-    See Jiang and Li, equation 10. With a model of zeros it is PDIS.
+    See Jiang and Li, equation 10. With a model of zeros, DR is PDIS.
     """
     unexplained = episodes.rho * (episodes.rewards - episodes.q)
     per_step = unexplained + episodes.rho_before * episodes.v
@@ -126,41 +127,54 @@ ESTIMATORS: Final[dict[str, Callable[[EpisodeTable], RatioEstimate]]] = {
 WHOLE_EPISODE: Final = ("TIS", "WIS")
 """Estimators with one weight per episode; the others have one per step."""
 
+UNBIASED: Final = ("TIS", "PDIS", "DR")
+"""Estimators that do not divide by the sum of the weights."""
+
 
 def effective_sample_sizes(episodes: EpisodeTable) -> Floats:
     """Return Kish's effective sample size (T,) of each step: (sum rho_t)^2 / sum rho_t^2.
 
-    It is E if all weights are equal, 1 if only one is not 0, and 0 if all are 0.
+    The size is E if all weights are equal, 1 if only one is not 0, and 0 if all are 0.
     """
-    rho = episodes.rho
-    return divide(rho.sum(0) ** 2, (rho**2).sum(0))
+    return _kish(episodes.rho)
 
 
 def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
     """Return the effective number of episodes of an estimate.
 
-    For TIS and WIS it is that of the last step. For the others it is the harmonic mean over steps,
-    weighted with the discounts, because the variances of the steps add up.
+    For TIS and WIS, this is the size at the last step. For the others, it is the harmonic mean over
+    steps, weighted with the discounts, because the variances of the steps add up. For PDIS and DR,
+    it is at most the size of the episodes' discounted sums of weights, because these estimators do
+    not normalize: one huge weight, even in a late step, determines their value.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:
         return float(sizes[-1])
     discounts = episodes.discounts
     with np.errstate(divide="ignore"):
-        return float(discounts.sum() / (discounts @ (1 / sizes)))
+        size = float(discounts.sum() / (discounts @ (1 / sizes)))
+    if estimator in UNBIASED:
+        size = min(size, float(_kish(episodes.rho @ discounts)))
+    return size
 
 
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
     """Return the mean importance weight of an unbiased estimator, whose expectation is 1.
 
-    It is well below 1 if the log does not cover the policy's actions: the rare episodes with large
-    weights are missing. None for the weighted estimators, which divide by it.
+    A mean well below 1 shows that the log does not cover the policy's actions: rare episodes with
+    large weights are missing. None for the weighted estimators, which divide by this mean.
     """
-    if estimator == "TIS":
+    if estimator not in UNBIASED:
+        return None
+    if estimator in WHOLE_EPISODE:
         return RatioEstimate.mean(episodes.rho[:, -1])
-    if estimator in ("PDIS", "DR"):
-        return RatioEstimate.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
-    return None
+    return RatioEstimate.mean(episodes.rho @ episodes.discounts / episodes.discounts.sum())
+
+
+def _kish(weights: Floats) -> Floats:
+    """Return (sum w)^2 / sum w^2 over the first axis, without overflow."""
+    relative = divide(weights, np.broadcast_to(weights.max(0), weights.shape))
+    return divide(relative.sum(0) ** 2, (relative**2).sum(0))
 
 
 def _returns(episodes: EpisodeTable) -> Floats:

@@ -1,7 +1,7 @@
 """Off-policy evaluation: estimates of a policy's value from a log, with intervals and verdicts.
 
-Values are discounted returns of whole episodes. The rewards that a truncated episode would still
-have received are included by the estimators with a model (FQE, DR, WDR) and not by the others.
+Values are discounted returns of whole episodes. Estimators with a model (FQE, DR, WDR) include the
+rewards missing after a truncation; the others do not.
 """
 
 from __future__ import annotations
@@ -24,20 +24,24 @@ from mcaprl.offline.estimate.importance import (
     mean_weight,
 )
 from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate
+from mcaprl.recorder.dataset.calibration import calibration
+from mcaprl.recorder.format.probability import is_impossible
 
 if TYPE_CHECKING:
     from mcaprl.recorder.dataset.dataset import Dataset
 
 LEAST_SAMPLE_SIZE: Final = 10.0
-"""Effective number of episodes below which the verdict is refused."""
+"""Effective number of episodes below which an estimate is refused."""
+LARGEST_WEIGHT: Final = 1e100
+"""Importance weight above which sums of squares may overflow, so an estimate is refused."""
 RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
-PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS", "FQE")
-"""Estimators from the most to the least reliable."""
+PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS")
+"""Estimators for rankings, from the most to the least reliable."""
 _ROWS_AT_ONCE = 4096
 _STANDARD_ERRORS = 4.0
-"""Deviation of the mean weight from 1 above which the verdict is refused."""
+"""Deviation of the mean weight from 1, in standard errors, above which an estimate is refused."""
 
 
 class StochasticPolicy(Protocol):
@@ -49,15 +53,16 @@ class StochasticPolicy(Protocol):
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimate of one estimator for one policy.
+    """Estimate of one policy's value by one estimator.
 
     Attributes:
         policy: Name of the policy.
         estimator: `FQE` or one of `importance.ESTIMATORS`.
         value: Discounted return; None if it cannot be computed.
-        interval: 95 % bootstrap-t interval over episodes.
+        interval: 95 % bootstrap-t interval over episodes; None for FQE, and where there is no
+            value.
         effective_sample_size: Number of the policy's own episodes that would be as informative.
-        verdict: `ok`, or `refused: ` and the reason.
+        verdict: `ok`, or `refused: ` or `no interval: ` and the reason. FQE is never `ok`.
     """
 
     policy: str
@@ -79,7 +84,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class PolicyEstimates:
-    """The estimates of all estimators for one policy.
+    """Estimates of one policy's value by all estimators.
 
     Attributes:
         policy: Name of the policy.
@@ -94,7 +99,7 @@ class PolicyEstimates:
 
 
 class OffPolicyEvaluator:
-    """An evaluator of policies on one log.
+    """Evaluator of policies on one log.
 
     Attributes:
         gamma: Discount per step.
@@ -103,7 +108,7 @@ class OffPolicyEvaluator:
     """
 
     def __init__(self, dataset: Dataset, config: FQEConfig | None = None, seed: int = 0) -> None:
-        """Prepare a log.
+        """Prepare the evaluation on a log.
 
         Args:
             dataset: Dataset with discrete actions.
@@ -113,7 +118,7 @@ class OffPolicyEvaluator:
         Raises:
             SpaceError: The actions are not discrete.
             TrainingError: There are no transitions, or a number is not finite.
-            UsageError: There are fewer episodes than cross-fitting needs.
+            UsageError: There are too few episodes for cross-fitting.
         """
         self._config = config or FQEConfig()
         self._seed = seed
@@ -123,6 +128,7 @@ class OffPolicyEvaluator:
         if len(self._lengths) < FOLDS:
             raise UsageError(f"off-policy evaluation needs {FOLDS} episodes or more in the log")
         self.gamma = self._config.gamma
+        self._calibration = calibration(dataset.behavior_probs, dataset.action_space)
         random = np.random.default_rng(seed)
         shape = (RESAMPLES, len(self._lengths))
         self._counts = random.multinomial(shape[1], [1 / shape[1]] * shape[1], shape[0]).astype(
@@ -147,8 +153,8 @@ class OffPolicyEvaluator:
         Args:
             policy: Policy to evaluate; None is the uniform random policy.
             name: Name in tables.
-            epsilon: Probability of a random action instead of the policy's; with a larger one, the
-                estimates need fewer episodes.
+            epsilon: Probability of a random action instead of the policy's; a larger epsilon
+                requires fewer episodes.
             on_update: Callback for each update of the model, `updates_of_model` in total.
 
         Raises:
@@ -162,15 +168,15 @@ class OffPolicyEvaluator:
         q, v, v_last = self._model(pi, pi_next, on_update)
         own = pi[np.arange(len(pi)), self._buffer.actions.numpy()]
         behavior = self._dataset.behavior_probs.astype(np.float64)
-        unknown = int(np.isnan(behavior).sum())
-        if unknown:
-            verdict = f"refused: behavior_prob of {unknown} of {len(behavior)} steps is unknown"
-            found = [Estimate(name, each, None, None, 0.0, verdict) for each in ESTIMATORS]
-            weights = own
-        else:
+        weights, refused = own, _unusable(behavior)
+        if refused is None:
             weights = own / behavior
             table = self._table(weights, q, v, v_last)
+            refused = _overflow(table.rho)
+        if refused is None:
             found = [self._estimate(name, each, table) for each in ESTIMATORS]
+        else:
+            found = [Estimate(name, each, None, None, 0.0, refused) for each in ESTIMATORS]
         fqe = self._fqe_estimate(name, v, weights)
         return PolicyEstimates(name, float(own.mean()), (fqe, *found))
 
@@ -201,8 +207,8 @@ class OffPolicyEvaluator:
     ) -> tuple[Floats, Floats, Floats]:
         """Return Q of the actions taken, V of the states, and V of the next states, (N,) each.
 
-        Cross-fitting: the model that evaluates an episode was trained on the other half of the log,
-        because its values of training episodes are biased.
+        Cross-fitting: the model that evaluates an episode is trained on the other half of the log,
+        because a model's values of its training episodes are biased.
         """
         fold = np.repeat(self._fold, self._lengths)
         actions = self._buffer.actions.numpy()
@@ -253,6 +259,8 @@ class OffPolicyEvaluator:
         )
 
     def _verdict_on_weights(self, estimator: str, table: EpisodeTable, size: float) -> str:
+        if self._calibration is not None and not self._calibration.possible:
+            return f"refused: behavior_prob implies {self._calibration}"
         verdict, weights = _verdict(size), mean_weight(estimator, table)
         if verdict != TRUSTED or weights is None:
             return verdict
@@ -268,8 +276,9 @@ class OffPolicyEvaluator:
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
         """Return the model's mean value of the first states.
 
-        The interval does not include the variation between trained models. The effective sample
-        size is that of single steps, in episodes, because the model is trained on single steps.
+        It has no interval, and so it is never trusted: its error is the model's bias, which a log
+        does not show. The variation of the first states is a small part of the error. The effective
+        sample size is that of single steps, on which the model is trained, converted to episodes.
         """
         first = v[np.cumsum(self._lengths) - self._lengths]
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
@@ -280,8 +289,9 @@ class OffPolicyEvaluator:
                 f"refused: {self._config.updates // self._config.target_interval} target syncs"
                 f" are too few for gamma {self.gamma}; increase the updates"
             )
-        interval = RatioEstimate.mean(first).interval(self._counts)
-        return Estimate(name, "FQE", float(first.mean()), interval, size, verdict)
+        if verdict == TRUSTED:
+            verdict = "no interval: the error of the model cannot be estimated from the log"
+        return Estimate(name, "FQE", float(first.mean()), None, size, verdict)
 
     def _padded(self, column: NDArray[Any], fill: float) -> Floats:
         """Return a column of steps as rows (E, T), one per episode, padded with `fill`."""
@@ -292,21 +302,40 @@ class OffPolicyEvaluator:
 
 
 def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
-    """Rank policies by the first estimator of `PREFERENCE` that has a verdict on all of them.
+    """Rank policies by the first estimator of `PREFERENCE` that is trusted for all policies.
 
     Returns:
-        `estimator`; `policies`, best first; and `trusted`: false if no estimator has a verdict on
-        all policies and the ranking is that of FQE.
+        `estimator`; `policies`, best first; and `trusted`: false if no estimator is trusted for
+        all policies, so the ranking is that of FQE.
     """
     by_estimator = {
         name: [estimate for estimate in estimates if estimate.estimator == name]
-        for name in PREFERENCE
+        for name in (*PREFERENCE, "FQE")
     }
-    trusted = [name for name, own in by_estimator.items() if all(one.trusted for one in own)]
+    trusted = [name for name in PREFERENCE if all(one.trusted for one in by_estimator[name])]
     chosen = trusted[0] if trusted else "FQE"
     ordered = sorted(by_estimator[chosen], key=lambda estimate: -(estimate.value or 0.0))
     policies = [estimate.policy for estimate in ordered]
     return {"estimator": chosen, "policies": policies, "trusted": bool(trusted)}
+
+
+def _unusable(behavior: Floats) -> str | None:
+    """Return a verdict if steps cannot be weighted with their logged probabilities."""
+    for wrong, what in (
+        (is_impossible(behavior), "not in (0, 1]"),
+        (np.isnan(behavior), "unknown"),
+    ):
+        if wrong.any():
+            return f"refused: behavior_prob of {wrong.sum()} of {len(wrong)} steps is {what}"
+    return None
+
+
+def _overflow(rho: Floats) -> str | None:
+    """Return a verdict if importance weights may overflow."""
+    largest = float(np.nanmax(rho))
+    if largest <= LARGEST_WEIGHT:
+        return None
+    return f"refused: an importance weight is {largest:.0e}, above {LARGEST_WEIGHT:.0e}"
 
 
 def _verdict(size: float) -> str:

@@ -1,10 +1,10 @@
 """Calibration of logged behavior probabilities.
 
-A log contains only the probability p of the action taken. Over actions drawn with probabilities p,
-E[1 / p] is the number of actions with p > 0. The same holds for a range of probabilities: the sum
-of 1 / p over the steps in that range, divided by the number of all steps, is the mean number of
-actions per state whose probability is in the range. For example, an epsilon-greedy policy over nine
-actions has one action of high probability and eight of low probability.
+A log contains only the probability p of the action taken. If actions are drawn with probabilities
+p, E[1 / p] is the number of actions with p > 0. For a range of probabilities, the sum of 1 / p over
+the steps in the range, divided by the number of all steps, is the mean number of actions per state
+whose probability is in the range. For example, an epsilon-greedy policy over nine actions has one
+action of high probability and eight of low probability.
 """
 
 from __future__ import annotations
@@ -17,19 +17,23 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.recorder.format.probability import is_impossible
+
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 """Edges of the probability ranges (low, high]."""
 _STANDARD_ERRORS = 4.0
-"""Largest deviation, in standard errors, that is attributed to chance."""
+"""Largest deviation attributed to chance, in standard errors."""
+_LEAST_CHANCE = 1e-6
+"""Smallest chance of drawing an action this improbable that is still attributed to chance."""
 
 
 @dataclass(frozen=True)
 class ProbabilityRange:
-    """The steps whose action has a probability in one range.
+    """The steps whose action probability is in a range.
 
     Attributes:
-        probability: Mean probability of these actions.
-        steps: Number of these steps.
+        probability: Mean action probability.
+        steps: Number of steps.
         actions: Mean number of actions per state with a probability in the range.
     """
 
@@ -44,34 +48,46 @@ class Calibration:
 
     Attributes:
         available: Number of actions in the action space.
-        actions: Number of actions implied by the probabilities, the mean of 1 / p. It is smaller
-            than `available` if some actions are never taken, and larger only if the logged
+        actions: Number of actions implied by the probabilities, the mean of 1 / p. Smaller than
+            `available` if some actions are never taken; larger, beyond chance, only if the logged
             probabilities are too small.
         error: Standard error of `actions`.
-        ranges: The same estimate for each range of probabilities.
+        smallest: Smallest logged probability.
+        steps: Number of logged probabilities.
+        ranges: Estimates for each range of probabilities.
     """
 
     available: int
     actions: float
     error: float
+    smallest: float
+    steps: int
     ranges: tuple[ProbabilityRange, ...]
 
     @property
     def possible(self) -> bool:
-        """Whether the probabilities are consistent with the number of actions."""
-        return self.actions <= self.available + _STANDARD_ERRORS * self.error + 1e-6
+        """Whether the probabilities are consistent with the number of actions.
+
+        With A actions, a step draws an action of probability p or less with a probability of at
+        most A p. This bounds the smallest probability without the standard error, which a few tiny
+        probabilities inflate.
+        """
+        drawable = self.smallest * self.available * self.steps >= _LEAST_CHANCE
+        return drawable and (self.actions <= self.available + _STANDARD_ERRORS * self.error + 1e-6)
 
     def __str__(self) -> str:
-        """Return a summary of one line."""
-        text = (
-            f"{self.actions:.2f} +- {self.error:.2f} actions; the action space has {self.available}"
-        )
-        return text if self.possible else f"{text}, so the logged probabilities are too small"
+        """Return a one-line summary."""
+        text = f"{_number(self.actions)} +- {_number(self.error)} actions; the action space has"
+        text += f" {self.available}"
+        if self.possible:
+            return text
+        return f"{text}, so the logged probabilities are too small (down to {self.smallest:.2g})"
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that commands print."""
         ranges = [vars(one) for one in self.ranges]
         mine = {"available": self.available, "actions": self.actions, "error": self.error}
+        mine |= {"smallest": self.smallest}
         return {**mine, "possible": self.possible, "ranges": ranges}
 
 
@@ -85,11 +101,11 @@ def calibration(
         action_space: Space of the actions.
 
     Returns:
-        None if the actions are not discrete, or a probability is unknown or 0.
+        None if the actions are not discrete, or a probability is unknown or not in (0, 1].
     """
     if not isinstance(action_space, spaces.Discrete) or len(behavior_probs) < 2:
         return None
-    if not (behavior_probs > 0).all():
+    if np.isnan(behavior_probs).any() or is_impossible(behavior_probs).any():
         return None
     probs = behavior_probs.astype(np.float64)
     inverse = 1 / probs
@@ -103,4 +119,15 @@ def calibration(
         for k in np.unique(place)
     ]
     error = float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
-    return Calibration(int(action_space.n), float(inverse.mean()), error, tuple(ranges))
+    return Calibration(
+        int(action_space.n),
+        float(inverse.mean()),
+        error,
+        float(probs.min()),
+        len(probs),
+        tuple(ranges),
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if value < 1e6 else f"{value:.2g}"

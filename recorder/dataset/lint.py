@@ -1,4 +1,4 @@
-"""Checks of a dataset for what harms or may harm learning, each with its place and effect."""
+"""Checks of a dataset for problems that harm or may harm learning."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.probability import is_impossible
+from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside
 
 GAP: Final = 1.5
-"""Shortest gap between two steps, as a multiple of the median time between steps."""
+"""Shortest reported gap between two steps, as a multiple of the median time between steps."""
 _SHOWN = 3
 _note = functools.partial(Problem, severity="note")
 
 
 def lint(dataset: Dataset) -> list[Problem]:
-    """Run all checks of this module; problems come before notes."""
+    """Return the findings of all checks, problems before notes."""
     found = [finding for check in _CHECKS for finding in check(dataset)]
     return sorted(found, key=lambda finding: finding.severity != "problem")
 
 
 def _not_finite(dataset: Dataset) -> Iterator[Problem]:
-    effect = "one such number in a batch makes every weight NaN; training refuses the dataset"
+    effect = "one such value in a batch makes every weight NaN; training rejects the dataset"
     counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
     for leaf in _leaves(dataset):
         if counts[leaf.name]:
@@ -57,11 +58,22 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
         if len(wrong):
             first = int(wrong[0])
             yield Problem(
-                f"{_count(len(wrong), 'number')} of {leaf.name} leave their space",
+                f"{_count(len(wrong), 'element')} of {leaf.name} outside its space",
                 f"{_name(dataset, leaf, first)} is {column.low[first]:.4g} to"
                 f" {column.high[first]:.4g}, its space {low[first]:.4g} to {high[first]:.4g}",
-                "code that scales observations by the bounds of the space gets values out of range",
+                "observations that are scaled by the bounds of the space are out of range",
             )
+
+
+def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
+    wrong = outside(dataset.action_space, dataset.actions)
+    if wrong.any():
+        flags = functools.partial(outside, dataset.action_space)
+        yield Problem(
+            f"{_count(int(wrong.sum()), 'action')} outside of {dataset.action_space}",
+            _places(dataset, lambda episode: np.where(flags(episode.actions), np.nan, 0.0)),
+            "training rejects the dataset",
+        )
 
 
 def _constant(dataset: Dataset) -> Iterator[Problem]:
@@ -73,9 +85,9 @@ def _constant(dataset: Dataset) -> Iterator[Problem]:
         if len(same):
             names = ", ".join(_name(dataset, leaf, int(index)) for index in same[:_SHOWN])
             yield _note(
-                f"{_count(len(same), 'number')} of {leaf.name} never change",
+                f"{_count(len(same), 'element')} of {leaf.name} never change",
                 names + (", ..." if len(same) > _SHOWN else ""),
-                "they carry no information, and a network does not learn to ignore other values",
+                "they carry no information, and the network is untrained for other values",
             )
 
 
@@ -90,9 +102,9 @@ def _duplicates(dataset: Dataset) -> Iterator[Problem]:
     if copies:
         extra = sum(len(indexes) - 1 for indexes in copies)
         yield Problem(
-            f"{_count(extra, 'episode')} repeat others, step by step",
+            f"{_count(extra, 'episode')} are duplicates of others",
             "; ".join(_listed(indexes) for indexes in copies[:_SHOWN]),
-            "they are weighted twice, and held-out episodes can also be in the training data",
+            "they are overweighted, and held-out episodes can also be in the training data",
         )
 
 
@@ -107,15 +119,15 @@ def _actions_never_taken(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             f"{_count(len(missing), 'action')} of {int(space.n)} were never taken",
             ", ".join(names) + (", ..." if len(missing) > _SHOWN else ""),
-            "their Q-values are extrapolated: choose an algorithm that stays close to the data"
-            " (cql, bcq, bc)",
+            "their Q-values are extrapolated: choose an algorithm that stays close to the behavior"
+            " policy (cql, bcq, bc)",
         )
 
 
 def _rewards(dataset: Dataset) -> Iterator[Problem]:
     rewards = dataset.rewards
     if len(rewards) and not rewards.any():
-        yield Problem("every reward is 0", "all steps", "there is nothing to learn from")
+        yield Problem("every reward is 0", "all steps", "there is no learning signal")
         return
     last = np.zeros(len(rewards), dtype=bool)
     last[np.cumsum(dataset.statistics.lengths) - 1] = True
@@ -123,7 +135,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             "only the last steps of episodes have a reward",
             f"{int((rewards != 0).sum())} of {len(dataset.episodes)} episodes",
-            "values of early steps need many updates to reflect them: n-step returns help",
+            "these rewards reach the values of early steps slowly: n-step returns help",
         )
         return
     cut, others = rewards[dataset.truncated], rewards[~last]
@@ -134,7 +146,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
                 f"{_count(int(beyond.sum()), 'truncated episode')} end with a reward that no"
                 " other step has",
                 f"{cut[beyond][0]:.4g}, elsewhere {others.min():.4g} to {others.max():.4g}",
-                "learners bootstrap after a truncation: this reward belongs to a terminal state",
+                "learners bootstrap after truncation, but this reward suggests a terminal state",
             )
 
 
@@ -151,9 +163,9 @@ def _time_gaps(dataset: Dataset) -> Iterator[Problem]:
     if gaps:
         index, step, longest_ns = max(gaps, key=lambda gap: gap[2])
         yield Problem(
-            f"{_count(len(gaps), 'gap')} in time, where steps are {usual_ns / 1e9:.4g} s apart",
+            f"{_count(len(gaps), 'gap')} in time; the median step is {usual_ns / 1e9:.4g} s",
             f"the longest is {longest_ns / 1e9:.4g} s, episode {index} step {step}",
-            "steps are missing or took longer: their rewards and observations are not comparable",
+            "steps are missing or took longer: their transitions are not comparable to others",
         )
 
 
@@ -161,9 +173,9 @@ def _mixed_policies(dataset: Dataset) -> Iterator[Problem]:
     policies = Counter(episode.policy or "unknown" for episode in dataset.episodes)
     if len(policies) > 1:
         yield _note(
-            f"{len(policies)} policies acted",
+            f"{len(policies)} behavior policies",
             ", ".join(f"{count} by {name}" for name, count in policies.most_common(_SHOWN)),
-            "behavior cloning learns a mixture of them",
+            "behavior cloning learns a mixture of these policies",
         )
 
 
@@ -172,7 +184,22 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
     if unknown:
         yield _note(
             f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
-            _places(dataset, lambda episode: episode.behavior_probs),
+            _places(
+                dataset, lambda episode: np.where(np.isnan(episode.behavior_probs), np.nan, 0.0)
+            ),
+            "off-policy evaluation by importance sampling is not possible",
+        )
+
+
+def _impossible_probabilities(dataset: Dataset) -> Iterator[Problem]:
+    impossible = int(is_impossible(dataset.behavior_probs).sum())
+    if impossible:
+        yield Problem(
+            f"behavior_prob is not in (0, 1] in {impossible} of {_count(len(dataset), 'step')}",
+            _places(
+                dataset,
+                lambda episode: np.where(is_impossible(episode.behavior_probs), np.nan, 0.0),
+            ),
             "off-policy evaluation by importance sampling is not possible",
         )
 
@@ -183,13 +210,14 @@ def _wrong_probabilities(dataset: Dataset) -> Iterator[Problem]:
         yield Problem(
             f"behavior_prob implies {found}",
             "all steps",
-            "off-policy evaluation weights steps by it, so its estimates are biased",
+            "off-policy estimates, which are weighted by behavior_prob, are biased",
         )
 
 
 _CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
     _not_finite,
     _out_of_range,
+    _impossible_actions,
     _duplicates,
     _time_gaps,
     _rewards,
@@ -197,6 +225,7 @@ _CHECKS: Final[tuple[Callable[[Dataset], Iterator[Problem]], ...]] = (
     _actions_never_taken,
     _mixed_policies,
     _unknown_probabilities,
+    _impossible_probabilities,
     _wrong_probabilities,
 )
 
@@ -212,7 +241,7 @@ def _frames(leaf: Leaf, episode: Episode) -> NDArray[Any]:
 
 
 def _name(dataset: Dataset, leaf: Leaf, index: int) -> str:
-    """Return the name of one number of a leaf."""
+    """Return the name of one element of a leaf."""
     names = dataset.observation_names
     return names[index] if len(names) == leaf.size else f"{leaf.name}[{index}]"
 
@@ -224,7 +253,7 @@ def _arrays(observations: Any) -> list[NDArray[Any]]:
 
 
 def _places(dataset: Dataset, column: Callable[[Episode], NDArray[Any]]) -> str:
-    """List the first steps whose numbers are not finite."""
+    """List the first steps whose values in a column are not finite."""
     found: list[str] = []
     for episode in dataset.episodes:
         values = column(episode)

@@ -1,12 +1,11 @@
-"""A Gymnasium wrapper that records a vector of environments, one whole episode after the other.
+"""A Gymnasium wrapper that records a vector environment, one whole episode after the other.
 
-The rows of each environment's open episode stay in memory until it ends; then they are written
-after the episode that ended before it, as if it had been recorded alone. The file has the same form
-as a single environment's, and simulated time continues from episode to episode. If the process is
-killed, the open episode of each environment is lost.
+The rows of each environment's open episode stay in memory until the episode ends, and are then
+written after the previously ended episode. The file has the same form as a single environment's,
+and simulated time increases from episode to episode. If the process is killed, the open episode of
+each environment is lost.
 
-No scene is recorded, because there is no single environment to show; one that repeats the seeds and
-actions has it.
+No scene is recorded: replay the seeds and actions in a single environment to get it.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.probability import check_probability, is_impossible
 from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.writing import HoldSignals
@@ -35,19 +35,18 @@ from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
 class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     """A wrapper that records every transition of a vector environment to an MCAP file.
 
-    Each finished episode is on disk when `step` returns its end, in every autoreset mode. An
-    episode that is interrupted by `reset`, `close` or an error is recorded as truncated, with the
-    reason `interrupted`. Apply this wrapper last: it does not record what wrappers outside of it
-    do.
+    An episode is on disk when the `step` that ends it returns, in every autoreset mode. An episode
+    interrupted by `reset`, `close` or an error is recorded as truncated, with the reason
+    `interrupted`. Apply this wrapper last: the effects of wrappers around it are not recorded.
 
     Attributes:
-        behavior_probs: (N,) probabilities of the next actions under the policy that chose them. Set
-            it before `step`, which resets it to NaN (unknown).
-        policy: Name of the policy, for `/rl/episode`; may be changed at any time, and each episode
+        behavior_probs: (N,) probabilities of the next actions under the behavior policy. Set them
+            before each `step`, which resets them to NaN (unknown).
+        policy: Name of the policy, for `/rl/episode`; may be changed at any time. An episode
             records the name at its start.
-        epsilon: Exploration of the policy; NaN if unknown. May be changed at any time.
-        policy_version: Number of updates of the policy so far. If it is given at the beginning,
-            `/rl/learner` records it and `epsilon` for each step, as they are when `step` is called.
+        epsilon: Exploration rate of the policy; NaN if unknown. May be changed at any time.
+        policy_version: Number of updates of the policy so far. If passed to the constructor,
+            `/rl/learner` records `policy_version` and `epsilon` at each `step`.
     """
 
     def __init__(
@@ -74,21 +73,21 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             path: File to write.
             policy: Name of the policy.
             epsilon: Probability of a random action; NaN if unknown.
-            policy_version: Number of updates of the policy so far; None leaves out `/rl/learner`.
-            seed: Seed of the recording, for the metadata.
+            policy_version: Number of updates of the policy so far; None omits `/rl/learner`.
+            seed: Seed to store in the log's metadata.
             compression: Compression of chunks: `zstd`, `lz4` or `none`.
             overwrite: Whether to replace an existing file.
-            append: Whether to continue after the last episode of an existing file, which must have
-                been recorded from an environment of the same id, arguments and spaces.
-            max_file_bytes: File size after which the next episode begins another file. `lane.mcap`
+            append: Whether to append episodes to an existing file, which must have been recorded
+                from an environment of the same id, arguments and spaces.
+            max_file_bytes: File size after which the next episode begins a new file. `lane.mcap`
                 becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
                 episodes; `mcaprl.open` reads their folder as one dataset.
             step_duration_s: Simulated seconds between two observations; default: as `RecordMcap`.
-            start_time_ns: log_time of the first record since the Unix epoch; default: now.
+            start_time_ns: log_time of the first message, since the Unix epoch; default: now.
 
         Raises:
-            SpaceError: A log cannot contain the environments' spaces.
-            UsageError: The timestamps would not increase, or the autoreset mode is unknown.
+            SpaceError: The log format does not support the environments' spaces.
+            UsageError: Timestamps would not increase, or the autoreset mode is unknown.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if not isinstance(env, gym.vector.VectorEnv):
@@ -128,10 +127,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._take_spaces()
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Number of transitions in each environment's open episode, and whether it has one.
+        # Number of transitions in each environment's open episode, and whether one is open.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
-        # Which environments reset themselves in the next step.
+        # Whether each environment resets itself in the next step.
         self._due = np.zeros(count, np.bool_)
         self._full_at = 0
 
@@ -144,7 +143,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Reset all environments, or those of `options["reset_mask"]`, and begin their episodes.
 
         Args:
-            seed: Seed of the first environment, from which the others count up; or a list of seeds.
+            seed: Seed of the first environment (environment k uses seed + k), or a list of seeds.
             options: Options of the environments.
 
         Raises:
@@ -170,13 +169,14 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step all environments and log the transitions.
 
-        The action of an environment that resets itself in this step is not taken, nor logged.
+        The action of an environment that resets itself in this step is neither taken nor logged.
 
         Raises:
             ResetNeeded: An environment has no open episode.
-            SpaceError: The actions do not fit their space, and the environments are not stepped; or
-                an observation does not fit. After an error in an environment or in its results, all
-                episodes are over and recorded up to the previous transition.
+            UsageError: One of `behavior_probs` is not in (0, 1]; the environments are not stepped.
+            SpaceError: The actions do not fit their space (the environments are not stepped), or an
+                observation does not. An error in an environment or in its results ends all
+                episodes, which are recorded up to the previous transition.
         """
         if not (self._running | self._due).all():
             idle = np.flatnonzero(~(self._running | self._due)).tolist()
@@ -205,7 +205,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return observations, rewards, terminated, truncated, infos
 
     def close(self, **kwargs: Any) -> None:
-        """Finish the log and close the environments. Closing twice is harmless."""
+        """Finish the log and close the environments; a second call has no effect."""
         try:
             with HoldSignals():
                 if not self._recording.closed:
@@ -215,7 +215,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             super().close(**kwargs)
 
     def _take_spaces(self) -> None:
-        """Prepare how values are read from observations and actions, and where they are put."""
+        """Set the functions that read observations and actions, and the buffers of the values."""
         leaves = observation_leaves(self.single_observation_space)
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
@@ -226,11 +226,15 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._action_leaf = action_leaf(self.action_space)
 
     def _act(self, actions: Any) -> None:
-        """Put the actions, before the environments can change them."""
+        """Store the actions before the environments can change them."""
         every, steps = self._every, self._steps
         probs = np.asarray(self.behavior_probs, np.float32)
         if probs.shape not in ((), steps.shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {steps.shape}")
+        # The action of an environment that resets itself is not taken.
+        for number in np.flatnonzero(is_impossible(probs) & self._running):
+            prob = float(np.broadcast_to(self.behavior_probs, steps.shape)[number])
+            check_probability(prob, f"behavior_probs[{number}]")
         self._columns.put("action", every, steps, as_declared(actions, self._action_leaf))
         self._columns.put("behavior_prob", every, steps, probs)
         self.behavior_probs = math.nan
@@ -247,7 +251,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._full_at = min(table.capacity for table in tables)
 
     def _observe(self, values: list[NDArray[Any]]) -> None:
-        """Put each environment's observation; the transition to it is complete then."""
+        """Store each environment's observation and count the transition that led to it."""
         self._put(self._every, self._steps + self._running, values)
         self._steps += self._running
 
@@ -260,7 +264,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
 
     def _begin(self, number: int, values: list[NDArray[Any]], episode: OpenEpisode) -> None:
-        """Begin an episode of one environment with its part of the observations."""
+        """Begin an episode of one environment with its observation."""
         self._put(number, 0, [value[number] for value in values])
         self._open[number], self._steps[number] = episode, 0
         self._running[number], self._due[number] = True, False
@@ -273,7 +277,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         truncated: NDArray[np.bool_],
         infos: dict[str, Any],
     ) -> None:
-        """End episodes in the order of their environments; begin the next ones if required."""
+        """End the episodes of these environments; in same-step mode, begin the next ones."""
         same_step = self._autoreset is AutoresetMode.SAME_STEP
         ended = infos.get("final_info", {}) if same_step else infos
         for number in numbers.tolist():
@@ -287,7 +291,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
                 self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
-        """Return an episode's last observation; `step` returned the next episode's first one."""
+        """Return an episode's last observation from the infos of same-step mode."""
         final = _of_env(infos, "final_obs", number)
         if final is None:
             raise SpaceError(
@@ -297,7 +301,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return [convert(final) for convert in self._converters_of_one]
 
     def _interrupt(self, numbers: NDArray[np.int64]) -> None:
-        """End unfinished episodes as truncated; one without a transition is dropped."""
+        """Record unfinished episodes as truncated, and drop those without a transition."""
         with HoldSignals():
             for number in numbers.tolist():
                 if self._running[number] and self._steps[number] and not self._recording.closed:
@@ -307,10 +311,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._display.clear()
 
     def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
-        """Write an episode after the previous one, as if it had been recorded alone."""
+        """Write an episode after the previous one."""
         recording, episode = self._recording, self._open[number]
         steps = episode.steps = int(self._steps[number])
-        # Set first, so that after an error this episode is not written a second time.
+        # Set first, so that an error does not cause a second write of this episode.
         self._running[number], self._steps[number] = False, 0
         summary = recording.summary(
             episode,
@@ -331,7 +335,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         recording.advance(summary)
 
 
-# The public path, for reprs and pickles.
+# Public import path, for reprs and pickles.
 RecordVecMcap.__module__ = "mcaprl"
 
 
@@ -342,8 +346,7 @@ def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
     except ValueError:
         known = ", ".join(mode.value for mode in AutoresetMode)
         raise UsageError(
-            f"{env} does not declare how it resets: its metadata['autoreset_mode'] is {declared!r};"
-            f" known are {known}"
+            f"metadata['autoreset_mode'] of {env} is {declared!r}; expected one of {known}"
         ) from None
 
 

@@ -1,9 +1,9 @@
 """A Gymnasium wrapper that records an environment while it runs.
 
-Row k of `/rl/step` contains observation k, the action taken there and its reward; the row after an
-episode's last transition contains its last observation and is `final`. Only the values that differ
-from row to row are stored per step; times, counters and constants are filled in as whole columns
-when a chunk is written. Rows are copies, so the environment may reuse its buffers.
+Row k of `/rl/step` contains observation k, the action taken in it and the resulting reward. The
+`final` row, after an episode's last transition, contains the last observation. Each step stores
+only the values that change; times, counters and constants are filled in as whole columns when a
+chunk is written. Values are copied, so the environment may reuse its buffers.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import gymnasium as gym
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.probability import check_probability
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
@@ -33,15 +34,15 @@ _UNKNOWN = math.nan
 class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper that records every transition of an environment to an MCAP file.
 
-    Each finished episode is on disk when `step` returns its end. An episode that is interrupted by
-    `reset`, `close` or an error is recorded as truncated, with the reason `interrupted`. Apply this
-    wrapper last: it does not record what wrappers outside of it do, such as a TimeLimit.
+    An episode is on disk when the `step` that ends it returns. An episode interrupted by `reset`,
+    `close` or an error is recorded as truncated, with the reason `interrupted`. Apply this wrapper
+    last: the effects of wrappers around it, such as a TimeLimit, are not recorded.
 
     Attributes:
-        behavior_prob: Probability of the next action under the policy that chose it. Set it before
+        behavior_prob: Probability of the next action under the behavior policy. Set it before each
             `step`, which resets it to NaN (unknown).
         policy: Name of the policy, for `/rl/episode`; may be changed between episodes.
-        epsilon: Exploration of the policy; NaN if unknown. May be changed between episodes.
+        epsilon: Exploration rate of the policy; NaN if unknown. May be changed between episodes.
     """
 
     def __init__(
@@ -64,28 +65,29 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         """Wrap `env` and create the file.
 
         Args:
-            env: Environment with a Box, Discrete, MultiDiscrete or MultiBinary action space, and
-                observations of these spaces or of a Dict of them.
+            env: Environment with a Box, Discrete, MultiDiscrete or MultiBinary action space. Its
+                observation space is one of these, or a Dict of them.
             path: File to write.
             policy: Name of the policy.
             epsilon: Probability of a random action; NaN if unknown.
-            seed: Seed of the recording, for the metadata.
+            seed: Seed to store in the log's metadata.
             compression: Compression of chunks: `zstd`, `lz4` or `none`.
             overwrite: Whether to replace an existing file.
-            append: Whether to continue after the last episode of an existing file, which must have
-                been recorded from an environment of the same id, arguments and spaces.
-            max_file_bytes: File size after which the next episode begins another file. `lane.mcap`
+            append: Whether to append episodes to an existing file, which must have been recorded
+                from an environment of the same id, arguments and spaces.
+            max_file_bytes: File size after which the next episode begins a new file. `lane.mcap`
                 becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
                 episodes; `mcaprl.open` reads their folder as one dataset.
-            scene: Whether to record what viewers show, where the environment describes it.
-            camera: Whether to record the environment's metric depth image as well.
+            scene: Whether to record shapes, frames and telemetry for viewers, if the environment
+                provides them.
+            camera: Whether to record the environment's metric depth image.
             step_duration_s: Simulated seconds between two observations; default: the environment's
-                `step_duration_s`, or one over its `render_fps`, or 0.1.
-            start_time_ns: log_time of the first record since the Unix epoch; default: now.
+                `step_duration_s`, else 1 / `render_fps`, else 0.1.
+            start_time_ns: log_time of the first message, since the Unix epoch; default: now.
 
         Raises:
-            SpaceError: A log cannot contain the environment's spaces.
-            UsageError: The timestamps would not increase.
+            SpaceError: The log format does not support the environment's spaces.
+            UsageError: Timestamps would not increase.
             OutputExistsError, LogError: The file cannot be created or appended to.
         """
         if isinstance(env, gym.vector.VectorEnv):
@@ -113,7 +115,6 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         log = self._recording.log
         self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
         self._columns = columns = StepColumns(log)
-        # Looked up at each step.
         self._shows_steps = self._display.shows_steps
         self._take_action, self._store_reward = columns.take_action, columns.store_reward
         images = {
@@ -151,16 +152,19 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             ResetNeeded: No episode is open.
-            SpaceError: The action does not fit its space, and the environment is not stepped; or
-                the observation does not fit. After an error in the environment or in its results,
-                the episode is over and recorded up to the previous transition.
+            UsageError: `behavior_prob` is not in (0, 1]; the environment is not stepped.
+            SpaceError: The action does not fit its space (the environment is not stepped), or the
+                observation does not. An error in the environment or in its results ends the
+                episode, which is recorded up to the previous transition.
         """
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
+        if self.behavior_prob is not _UNKNOWN:
+            check_probability(self.behavior_prob, "behavior_prob")
         try:
-            # Copied before the environment can change it.
+            # Copy the action before the environment can change it.
             try:
                 self._take_action(action)
             except (TypeError, OverflowError):
@@ -201,7 +205,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Finish the log and close the environment. Closing twice is harmless."""
+        """Finish the log and close the environment; a second call has no effect."""
         try:
             with HoldSignals():
                 if not self._recording.closed:
@@ -231,18 +235,18 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._full_at = self._next_full()
 
     def _next_full(self) -> int:
-        """Return the first step whose observation has no room."""
+        """Return the first step whose observation does not fit the buffers."""
         return min([self._columns.full_at, *(image.full_at for image in self._images)])
 
     def _count(self, episode: OpenEpisode, step: int, reward: float) -> None:
         if self._shows_steps:
             self._display.observe(step, reward)
-        # From here on the step counts.
         episode.steps = step
 
     def _interrupt(self) -> None:
-        """End an unfinished episode as truncated; one without a transition is dropped."""
-        if self._open is not None and self._open.steps > 0:
+        """Record an unfinished episode as truncated, or drop it if it has no transition."""
+        # After a write error the log is closed and contains the finished episodes.
+        if self._open is not None and self._open.steps > 0 and not self._recording.closed:
             with HoldSignals():
                 self._end(False, True, INTERRUPTED)
         self._display.clear()
@@ -251,7 +255,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     def _end(self, terminated: bool, truncated: bool, reason: str) -> None:
         episode = self._open
         assert episode is not None
-        # Set first, so that after an error this episode is not written a second time.
+        # Set first, so that an error does not cause a second write of this episode.
         self._open = None
         summary = self._recording.summary(
             episode,
@@ -268,5 +272,5 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._recording.advance(summary)
 
 
-# The public path, for reprs and pickles.
+# Public import path, for reprs and pickles.
 RecordMcap.__module__ = "mcaprl"

@@ -77,6 +77,17 @@ def test_mean_weights_by_hand() -> None:
     assert mean_weight("WIS", BY_HAND) is None
 
 
+def test_one_huge_late_weight_leaves_one_effective_episode_without_normalization() -> None:
+    """At gamma 1/2, the last of 21 steps has a discount of 1e-6."""
+    shape = (50, 21)
+    ratios = np.ones(shape)
+    ratios[0, -1] = 1e30
+    table = EpisodeTable(np.ones(shape), ratios, np.zeros(shape), np.zeros(shape), 0.5)
+    assert effective_sample_size("WPDIS", table) > 49
+    for name in ("PDIS", "DR", "TIS"):
+        assert effective_sample_size(name, table) == pytest.approx(1.0)
+
+
 def test_zero_weights_have_an_effective_sample_size_of_zero() -> None:
     never = EpisodeTable(BY_HAND.rewards, 0 * BY_HAND.ratios, 0 * BY_HAND.q, 0 * BY_HAND.v, 0.5)
     assert effective_sample_size("TIS", never) == 0.0

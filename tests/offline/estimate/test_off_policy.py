@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from mcaprl.offline.estimate.off_policy import (
     Estimate,
     OffPolicyEvaluator,
     PolicyEstimates,
+    ranking,
 )
 from mcaprl.recorder.dataset.dataset import Dataset
 from tests.support import two_state_task as task
@@ -104,8 +106,8 @@ def test_every_estimator_converges_to_the_true_value() -> None:
     evaluated = evaluator.evaluate(Table(task.EVALUATED), "better")
     found = by_name(evaluated)
     assert list(found) == ["FQE", *ESTIMATORS]
-    for estimate in found.values():
-        assert estimate.trusted
+    for name, estimate in found.items():
+        assert estimate.trusted == (name != "FQE")
         assert estimate.value == pytest.approx(task.true_value(), rel=0.12)
     assert 0.4 < evaluated.coverage < 0.65, "the policy's probabilities are .35 to .65"
     widths = {
@@ -162,6 +164,78 @@ def test_unknown_probabilities_leave_only_the_model_estimate() -> None:
         assert found[name].verdict == (
             f"refused: behavior_prob of 5 of {len(data)} steps is unknown"
         )
+
+
+def test_the_model_estimate_has_no_interval_and_is_never_trusted() -> None:
+    evaluator = OffPolicyEvaluator(log(400), FAST)
+    policies = {"better": task.EVALUATED, "behavior": task.BEHAVIOR}
+    found = [
+        estimate
+        for name, table in policies.items()
+        for estimate in evaluator.evaluate(Table(table), name).estimates
+    ]
+    for estimate in found[:: len(ESTIMATORS) + 1]:
+        assert estimate.estimator == "FQE"
+        assert estimate.value is not None
+        assert estimate.interval is None
+        assert estimate.verdict.startswith("no interval: the error of the model")
+    assert ranking(found)["estimator"] == "WDR"
+    refused = [
+        estimate if estimate.estimator == "FQE" else replace(estimate, verdict="refused: test")
+        for estimate in found
+    ]
+    assert ranking(refused) == {
+        "estimator": "FQE",
+        "policies": ["better", "behavior"],
+        "trusted": False,
+    }
+
+
+@pytest.mark.parametrize("prob", [-0.5, 0.0, 2.0, math.inf])
+def test_impossible_probabilities_are_refused(prob: float) -> None:
+    data = log(60)
+    data.behavior_probs[3:5] = prob
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(None, "random"))
+    for name in ESTIMATORS:
+        assert (found[name].value, found[name].interval) == (None, None)
+        assert found[name].verdict == (
+            f"refused: behavior_prob of 2 of {len(data)} steps is not in (0, 1]"
+        )
+
+
+@pytest.mark.parametrize("steps", [slice(None), slice(7, 8), slice(None, None, 20)])
+def test_tiny_probabilities_have_finite_values_and_no_verdict(steps: slice) -> None:
+    data = log(300)
+    data.behavior_probs[steps] = 1e-38
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(None, "random"))
+    for name in ESTIMATORS:
+        assert not found[name].trusted
+        assert found[name].value is None or math.isfinite(found[name].value)
+        assert found[name].interval is None or np.isfinite(found[name].interval).all()
+
+
+def test_weights_that_overflow_are_refused() -> None:
+    steps = 400
+    data = Dataset.from_arrays(
+        observations=np.zeros((2 * steps, 1), np.float32),
+        actions=np.arange(2 * steps) % 10,
+        rewards=np.ones(2 * steps),
+        terminated=np.arange(2 * steps) % steps == steps - 1,
+        truncated=np.zeros(2 * steps, np.bool_),
+        next_observations=np.zeros((2 * steps, 1), np.float32),
+        behavior_probs=np.full(2 * steps, 0.1),
+        action_space=spaces.Discrete(10),
+    )
+
+    class Follows:
+        """A policy that always takes the logged action."""
+
+        def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
+            return np.eye(10)[np.arange(len(observations)) % 10]
+
+    found = by_name(OffPolicyEvaluator(data, NO_MODEL).evaluate(Follows(), "follows"))
+    for name in ESTIMATORS:
+        assert found[name].verdict == "refused: an importance weight is inf, above 1e+100"
 
 
 def test_too_few_target_syncs_refuse_the_verdict() -> None:

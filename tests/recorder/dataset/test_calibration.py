@@ -64,7 +64,19 @@ def test_probabilities_that_are_too_small_are_a_problem() -> None:
     assert "4.00 +- 0.00 actions; the action space has 2, so" in problems[0].what
 
 
+@pytest.mark.parametrize("tiny", [1, 12, 400])
+def test_a_probability_too_small_to_be_drawn_is_a_problem(tiny: int) -> None:
+    """The standard error of 12 huge inverses is as large as their mean."""
+    probs = np.full(400, 0.5)
+    probs[:tiny] = 1e-38
+    found = calibration(probs, spaces.Discrete(2))
+    assert found is not None
+    assert not found.possible
+    assert str(found).endswith("so the logged probabilities are too small (down to 1e-38)")
+
+
 def test_continuous_or_unknown_probabilities_have_no_calibration() -> None:
     assert calibration(np.array([0.5, math.nan]), spaces.Discrete(2)) is None
-    assert calibration(np.array([0.5, 0.0]), spaces.Discrete(2)) is None
+    for prob in (0.0, -0.5, 2.0, math.inf):
+        assert calibration(np.array([0.5, prob]), spaces.Discrete(2)) is None
     assert calibration(np.array([0.5, 0.5]), spaces.Box(-1, 1, (1,))) is None

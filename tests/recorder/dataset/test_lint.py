@@ -67,7 +67,7 @@ def test_a_valid_dataset_has_no_findings() -> None:
         (
             changed("next_observations", (5, 1), 1.5),
             "problem",
-            "1 number of observation leave their space (observation[1] is 0.07143 to 1.5, its"
+            "1 element of observation outside its space (observation[1] is 0.07143 to 1.5, its"
             " space 0 to 1)",
         ),
         ({"rewards": np.zeros(6)}, "problem", "every reward is 0 (all steps)"),
@@ -91,11 +91,19 @@ def test_a_valid_dataset_has_no_findings() -> None:
             "note",
             "behavior_prob is unknown in 1 of 6 steps (episode 1 step 0)",
         ),
+        *(
+            (
+                changed("behavior_probs", 4, prob),
+                "problem",
+                "behavior_prob is not in (0, 1] in 1 of 6 steps (episode 1 step 1)",
+            )
+            for prob in (-0.5, 0.0, 2.0, math.inf)
+        ),
         (
             {name: np.array(getattr(dataset(), name)) * [0, 1] for name in ("observations",)}
             | {"next_observations": np.array(dataset().next_observations) * [0, 1]},
             "note",
-            "1 number of observation never change (observation[0])",
+            "1 element of observation never change (observation[0])",
         ),
     ],
 )
@@ -109,7 +117,7 @@ def test_repeated_episodes_are_named() -> None:
     twice = Dataset.concatenate([dataset(), dataset()])
     [finding] = lint(twice)
     assert str(finding).startswith(
-        "2 episodes repeat others, step by step (episodes 0, 2; episodes 1, 3)"
+        "2 episodes are duplicates of others (episodes 0, 2; episodes 1, 3)"
     )
 
 
@@ -126,7 +134,7 @@ def test_gaps_in_time_are_measured_in_usual_steps() -> None:
     gappy.episodes[1].log_time_ns[2:] += 400_000_000
     [finding] = lint(gappy)
     assert str(finding).startswith(
-        "1 gap in time, where steps are 0.1 s apart (the longest is 0.5 s, episode 1 step 1)"
+        "1 gap in time; the median step is 0.1 s (the longest is 0.5 s, episode 1 step 1)"
     )
 
 
@@ -141,4 +149,4 @@ def test_several_policies_are_reported(tmp_path: Path) -> None:
             ended = recorder.step(int(policy == "one"))[2]
     recorder.close()
     found = [str(finding) for finding in lint(mcaprl.open(tmp_path / "mixed.mcap"))]
-    assert any("2 policies acted (1 by one, 1 by other)" in text for text in found)
+    assert any("2 behavior policies (1 by one, 1 by other)" in text for text in found)

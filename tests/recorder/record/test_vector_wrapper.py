@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -271,7 +272,7 @@ def test_invalid_arguments_are_refused(log_path: Path) -> None:
         mcaprl.RecordVecMcap(gym.make("CartPole-v1"), log_path)  # type: ignore[arg-type]
     silent = cartpoles(2)
     silent.metadata = {}
-    with pytest.raises(UsageError, match="does not declare how it resets"):
+    with pytest.raises(UsageError, match="expected one of"):
         mcaprl.RecordVecMcap(silent, log_path)
     assert not log_path.exists()
     env = mcaprl.RecordVecMcap(cartpoles(2), log_path)
@@ -281,6 +282,12 @@ def test_invalid_arguments_are_refused(log_path: Path) -> None:
     env.behavior_probs = np.ones(3)
     with pytest.raises(SpaceError, match=r"behavior_probs has shape \(3,\), expected \(2,\)"):
         env.step(np.zeros(2, np.int64))
+    for probs, name in (((0.5, -0.5), "behavior_probs[1] -0.5"), (2, "behavior_probs[0] 2")):
+        env.behavior_probs = probs
+        with pytest.raises(UsageError, match=re.escape(f"{name} is not the probability")):
+            env.step(np.zeros(2, np.int64))
+    env.behavior_probs = (math.nan, 1.0)
+    env.step(np.zeros(2, np.int64))
     env.close()
     with pytest.raises(UsageError, match="closed"):
         env.reset()

@@ -44,6 +44,21 @@ ONE = [
 ]
 
 
+@pytest.mark.parametrize("prob", [-0.5, 0.0, 1e-60, 1.5, math.inf])
+def test_impossible_probabilities_are_refused_before_the_step(prob: float, log_path: Path) -> None:
+    with closing(mcaprl.RecordMcap(scripted(ONE), log_path)) as env:
+        env.reset()
+        env.behavior_prob = prob
+        with pytest.raises(UsageError, match=f"behavior_prob {prob:g} is not the probability"):
+            env.step(2)
+        env.behavior_prob = 1 + 1e-7
+        env.step(1)
+        env.step(0)
+    (episode,) = mcaprl.open(log_path).episodes
+    assert episode.actions.tolist() == [1, 0]
+    assert episode.behavior_probs[0] == pytest.approx(1.0)
+
+
 def test_columns_by_hand(log_path: Path) -> None:
     with closing(mcaprl.RecordMcap(scripted(ONE, ONE), log_path, policy="me", epsilon=0.5)) as env:
         env.reset(seed=7)
@@ -190,7 +205,7 @@ def test_episode_ends_before_an_exception(log_path: Path) -> None:
 def test_another_dtype_is_cast_with_one_warning(log_path: Path) -> None:
     rows = [(np.array([0.1, 0.2]), 0.0, False, False), (two(1, 2), 1.0, True, False)]
     env = mcaprl.RecordMcap(scripted(rows), log_path)
-    with pytest.warns(UserWarning, match="observation is float64, its space declares float32"):
+    with pytest.warns(UserWarning, match="converted to its space's float32"):
         env.reset()
     env.step(0)
     env.close()
@@ -263,7 +278,7 @@ def test_the_policy_name_is_read_at_the_episodes_start(log_path: Path) -> None:
 
 @pytest.mark.parametrize("options", [{"step_duration_s": 0.0}, {"start_time_ns": -5}])
 def test_log_times_must_increase(log_path: Path, options: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match="timestamps must increase"):
+    with pytest.raises(UsageError, match="the step must be positive"):
         mcaprl.RecordMcap(scripted(ONE), log_path, **options)
     assert not log_path.exists()
 

@@ -1,0 +1,38 @@
+"""Range of `behavior_prob`, the probability of an action that was taken."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+
+SMALLEST: Final = float(np.finfo(np.float32).smallest_subnormal)
+"""Smallest probability that a log holds as a number above 0."""
+LARGEST: Final = 1 + 1e-6
+"""Largest probability, with the rounding errors of a softmax."""
+
+
+def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return where numbers are not within (0, 1]; NaN means unknown, which is possible."""
+    found: NDArray[np.bool_] = ~(np.isnan(probs) | ((probs >= SMALLEST) & (probs <= LARGEST)))
+    return found
+
+
+def check_probability(prob: float, name: str) -> None:
+    """Check one probability.
+
+    Args:
+        prob: Probability, or NaN.
+        name: Name in the message.
+
+    Raises:
+        UsageError: The number is not within (0, 1].
+    """
+    if not (SMALLEST <= prob <= LARGEST or prob != prob):
+        raise UsageError(
+            f"{name} {prob:g} is not the probability of an action that was taken: give a number"
+            " above 0 and up to 1, or NaN if it is unknown"
+        )
