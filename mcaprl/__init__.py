@@ -1,13 +1,13 @@
-"""The robot's log is the dataset: record, learn from and replay MCAP files.
+"""Record reinforcement learning episodes as MCAP logs, learn from logs, and replay them.
 
     env = mcaprl.RecordMcap(gym.make("mcaprl/LaneKeeping-v0"), "lane.mcap")   # records each step
     data = mcaprl.open("lane.mcap")                                           # arrays and episodes
-    mcaprl.train(data, "runs/cql")                                            # a policy from them
-    policy = mcaprl.load_policy("runs/cql")                                   # a trained policy
+    mcaprl.train(data, "runs/cql")                                            # trained policy
+    policy = mcaprl.load_policy("runs/cql")                                   # loaded policy
 
-Each command of the program has a function of its name here (`train-offline` is `train`; `evaluate
---data` is `estimate`; `replay` is also `verify` and `render`). Importing this package loads neither
-torch nor numba; a function imports what it needs when it is called.
+Each command of the program has a function of the same name (but `train-offline` is `train`,
+`evaluate --data` is `estimate`, and `replay` is also `verify` and `render`). Importing this package
+does not import torch or numba; functions import them when called.
 """
 
 from typing import TYPE_CHECKING
@@ -66,7 +66,7 @@ __all__ = [
     "verify",
 ]
 
-# Imported on first use, because they load the log writer or an engine.
+# Imported on first use, because they import the log writer, torch or numba.
 _COMMANDS = (
     "annotate check estimate evaluate export info layout record recover render replay train"
     " train_online verify"

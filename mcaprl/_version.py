@@ -1,3 +1,3 @@
-"""The version, in one place: the package, its logs and its checkpoints all quote it."""
+"""Version of the package, also stored in logs and checkpoints."""
 
 __version__ = "0.1.0"

@@ -1,14 +1,14 @@
-"""All errors that a user can meet. A message says what is wrong, where, and what to do.
+"""Errors caused by data or a request of the user. Messages state the problem, place and remedy.
 
 McaprlError
 ├── UsageError            the request is invalid                       (exit code 2)
 │   ├── UnknownNameError    a sim, policy, observation... is unknown
 │   ├── OutputExistsError   the output path exists
 │   └── MissingExtraError   an optional dependency is not installed
-├── LogError              a log cannot be read or written as asked     (exit code 1)
+├── LogError              a log cannot be read or written              (exit code 1)
 │   ├── NotMcapError        the file is not an MCAP file
 │   ├── NoStepsError        the file has no `/rl/step` topic, or no finished episode
-│   │   └── NoEpisodesError   it has the topic, but no finished episode
+│   │   └── NoEpisodesError   the file has the topic, but no finished episode
 │   └── CorruptLogError     the file is damaged
 ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
 ├── PolicyError           a saved policy cannot be used                (exit code 1)
@@ -58,7 +58,7 @@ class UnknownNameError(UsageError):
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
-        """Return the arguments to pickle: the message alone is not enough."""
+        """Return the constructor arguments for pickle; the message does not suffice."""
         return type(self), self._arguments
 
 
@@ -71,7 +71,7 @@ class MissingExtraError(UsageError):
 
 
 class LogError(McaprlError):
-    """A log cannot be read or written as asked."""
+    """A log cannot be read or written."""
 
 
 class NotMcapError(LogError):
@@ -111,10 +111,10 @@ def import_extra(module: str, extra: str) -> ModuleType:
 
     Args:
         module: Import name of the module, such as `"torch"`.
-        extra: Extra of `mcaprl` that installs it, such as `"offline"`.
+        extra: Extra of `mcaprl` that installs the module, such as `"offline"`.
 
     Raises:
-        MissingExtraError: It is not installed; the message has the pip command that installs it.
+        MissingExtraError: The module is not installed; the message has the pip command.
     """
     try:
         return importlib.import_module(module)

@@ -51,10 +51,12 @@ def try_lock(descriptor: int) -> bool:
 def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Iterator[None]:
     """Create a folder if it is missing, and lock it against other writers.
 
+    If the folder is new and empty at the end, it is removed.
+
     Raises:
         McaprlError: Another process is writing to the folder, or it cannot be created.
     """
-    descriptor = -1
+    descriptor, is_new = -1, not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if sys.platform != "win32":
@@ -67,7 +69,12 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
                 f"{folder} is in use by another recording or training: wait until it ends, or"
                 " choose another folder"
             )
-        yield
+        try:
+            yield
+        finally:
+            if is_new:
+                with suppress(OSError):
+                    folder.rmdir()
     finally:
         if descriptor >= 0:
             os.close(descriptor)

@@ -1,6 +1,6 @@
 """Offline learning from logs: DQN, Double DQN, CQL, BC, BCQ and IQL for discrete actions.
 
-Importing this package loads no torch; a name of it does when it is first used.
+Importing this package does not import torch; the first use of one of its names does.
 
     import mcaprl
 

@@ -3,7 +3,7 @@
 Inputs are the parts of the observation as the environment returns them, named as in `/rl/step`
 (`observation`, `camera`, ...), with a leading batch axis; a policy with frame stacks of k expects
 (B, k, *shape), oldest first. Outputs are `action` (B,) int64, a value of the action space, and
-`scores` (B, A), whose largest selects the action. The file includes the normalization.
+`scores` (B, A); the action has the largest score. The file includes the normalization.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mcaprl.offline.policy import Policy
 
 
 class ExportedPolicy(nn.Module):
-    """Policy as a module with plain tensors as inputs and outputs, for exporters."""
+    """Policy as an `nn.Module` whose inputs and outputs are plain tensors."""
 
     def __init__(self, policy: Policy) -> None:
         """Wrap a policy's networks and normalization."""
@@ -44,7 +44,7 @@ class ExportedPolicy(nn.Module):
         return [leaf.name for leaf in self.encoder.leaves]
 
     def examples(self, batch_size: int, seed: int = 0) -> tuple[Tensor, ...]:
-        """Return arguments for `forward` from random observations."""
+        """Return random observations as arguments of `forward`."""
         space = self.encoder.space
         space.seed(seed)
         stack = (self.frame_stack,) if self.frame_stack > 1 else ()
@@ -68,7 +68,7 @@ class ExportedPolicy(nn.Module):
         return scores.argmax(1) + self.first_action, scores
 
     def _encode(self, inputs: tuple[Tensor, ...]) -> Observations:
-        """Do what `ObservationEncoder.encode` does, in torch."""
+        """Encode observations in torch as `ObservationEncoder.encode` does in NumPy."""
         encoder, rows = self.encoder, inputs[0].shape[0]
         n_images = len(encoder.images)
         shaped = zip(inputs[:n_images], encoder.image_inputs, strict=True)
@@ -128,7 +128,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
-    """Return the numbers (B, width) of a part of the space: counters as one-hot codes."""
+    """Return a part of the space as numbers (B, width); discrete values are one-hot encoded."""
     flat = values.reshape(values.shape[0], -1)
     sizes = discrete_sizes(space)
     if sizes is None:

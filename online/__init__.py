@@ -1,6 +1,6 @@
 """Online learning with recording: DQN, Double DQN, PPO and A2C of Stable-Baselines3.
 
-Importing this package loads no torch; a name of it does when it is first used.
+Importing this package does not import torch; the first use of one of its names does.
 
     import mcaprl
 

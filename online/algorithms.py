@@ -1,4 +1,4 @@
-"""Algorithms by name: their settings, and the classes of Stable-Baselines3 that implement them."""
+"""Algorithms by name: their settings, and their classes of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from mcaprl.online.frames import parts_of_space
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm.
+    """Classes of an algorithm.
 
     Attributes:
         config_type: Dataclass of its settings.
-        model_type: Class of SB3.
+        model_type: SB3 class of its model.
     """
 
     config_type: type[OnlineConfig]
@@ -66,7 +66,7 @@ def check_spaces(
 
     Raises:
         UnknownNameError: No algorithm has that name.
-        SpaceError: The algorithm does not support them.
+        SpaceError: The algorithm does not support the spaces.
     """
     find_algorithm(algo)
     if not isinstance(action_space, spaces.Discrete):
@@ -77,7 +77,7 @@ def check_spaces(
 
 
 def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseAlgorithm:
-    """Create an algorithm with new weights, and seed Python, NumPy and torch."""
+    """Create a model with new weights, and seed Python, NumPy and torch."""
     algorithm = find_algorithm(algo)
     last_rate = config.learning_rate * config.final_learning_rate_fraction
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
@@ -95,7 +95,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         **_arguments(config, env.observation_space),
     )
     if _has_images(env.observation_space):
-        # The same convolutions in three quarters of the time; files and results do not change.
+        # Convolutions take 25 % less time in this format; files and results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
         if config.center_images:
             center_images(cast(Any, model.policy))
@@ -110,7 +110,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
 
 
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return SB3's arguments, with a buffer that stores each frame once for images and stacks."""
+    """Return SB3's arguments; for images and stacks, the buffer stores each frame once."""
     arguments = config.arguments()
     if isinstance(config, DQNConfig) and (config.frame_stack > 1 or _has_images(space)):
         extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
@@ -125,7 +125,7 @@ def _has_images(space: spaces.Space[Any]) -> bool:
 
 @dataclass(frozen=True)
 class ExponentialSchedule:
-    """An exponential decay per step to a last value, as a function of the progress remaining."""
+    """Exponential decay per step down to `last`, as a function of the remaining progress."""
 
     first: float
     last: float

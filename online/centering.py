@@ -24,7 +24,7 @@ _MIDDLE = 0.5
 
 
 def center_images(policy: nn.Module) -> None:
-    """Center the input of the first convolution of each image from now on."""
+    """Center the input of the first convolution of each image."""
     for convolution in _first_convolutions(policy):
         convolution.register_forward_pre_hook(_centered)
 

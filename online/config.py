@@ -23,22 +23,22 @@ class OnlineConfig(Settings):
     """number of environments stepped at once, in this process"""
     learning_rate: float = 1e-4
     gamma: float = 0.99
-    """discount of the reward one step later"""
+    """discount per step"""
     hidden: tuple[int, ...] = (64, 64)
     center_images: bool = False
     """scale the input of the first convolution to [-2, 2] instead of [0, 1]"""
     max_grad_norm: float = 10.0
-    """norm to which longer gradients are clipped"""
+    """maximum norm of the gradient"""
     eval_interval: int = 5_000
     """environment steps between two evaluations"""
     eval_episodes: int = 30
     """episodes of one evaluation, the same each time, in a separate environment"""
     checkpoint_interval: int = 20_000
     final_episodes: int = 100
-    """episodes of the final score of the best checkpoint, not used to select it"""
+    """new episodes for the final score of the best checkpoint"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         self._require_positive("steps", "envs", "eval_interval", "eval_episodes")
         self._require("max_grad_norm", self.max_grad_norm > 0, "above 0")
@@ -56,7 +56,7 @@ class DQNConfig(OnlineConfig):
     batch_size: int = 32
     """transitions in one gradient step"""
     buffer_size: int = 1_000_000
-    """capacity of the replay buffer in transitions; never more than there are steps"""
+    """capacity of the replay buffer in transitions, capped at the number of steps"""
     learning_starts: int = 100
     """random steps before the first gradient step"""
     steps_per_update: int = 4
@@ -64,9 +64,9 @@ class DQNConfig(OnlineConfig):
     target_update_interval: int = 10_000
     """environment steps between two updates of the target network"""
     target_update_episodes: int = 0
-    """episodes between two updates of the target network, instead of steps; 0 counts steps"""
+    """episodes between two updates of the target network; 0 counts steps instead"""
     n_steps: int = 1
-    """number of rewards in a target before the value of the state that follows"""
+    """number of rewards in a target before the bootstrap value"""
     exploration_fraction: float = 0.1
     """fraction of the training during which epsilon falls linearly to its final value"""
     exploration_initial_eps: float = 1.0
@@ -74,10 +74,10 @@ class DQNConfig(OnlineConfig):
     exploration_final_eps: float = 0.05
     """epsilon at the end"""
     exploration_decay: float = 0.0
-    """factor on epsilon at each step, instead of the linear decay; 0 is the linear decay"""
+    """factor on epsilon at each step; 0 selects the linear decay"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         self._require_positive(
             "batch_size", "steps_per_update", "target_update_interval", "n_steps"
@@ -107,7 +107,7 @@ class DQNConfig(OnlineConfig):
             # Never reached: episodes are counted instead.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
-            # SB3 counts calls of `step`, each of which is a step of every environment.
+            # SB3 counts calls of `step`; each call steps every environment.
             "train_freq": max(1, self.steps_per_update // self.envs),
             "gradient_steps": max(1, self.envs // self.steps_per_update),
         }
@@ -126,12 +126,12 @@ class RolloutConfig(OnlineConfig):
     rollout_steps: int = 40
     """environment steps, summed over all environments, between two rounds of updates"""
     gae_lambda: float = 1.0
-    """lambda of the advantages: 0 uses one step, 1 the whole return"""
+    """lambda of GAE; 0 uses one step, 1 the whole return"""
     entropy_coefficient: float = 0.0
     """weight of the policy's entropy in the loss"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         whole = self.rollout_steps >= self.envs and self.rollout_steps % self.envs == 0
         self._require("rollout_steps", whole, f"a multiple of envs ({self.envs})")
@@ -158,10 +158,10 @@ class PPOConfig(RolloutConfig):
     epochs: int = 10
     """passes over each rollout"""
     clip_range: float = 0.2
-    """largest relative change of an action's probability in one round"""
+    """maximum relative change of an action's probability in one round"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         self._require_positive("batch_size", "epochs")
         enough = self.rollout_steps >= 2 * self.envs

@@ -22,9 +22,9 @@ class WarmDQN(DQN):
     """SB3's DQN with an option for pretrained weights.
 
     Attributes:
-        skips_random_steps: Whether the policy, rather than random actions, takes the steps before
-            learning starts. A policy that learns from few steps unlearns its pretraining
-            (https://arxiv.org/abs/2412.07762), so it fills the buffer first.
+        skips_random_steps: Whether the policy, instead of random actions, fills the buffer before
+            learning starts. Learning from too few steps destroys the pretraining
+            (https://arxiv.org/abs/2412.07762).
     """
 
     skips_random_steps = False
@@ -37,7 +37,7 @@ class WarmDQN(DQN):
 
 
 class DoubleDQN(WarmDQN):
-    """SB3's DQN with another target; its `.zip` files load as `DQN` as well."""
+    """SB3's DQN with the Double DQN target; its `.zip` files also load as `DQN`."""
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Run gradient steps on batches from the replay buffer."""

@@ -27,7 +27,7 @@ FRESH_SEED: Final = 1_000_000
 
 @dataclass(frozen=True)
 class Scale:
-    """The mean returns of random actions and of the sim's pilot on the same episodes.
+    """Mean returns of random actions and of the sim's pilot on the same episodes.
 
     Attributes:
         random: Mean return of random actions.
@@ -38,7 +38,7 @@ class Scale:
     pilot: float
 
     def score(self, mean_return: float) -> float:
-        """Return 0 for random, 1 for the pilot; NaN without a pilot."""
+        """Return the score of a mean return: 0 for random, 1 for the pilot; NaN without a pilot."""
         span = self.pilot - self.random
         return (mean_return - self.random) / span if span else math.nan
 
@@ -149,10 +149,10 @@ class _Step(NamedTuple):
 
 
 class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
-    """A recorder of each environment's first episode since the last reset.
+    """Recorder of each environment's first episode since the last reset.
 
-    The environments reset themselves in the step that ends an episode. While the longest first
-    episode continues, others begin their second; those would overrepresent short episodes.
+    Environments reset themselves in the step that ends an episode. Their later episodes are not
+    recorded, because they would overrepresent short episodes.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], env_id: str) -> None:
@@ -195,7 +195,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return result
 
     def dataset(self) -> Dataset:
-        """Return the episodes of a greedy policy, in the order of their environments."""
+        """Return the episodes by environment, with behavior probability 1 (greedy policy)."""
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
         columns = {

@@ -1,9 +1,9 @@
-"""A replay buffer that stores each image once, with n-step returns for any observations.
+"""Replay buffer that stores each image once, with n-step returns for any observations.
 
-SB3's buffers store every observation twice, as the next one of a step and as the first one of the
-step that follows: 7 GB for 500,000 depth images of 84x84. Here the next observation is that of the
-following row; only the last observation of an episode is stored separately. Each frame of stacked
-observations is stored once, too.
+SB3's buffers store every observation twice, as the next observation of one step and the observation
+of the following step: 7 GB for 500,000 depth images of 84x84. Here the next observation is that of
+the following row; only the last observation of an episode is stored separately. Each frame of
+stacked observations is also stored once.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _COLUMNS = ("final_of", "ages", "actions", "rewards", "dones", "timeouts")
 class FrameReplayBuffer(BaseBuffer):
     """SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer` in half the memory.
 
-    R rows of N environments; a row's step follows the step of the previous row. *shape is that of a
-    single frame. Overwritten frames before the oldest step are replaced by copies of that frame.
+    The buffer has R rows, each with one step of N environments. *shape is the shape of a single
+    frame. In stacks, copies of the oldest stored frame replace overwritten frames.
 
     Attributes:
-        frames: Observations (R, N, *shape) by key; the key of observations without keys is "".
-        newest: Observations (N, *shape) by key after the last row.
-        finals: Last observations (F, *shape) of episodes by key.
+        frames: Observations (R, N, *shape) by key; "" is the key of observations without keys.
+        newest: Observations (N, *shape) after the last row, by key.
+        finals: Last observations (F, *shape) of episodes, by key.
         final_of: (R, N) indices into `finals`; -1 where the episode continued.
         ages: (R, N) numbers of earlier frames in the episode, at most `frame_stack`.
         actions: (R, N, 1) actions.
@@ -62,10 +62,10 @@ class FrameReplayBuffer(BaseBuffer):
             observation_space: Space of the network's observations.
             action_space: Discrete action space.
             device: Device of the batches.
-            n_envs: N.
-            optimize_memory_usage: Ignored; SB3 passes it.
+            n_envs: Number N of environments.
+            optimize_memory_usage: Ignored argument of SB3.
             n_steps: Number of rewards in a return.
-            gamma: Discount of the reward one step later.
+            gamma: Discount per step.
             frame_stack: k, the number of successive frames in an observation.
         """
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
@@ -155,7 +155,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._free.pop()
 
     def _get_samples(self, batch_inds: NDArray[Any], env: VecNormalize | None = None) -> Any:
-        """Return batches of rows, each of a random environment, with SB3's random draws."""
+        """Return transitions of rows, each of a random environment drawn as in SB3."""
         assert env is None
         envs = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         rows, returns, discounts = self._look_ahead(batch_inds, envs)

@@ -1,7 +1,7 @@
-"""Frame stacking: several successive observations as one, to make speeds visible, for example.
+"""Frame stacking: several successive observations as one, for example to show velocities.
 
 The order is oldest first, along the channels of images and along the last axis of other arrays, as
-in `offline/`. Missing frames before an episode's first observation are copies of it.
+in `offline/`. Frames before an episode's first observation are copies of that observation.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ WHOLE = ""
 
 
 def parts_of_space(space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return the parts of a Dict space by key; any other space is its own only part."""
+    """Return the parts of a Dict space by key; any other space is a single part."""
     return dict(space.items()) if isinstance(space, spaces.Dict) else {WHOLE: space}
 
 
@@ -67,7 +67,7 @@ def joined(frames: Any, space: spaces.Space[Any]) -> Any:
 
 
 class FrameMemory:
-    """The last k observations of each of B episodes.
+    """Last k observations of each of B episodes.
 
     Attributes:
         space: Space of a single observation.
@@ -97,7 +97,7 @@ class FrameMemory:
         return self.stacked()
 
     def begin_one(self, row: int) -> None:
-        """Make the last observation of a row the first one of a new episode."""
+        """Start a new episode in a row, with the row's last observation."""
         for part in self.frames.values():
             part[row] = part[row, -1:]
 
@@ -115,7 +115,7 @@ class FrameMemory:
 
 
 class StackedVecEnv(VecEnvWrapper):
-    """A wrapper whose observations are stacks of the last k observations."""
+    """Wrapper whose observations are stacks of the last k observations."""
 
     def __init__(self, venv: VecEnv, count: int) -> None:
         """Wrap environments that reset themselves in the step that ends an episode."""
@@ -127,7 +127,7 @@ class StackedVecEnv(VecEnvWrapper):
         return cast(VecEnvObs, self._memory.begin(self.venv.reset()))
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments; the last observation of an episode is a stack as well."""
+        """Step all environments; each `terminal_observation` is also a stack."""
         observations, rewards, dones, infos = self.venv.step_wait()
         self._memory.see(observations)
         for row in np.flatnonzero(dones).tolist():

@@ -7,11 +7,11 @@ reproduce.
     autonomysim-car, autonomysim-drone      https://github.com/nervosys/AutonomySim
     ddqn-racer                              Double DQN on a ray-cast track
 
-`SIM_SETTINGS` are settings with which each sim is learned from vectors with its default rules;
-docs/results.md has the scores of four seeds and the command. What matters for tuning:
+`SIM_SETTINGS` are tuned for learning each sim from vectors with its default rules; docs/results.md
+has the command and the scores of four seeds. Important settings are:
 
-- A learning rate that falls to 4 % of its first value. With a constant one, the policy oscillates
-  until the end.
+- A learning rate that decays to 4 % of its initial value. With a constant learning rate, the policy
+  oscillates until the end.
 - `n_steps` 3 for powerline and racer, whose rewards are sparse or late, and an update of the target
   network only every 4,000 steps, or 2,000 with a shorter horizon.
 - Scores still drop during training, so the best checkpoint is stored, chosen on separate episodes.
@@ -48,7 +48,7 @@ _AUTONOMYSIM: Final[dict[str, Any]] = {
     "steps": 500_000,
     "envs": 1,
     "learning_rate": 2.5e-4,
-    # The 512 features of the convolutions are the inputs of the Q-values.
+    # The output layer follows the 512 features of the convolutions directly.
     "hidden": (),
     "batch_size": 32,
     "buffer_size": 500_000,
@@ -152,7 +152,7 @@ def find_preset(name: str) -> Preset:
 
 
 def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a sim; none for other environments, classic rules or images.
+    """Return the settings of a sim; empty for other environments, classic rules or images.
 
     Args:
         config_type: Type of the algorithm's settings; only algorithms with `n_steps` and

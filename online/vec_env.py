@@ -1,7 +1,7 @@
 """Batched Gymnasium environments with the interface of Stable-Baselines3, in one process.
 
 SB3's `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` passes all actions to
-one `gymnasium.vector.VectorEnv` at once, which for the sims here is one compiled call.
+one `gymnasium.vector.VectorEnv` at once; for this package's sims, that is one compiled call.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class BatchedVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all environments; ended episodes are followed by the next one in the same step."""
+        """Step all environments; those whose episode ends are reset in the same step."""
         observations, rewards, terminated, truncated, batch_info = self.env.step(self._actions)
         self._returns += rewards
         self._lengths += 1

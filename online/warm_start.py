@@ -21,7 +21,7 @@ from mcaprl.online.policy import channels_first
 from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
-"""Number of observations on which copied weights have to produce the same values."""
+"""Number of observations for which copied weights must produce the same values."""
 
 
 def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
@@ -78,15 +78,15 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
     Args:
         model: Fresh model.
         policy: Policy with `name`, `q_values`, and its network as an attribute.
-        space: Space of a single observation; samples of it verify that both produce the same
-            values.
+        space: Space of a single observation, sampled to verify that both networks produce the
+            same values.
 
     Raises:
         UsageError: The algorithm has no Q-network.
         PolicyError: The policy has no Q-network, or one of another architecture.
     """
     if not isinstance(model, DQN):
-        raise UsageError(f"{type(model).__name__} has no Q-values to start from a policy")
+        raise UsageError(f"{type(model).__name__} has no Q-values to copy from a policy")
     frames = getattr(policy, "frame_stack", 1)
     if stacked_space(channels_first(space), frames) != model.observation_space:
         raise PolicyError(
@@ -135,7 +135,7 @@ def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> N
 
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
-    """Transpose images (N, height, width, channels) for SB3's networks, and nothing else."""
+    """Transpose images (N, height, width, channels) for SB3's networks; pass on other values."""
     if isinstance(space, spaces.Dict):
         return {key: _channels_first(values[key], part) for key, part in space.items()}
     if is_image_space(space) and channels_first(space) != space:

@@ -144,7 +144,7 @@ def test_an_evaluation_shows_the_learning_curves(tmp_path: Path) -> None:
         [str(tmp_path / name) for name in ("online", "online/seed-0", "offline", "nowhere.zip")]
     )
     assert [figure.caption for figure in curves] == [
-        "Evaluations while learning",
+        "Evaluations during training",
         "offline: loss",
         "offline: held out loss",
     ]

@@ -1,4 +1,4 @@
-"""Check of whole files."""
+"""Validation of complete files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mcaprl.recorder.repair.check import check_log
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of a check.
+    """Result of `check`.
 
     Attributes:
         files: Files that were read.
@@ -31,7 +31,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no problems."""
         return not self.problems
 
     def to_json(self) -> dict[str, Any]:
@@ -40,11 +40,11 @@ class CheckResult:
 
 
 def check(data: Paths, *, threads: int = 1) -> CheckResult:
-    """Read every byte of logs, and check structure, CRCs, indexes, episodes and metadata.
+    """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
     Args:
-        data: File, folder or glob of logs, or several of them. A path without logs is a problem;
-            the others are checked all the same.
+        data: File, folder or glob of logs, or several of them. A path without logs is
+            reported as a problem.
         threads: Number of threads that decompress chunks.
 
     Raises:
@@ -62,7 +62,7 @@ def check(data: Paths, *, threads: int = 1) -> CheckResult:
             found = find_logs(name)
         except LogError as error:
             missing.append(
-                Problem(str(error), "looking for it", next="check the path", file=str(name))
+                Problem(str(error), "searching for logs", next="check the path", file=str(name))
             )
             problems.append(missing[-1])
             continue

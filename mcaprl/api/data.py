@@ -1,4 +1,4 @@
-"""Logs as the functions of the public API accept them."""
+"""Types of the log arguments of the public API."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Data = Dataset | Paths
 
 
 def opened(data: Data, *, threads: int = 1) -> Dataset:
-    """Return a dataset; paths are read."""
+    """Return a dataset unchanged, or read it from paths."""
     return data if isinstance(data, Dataset) else open_logs(data, threads=threads)
 
 

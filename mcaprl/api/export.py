@@ -31,7 +31,7 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Trai
 
     out = Path(out)
     if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists: choose another name, or --overwrite")
+        raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
     policy = load_policy(run)
     export_onnx(policy, out)
     return policy

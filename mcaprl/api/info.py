@@ -1,4 +1,4 @@
-"""Contents of logs: facts, problems, and steps to look at."""
+"""Contents of logs: facts, problems and notable steps."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class LogInfo:
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
         size_bytes: Size of all files.
-        storage: Place of the columns: memory or files.
+        storage: Storage of the columns: memory or files.
         problems: Defects of the logs, and warnings of the reader.
-        findings: Defects and notes from `lint`.
+        findings: Defects and notes of `lint`.
         moments: Steps with the most surprising annotations.
     """
 
@@ -86,20 +86,20 @@ class LogInfo:
         return {name: value for name, value in facts.items() if name != "sources"}
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the facts as names and texts."""
+        """Return the names and texts of the facts."""
         low, high = self.return_range
         found = self.behavior_prob
         return [
             ("environment", self.env_id or "unknown"),
             ("files", f"{len(self.sources)}, {size(self.size_bytes)}"),
             ("episodes", str(self.episodes)),
-            ("steps", f"{self.steps}, {self.mean_length:.1f} an episode"),
+            ("steps", f"{self.steps}, {self.mean_length:.1f} per episode"),
             ("simulated time", f"{self.duration_s:.1f} s"),
             ("mean return", f"{self.mean_return:.3f} (from {low:.3f} to {high:.3f})"),
             ("observations", _short(self.observations)),
-            ("kept in", self.storage),
+            ("storage", self.storage),
             ("actions", _short(self.actions)),
-            ("taken", _counts(self.action_counts) or "-"),
+            ("action counts", _counts(self.action_counts) or "-"),
             ("behavior_prob", "unknown" if found is None else f"implies {found}"),
             ("policies", ", ".join(self.policies) or "unknown"),
             ("ends", _counts(self.ends)),
@@ -107,16 +107,16 @@ class LogInfo:
 
 
 def info(data: Paths, *, report: str | Path | None = None, threads: int = 1) -> LogInfo:
-    """Read logs, and return facts about them and problems in them.
+    """Return facts about logs, and their problems.
 
     Args:
         data: File, folder or glob of logs, or several of them.
-        report: Folder for a page, an image and JSON.
+        report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
 
     Raises:
         LogError: A log cannot be read.
-        MissingExtraError: The packages of the report are not installed.
+        MissingExtraError: The packages of the `report` extra are not installed.
         ReportError: The report cannot be written.
     """
     paths = find_logs(data)
@@ -173,6 +173,6 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def _short(text: str) -> str:
-    """Return a space on one line, without most bounds of a large Box."""
+    """Return the text of a space on one line, shortened for a large Box."""
     line = " ".join(text.split())
     return line if len(line) <= _LONGEST_SPACE else f"{line[:40]} ... {line[-40:]}"

@@ -34,7 +34,7 @@ def layout(
     """
     path = None if out is None else Path(out)
     if path is not None and path.suffix == ".mcap":
-        raise UsageError(f"{path}: a layout is JSON, and must not replace a log")
+        raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
     if path is not None and path.exists() and not overwrite:
         raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
     name = str(source)
@@ -46,7 +46,7 @@ def layout(
 
 
 def _layout_of_sim(sim: str) -> dict[str, Any]:
-    """Return the layout that a recording of a sim has; a temporary one is made."""
+    """Return the layout of a temporary recording of a sim."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reset.mcap"
         sim_env = make_sim(sim)

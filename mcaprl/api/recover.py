@@ -15,16 +15,16 @@ def recover(
     Args:
         file: MCAP file, damaged or not; it is not changed.
         out: Path of the new log.
-        keep_unfinished: Whether episodes without an end are kept, marked truncated, up to their
-            last whole transition.
+        keep_unfinished: Whether unfinished episodes are kept up to their last complete
+            transition, marked truncated.
         overwrite: Whether an existing file is replaced.
 
     Returns:
-        What was kept and what was lost.
+        Summary of kept and lost data.
 
     Raises:
         OutputExistsError: `out` exists.
-        UsageError: `out` is the same file.
+        UsageError: `file` and `out` are the same file.
         LogError: Nothing can be kept, or `out` cannot be written.
     """
     return recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)

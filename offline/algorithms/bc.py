@@ -1,6 +1,6 @@
-"""Behavior cloning: take the action that the log takes most often in a state.
+"""Behavior cloning: predict the logged action of each state.
 
-It reads no reward, and is hard to beat on good logs: the baseline for algorithms that do. See
+BC ignores rewards and is hard to beat on good logs, so it is a baseline for other algorithms. See
 Pomerleau, "ALVINN: An Autonomous Land Vehicle in a Neural Network", 1988.
 """
 
@@ -19,11 +19,11 @@ from mcaprl.offline.batches.buffer import Batch
 
 @dataclass(frozen=True)
 class BCConfig(TrainingConfig):
-    """Settings of behavior cloning: the shared ones."""
+    """Settings of behavior cloning, the same as those of `TrainingConfig`."""
 
 
 class BC(Learner):
-    """A classifier of actions; its softmax estimates the behavior policy of the log."""
+    """Classifier of actions whose softmax estimates the behavior policy of the log."""
 
     name = "bc"
     config_type: ClassVar[type[TrainingConfig]] = BCConfig
@@ -32,11 +32,11 @@ class BC(Learner):
     config: BCConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return one logit per action."""
+        """Return the shape of the logits."""
         return {"logits": (self.n_actions,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the cross entropy, and whether the most likely action is the logged one."""
+        """Return the cross entropy, and the accuracy of the most likely action."""
         logits_tm1 = self.outputs("logits", batch.observations)
         correct = logits_tm1.argmax(1) == batch.actions
         return {"accuracy": correct.float(), "loss": cross_entropy(logits_tm1, batch.actions)}

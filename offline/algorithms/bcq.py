@@ -1,12 +1,12 @@
-"""Discrete batch-constrained Q-learning: Double DQN among the actions that the log would take.
+"""Discrete batch-constrained Q-learning: Double DQN restricted to actions likely in the log.
 
     https://arxiv.org/abs/1910.01708    argmax_a Q(s, a) where G(a|s) / max_a G(a|s) >= threshold
 
-G clones the behavior policy. Values of actions that G finds unlikely are used neither in the target
-nor when the policy acts.
+G clones the behavior policy. Neither the target nor the policy selects actions that are unlikely
+according to G.
 
-Departures from the paper: Q and G are separate networks for images, too; the target network is
-synced at intervals instead of averaged; the rest is as in `dqn`.
+Departures from the paper: Q and G are separate networks even for images; the target network is
+synced at intervals instead of averaged; otherwise as in `dqn`.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ class BCQConfig(DQNConfig):
     """Settings of discrete BCQ: those of DQN and of the behavior clone."""
 
     threshold: float = 0.3
-    """least probability relative to the most likely action; 0 is Double DQN, 1 cloning"""
+    """minimum probability relative to the most likely action; 0 is Double DQN, 1 cloning"""
     logits_penalty: float = 0.01
     """weight of the mean square of the clone's logits"""
 
     def __post_init__(self) -> None:
-        """Refuse invalid settings."""
+        """Validate the settings."""
         super().__post_init__()
         self._require("threshold", 0 <= self.threshold <= 1, "within [0, 1]")
         self._require("logits_penalty", self.logits_penalty >= 0, "at least 0")
 
 
 class BCQ(DQN):
-    """Q-learning that selects next actions among likely ones."""
+    """Q-learning that selects next actions only among likely ones."""
 
     name = "bcq"
     config_type: ClassVar[type[TrainingConfig]] = BCQConfig

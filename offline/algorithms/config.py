@@ -25,20 +25,20 @@ class TrainingConfig(Settings):
     """transitions in one gradient update, drawn with replacement"""
     final_learning_rate_fraction: float = 0.02
     weight_decay: float = 0.0
-    """fraction of each weight that a step of size 1 would remove (AdamW)"""
+    """weight decay of AdamW"""
     channels: tuple[int, ...] = (32, 64, 64)
-    """channels of the three convolutions over images; half as many take less than half the time"""
+    """output channels of the three convolutions over images"""
     layer_norm: bool = False
     """normalize the hidden layers"""
     normalize: bool = False
-    """shift and scale the network's inputs to mean 0 and deviation 1 over the data"""
+    """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
     held_out: float = 0.05
-    """fraction of the episodes that is held out for validation"""
+    """fraction of the episodes held out for validation"""
     log_interval: int = 100
     """updates between two rows of metrics"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         self._require_positive("updates", "batch_size", "log_interval")
         self._require("weight_decay", self.weight_decay >= 0, "at least 0")
@@ -47,13 +47,13 @@ class TrainingConfig(Settings):
         self._require("held_out", 0 <= self.held_out < 1, "within [0, 1)")
 
     def learning_rate_at(self, step: int) -> float:
-        """Return the learning rate of the update that follows `step` finished ones."""
+        """Return the learning rate after `step` finished updates."""
         done = step / max(1, self.updates - 1)
         return self.learning_rate * (1 - (1 - self.final_learning_rate_fraction) * done)
 
     @property
     def packing(self) -> Packing:
-        """How transitions are built from the log."""
+        """Settings for building transitions from the log."""
         return Packing(frame_stack=self.frame_stack, normalize=self.normalize)
 
     @property
@@ -64,33 +64,33 @@ class TrainingConfig(Settings):
 
 @dataclass(frozen=True)
 class BootstrapConfig(TrainingConfig):
-    """Settings of algorithms whose targets use their own values of later states."""
+    """Settings of algorithms whose targets bootstrap from values of next states."""
 
     gamma: float = 0.97
-    """discount of the reward one step later; 0.97 has a horizon of about 33 steps"""
+    """discount per step; 0.97 has an effective horizon of about 33 steps"""
     n_steps: int = 1
-    """number of rewards in a target before the value of the state that follows"""
+    """number of rewards in a target before the bootstrap value"""
     target_interval: int = 500
     """updates between two updates of the target network"""
 
     def __post_init__(self) -> None:
-        """Refuse settings outside their ranges."""
+        """Validate the settings."""
         super().__post_init__()
         self._require_fraction("gamma")
         self._require_positive("n_steps", "target_interval")
 
     @property
     def packing(self) -> Packing:
-        """How transitions are built from the log."""
+        """Settings for building transitions from the log."""
         return Packing(self.frame_stack, self.normalize, self.gamma, self.n_steps)
 
     @property
     def horizon_fraction(self) -> float:
         """Fraction of an infinite discounted return that values can contain after training.
 
-        Values start near 0, and each update of the target network adds the rewards of n steps:
-        after k of them, values contain (1 - gamma^(n k)) / (1 - gamma) times a constant reward, of
-        1 / (1 - gamma).
+        Values start near 0, and each update of the target network adds the rewards of n steps.
+        After k updates, the value of a constant reward of 1 is (1 - gamma^(n k)) / (1 - gamma);
+        the full return is 1 / (1 - gamma).
         """
         target_updates = max(self.updates / self.target_interval, 1)
         return float(1 - self.gamma ** (self.n_steps * target_updates))

@@ -2,12 +2,11 @@
 
     https://arxiv.org/abs/2006.04779    Double DQN + alpha (logsumexp_a Q(s, a) - Q(s, a_data))
 
-The second term is the penalty: with it, the greedy policy stays close to actions whose outcome the
-log shows.
+The second term is a penalty that keeps the greedy policy close to the logged actions.
 
-Departures from the paper: values are plain means unless `n_quantiles` is above 1, as they are in
-its Atari agent; alpha is fixed and not tuned by a Lagrange multiplier; the target is that of Double
-DQN.
+Departures from the paper: values are means unless `n_quantiles` is above 1 (the paper's Atari
+agent uses quantiles); alpha is fixed instead of tuned by a Lagrange multiplier; the target is that
+of Double DQN.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class CQLConfig(DoubleDQNConfig):
     """weight of the penalty on actions that are not in the data; 0 is Double DQN"""
 
     def __post_init__(self) -> None:
-        """Refuse invalid settings."""
+        """Validate the settings."""
         super().__post_init__()
         self._require("alpha", self.alpha >= 0, "at least 0")
 

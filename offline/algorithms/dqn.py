@@ -2,14 +2,13 @@
 
     DQN         https://doi.org/10.1038/nature14236   target r + gamma max_a Q'(s', a)
     Double DQN  https://arxiv.org/abs/1509.06461      target r + gamma Q'(s', argmax_a Q(s', a))
-    quantiles   https://arxiv.org/abs/1710.10044      Q is the mean of `n_quantiles` learned ones
+    quantiles   https://arxiv.org/abs/1710.10044      Q is the mean of `n_quantiles` quantiles
 
 Q is the learning network, Q' the target network, synced every `target_interval` updates.
 
-Departures from the papers: the data are a log and not a growing replay buffer, so there is no
-exploration; Adam replaces RMSProp; the learning rate decays to almost 0, because no new data
-arrive that a large one would help to follow. Both algorithms overestimate actions that the log
-never shows: they are the baselines of CQL.
+Departures from the papers: the data are a fixed log, so there is no exploration; Adam replaces
+RMSProp; the learning rate decays to almost 0, because no new data arrive. Both algorithms
+overestimate actions that are not in the log; they are the baselines of CQL.
 """
 
 from __future__ import annotations
@@ -42,17 +41,17 @@ class DQNConfig(BootstrapConfig):
     dueling: bool = False
     """learn the value of a state separately from the advantages of its actions"""
     n_quantiles: int = 1
-    """number of quantiles of the return; the policy acts by their mean; 1 learns the mean alone"""
+    """number of quantiles of the return, whose mean selects actions; 1 learns only the mean"""
 
     def __post_init__(self) -> None:
-        """Refuse invalid settings."""
+        """Validate the settings."""
         super().__post_init__()
         self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
 
     @property
     def architecture(self) -> Architecture:
-        """The shape of the networks."""
+        """Architecture of the networks."""
         return replace(super().architecture, dueling=self.dueling)
 
 
@@ -76,7 +75,7 @@ class DQN(Learner):
         self.target_network = self.add_target_network("q", config.target_interval)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return one value per action, or quantiles."""
+        """Return the shape of the values or quantiles of all actions."""
         count = self.config.n_quantiles
         return {"q": (self.n_actions,) if count == 1 else (self.n_actions, count)}
 

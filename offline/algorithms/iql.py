@@ -1,12 +1,12 @@
-"""Implicit Q-learning with discrete actions: no action is evaluated that the log does not show.
+"""Implicit Q-learning with discrete actions; only logged actions are evaluated.
 
     https://arxiv.org/abs/2110.06169
-        V(s)    expectile regression to Q'(s, a_data): close to the best action taken there
+        V(s)    expectile regression to Q'(s, a_data): close to the value of the best logged action
         Q(s,a)  regression to r + gamma V(s')
         pi      behavior cloning, each action weighted with exp(beta (Q'(s, a) - V(s)))
 
-Q' is the smaller value of two target networks, one for each of two networks Q that learn from the
-same targets; they are synced every `target_interval` updates.
+Q' is the minimum of two target networks, one for each of two networks Q that learn from the same
+targets. The target networks are synced every `target_interval` updates.
 
 Departures from the paper: discrete actions, so the policy is a classifier and Q has one output per
 action; target networks are synced at intervals instead of averaged; Huber loss for Q.
@@ -32,7 +32,7 @@ from mcaprl.offline.algorithms.losses import (
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
 MAX_WEIGHT = 100.0
-"""Largest weight of one action in the policy's loss, as in the paper's code."""
+"""Maximum weight of an action in the policy's loss, as in the paper's code."""
 _TWINS = ("q", "q_twin")
 
 
@@ -43,12 +43,12 @@ class IQLConfig(BootstrapConfig):
     target_interval: int = 50
     """updates between two syncs of the target networks"""
     expectile: float = 0.8
-    """expectile of the action values that a state's value is; 0.5 is the mean, near 1 the best"""
+    """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
     beta: float = 3.0
     """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
 
     def __post_init__(self) -> None:
-        """Refuse invalid settings."""
+        """Validate the settings."""
         super().__post_init__()
         self._require("expectile", 0 < self.expectile < 1, "within (0, 1)")
         self._require("beta", self.beta >= 0, "at least 0")

@@ -1,4 +1,4 @@
-"""The parts that all algorithms share: networks, optimizer, samplers, and their state."""
+"""Base class of all algorithms: networks, optimizer, samplers, and their state."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
 ActsBy = Literal["q_values", "logits", "filtered_q_values"]
-"""Outputs whose largest decides the action of a trained policy; see `policy`."""
+"""Outputs by which a trained policy selects actions; see `policy`."""
 
 _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class NotFiniteError(ArithmeticError):
-    """A term of the loss that is NaN or infinite.
+    """Error of a loss term that is NaN or infinite.
 
     Attributes:
         update: Number of the update, from 1.
     """
 
     def __init__(self, message: str, update: int) -> None:
-        """Store which term it is, and when it occurred."""
+        """Store the message and the number of the update."""
         super().__init__(message)
         self.update = update
 
@@ -40,13 +40,13 @@ class NotFiniteError(ArithmeticError):
 class Learner(ABC):
     """One algorithm on one dataset with K seeds; a subclass defines networks and losses.
 
-    All randomness comes from the seeds: the same seed, data and machine give the same weights,
-    whichever seeds are trained together. Networks are on the device of the buffer.
+    All randomness comes from the seeds: the same seed, data and machine produce the same
+    weights, regardless of the seeds trained in parallel. Networks are on the device of the buffer.
 
     Attributes:
-        name: Name of the algorithm, as a user writes it.
+        name: Name of the algorithm in commands and in `mcaprl.train`.
         config_type: Dataclass of its settings.
-        acts_by: Outputs that decide the policy's action.
+        acts_by: Outputs by which the policy selects actions.
         policy_models: Names of the models that the policy needs.
         seeds: K seeds.
         models: K networks each, by name.
@@ -94,20 +94,20 @@ class Learner(ABC):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the terms (R,) to log, by name; the last one is `loss`, which is minimized.
 
-        Gradients of `loss` reach every weight that it was computed from: compute targets under
+        `loss` is backpropagated to every weight that it depends on, so compute targets under
         `torch.no_grad()`.
         """
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return metrics (R,) of a held-out batch, by name.
 
-        Learners of values return `q`, the value of the logged action, and `td_error`, its absolute
-        difference from the target.
+        Algorithms with Q-values return `q`, the value of the logged action, and `td_error`, its
+        absolute difference from the target.
         """
         return self.losses(batch)
 
     def update(self) -> dict[str, Tensor]:
-        """Make one gradient step on one random batch per seed, and sync target networks when due.
+        """Run one gradient step on one random batch per seed, and sync target networks when due.
 
         Returns:
             The terms of `losses`, without gradients.
@@ -118,7 +118,7 @@ class Learner(ABC):
         size = self.config.batch_size
         rows = torch.cat([self.buffer.sample_rows(size, sampler) for sampler in self.samplers])
         terms = self.losses(self.buffer.batch(rows.to(self.buffer.device)))
-        # Each seed's rows depend on its own weights alone: one sum gives all seeds their gradients.
+        # Each seed's rows depend only on its own weights, so one sum yields all gradients.
         loss = terms["loss"].sum()
         terms = {name: term.detach() for name, term in terms.items()}
         if not math.isfinite(loss.item()):
@@ -136,12 +136,12 @@ class Learner(ABC):
     def add_target_network(
         self, name: str, interval: int, *, next_states: bool = True
     ) -> TargetNetwork:
-        """Add a target network, which gets a model's weights now and every `interval` updates.
+        """Add a target network, synced with a model now and every `interval` updates.
 
         Args:
             name: Name of the model.
             interval: Number of updates; the same for all target networks.
-            next_states: Whether its outputs are those of the next states, or of the states.
+            next_states: Whether it evaluates the next states instead of the states.
         """
         rows = self.config.batch_size * interval
         self._sync_interval = interval
@@ -162,12 +162,12 @@ class Learner(ABC):
         return allowed_only(self.models[name](observations), observations.mask)
 
     def all_models(self) -> dict[str, Model]:
-        """Return the models that learn and the target networks, by name."""
+        """Return the learning models and the target networks by name."""
         targets = {f"{name}_target": target.model for name, target in self.target_networks.items()}
         return {**self.models, **targets}
 
     def network(self, name: str, seed: int) -> Network:
-        """Return one seed's network, with its present weights."""
+        """Return one seed's network, with its current weights."""
         return self.models[name].networks[self.seeds.index(seed)]
 
     def state(self, seed: int) -> dict[str, Tensor]:
@@ -183,7 +183,7 @@ class Learner(ABC):
 
     @torch.no_grad()
     def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Restore what `state` returned after `step` updates; all seeds must be at the same step.
+        """Restore the tensors of `state` after `step` updates, the same for all seeds.
 
         Raises:
             KeyError: A tensor is missing.
@@ -214,7 +214,7 @@ class Learner(ABC):
             }
 
     def _not_finite(self, seed_means: Sequence[Mapping[str, float]]) -> NotFiniteError:
-        """Name the first bad term; the loss is last, and bad whenever one of its parts is."""
+        """Return an error that names the first term that is not finite; `loss` is the last."""
         for seed, means in zip(self.seeds, seed_means, strict=True):
             for name, value in means.items():
                 if not math.isfinite(value):

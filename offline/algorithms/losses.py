@@ -1,7 +1,7 @@
 """The equations of offline learning: pure functions of a batch, without networks or state.
 
-`_tm1` marks what belongs to the state in which an action was taken, `_t` what belongs to the next
-state. B is the batch size, A the number of actions, N the number of quantiles.
+The suffix `_tm1` marks the state in which an action was taken, `_t` the next state. B is the batch
+size, A the number of actions, N the number of quantiles.
 
     r_t             rewards (B,)
     discount_t      gamma (B,), to the power of n for n-step returns, or 0 after termination
@@ -11,13 +11,13 @@ state. B is the batch size, A the number of actions, N the number of quantiles.
     pi_t            probabilities (B, A) of the evaluated policy in the next states
     q_tm1, z_tm1    values (B, A) or quantiles (B, A, N) of the learning network
     a_tm1           actions taken (B,), int64
-    target_tm1      targets (B,) of Q(s, a), or samples (B, N) of them
+    target_tm1      targets (B,) of Q(s, a), or target samples (B, N)
     v_tm1           values (B, 1) of states
     logits_tm1      unnormalized log probabilities (B, A)
 
-Targets of quantiles are (B, N), those of the action with the largest mean. Outputs of actions that
-are not allowed are minus infinity. A loss returns one value per transition; its gradient comes
-from autograd.
+Quantile targets (B, N) are those of the action with the largest mean. Outputs of actions that are
+not allowed are minus infinity. A loss returns one value per transition; autograd computes its
+gradient.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def double_q_learning_target(
 ) -> Tensor:
     """Return the Double DQN target (B,): r + discount Q'(s', argmax_a Q(s', a)).
 
-    One network selects the next action and the other evaluates it, so an overestimate counts only
-    where both make it. See "Deep Reinforcement Learning with Double Q-learning",
+    One network selects the next action and the other evaluates it, so a value is overestimated
+    only if both overestimate it. See "Deep Reinforcement Learning with Double Q-learning",
     https://arxiv.org/abs/1509.06461.
     """
     _check_shape("q_t_selector", q_t_selector, q_t_value.shape)
@@ -88,8 +88,8 @@ def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -
 def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
     """Return the Huber loss (B,) of Q(s, a) - target: squared / 2 up to 1, absolute - 1/2 beyond.
 
-    The gradient of a rare, large error (a crash, a new target network) is no larger than that of an
-    error of 1: the clipped error of the DQN paper, as a loss.
+    This is the error clipping of the DQN paper: the gradient of a rare, large error (a crash, a new
+    target network) is no larger than that of an error of 1.
     """
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
@@ -147,7 +147,7 @@ def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) ->
 def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
     """Return outputs (B, A) or (B, A, N) with minus infinity for actions that are not allowed.
 
-    `mask` is the allowed actions (B, A), bool, or None if all are allowed.
+    `mask` (B, A), bool, marks the allowed actions; None allows all.
     """
     if mask is None:
         return outputs
@@ -157,25 +157,25 @@ def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
 def likely_actions(logits: Tensor, threshold: float) -> Tensor:
     """Return whether pi(a|s) / max_a pi(a|s) >= threshold (B, A), with pi = softmax(logits).
 
-    The filter of discrete BCQ. See "Benchmarking Batch Deep Reinforcement Learning Algorithms",
-    algorithm 1, https://arxiv.org/abs/1910.01708. A threshold of 0 admits all actions, 1 only
-    the most likely one.
+    This is the filter of discrete BCQ; a threshold of 0 admits all actions, 1 only the most likely
+    one. See "Benchmarking Batch Deep Reinforcement Learning Algorithms", algorithm 1,
+    https://arxiv.org/abs/1910.01708.
     """
     return (logits - logits.amax(1, keepdim=True)).exp() >= threshold
 
 
 def mean_values(q: Tensor) -> Tensor:
-    """Return values (B, A): those given, or the means of quantiles (B, A, N)."""
+    """Return values (B, A) unchanged, or the means of quantiles (B, A, N)."""
     return q.mean(2) if q.ndim == 3 else q
 
 
 def best_actions(q: Tensor) -> Tensor:
-    """Return the action (B,) of the largest mean value, the first of equal ones."""
+    """Return the actions (B,) with the largest mean value; ties go to the first."""
     return mean_values(q).argmax(1)
 
 
 def chosen(values: Tensor, actions: Tensor) -> Tensor:
-    """Return the values (B,) of one action each, from (B, A); or (B, N) from (B, A, N)."""
+    """Return values (B,) of one action each, or quantiles (B, N) from (B, A, N)."""
     if values.ndim == 2:
         return values.gather(1, actions.unsqueeze(1)).squeeze(1)
     return values[torch.arange(len(values), device=values.device), actions]

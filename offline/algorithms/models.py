@@ -1,8 +1,8 @@
-"""K networks of one shape, one per seed, that learn side by side, and their target networks.
+"""K networks of one shape, one per seed, trained in parallel, and their target networks.
 
 The weights are the rows of one matrix (K, P), a leaf of autograd: the optimizer, the target network
-and a checkpoint each handle one tensor. Batches contain the rows of all seeds, those of the first
-seed first: R = K * B rows.
+and a checkpoint each handle one tensor. Batches contain the rows of all seeds, ordered by seed:
+R = K * B rows.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
 _ALIGNMENT = 16
-"""Floats in a vector register: rows of this length get the same arithmetic for any K."""
+"""Number of floats in a vector register; rows padded to it have the same arithmetic for any K."""
 _ROWS_AT_ONCE = 1024
 
 
@@ -37,7 +37,7 @@ class Model(ABC):
     bulk_gain: ClassVar[float] = 1.0
 
     def __init__(self, networks: Sequence[Network]) -> None:
-        """Gather the weights of networks of one shape."""
+        """Move the weights of networks of one shape into one matrix."""
         self.networks = list(networks)
         parameters = dict(networks[0].named_parameters())
         self._names, self._shapes = list(parameters), [p.shape for p in parameters.values()]
@@ -62,7 +62,7 @@ class Model(ABC):
 
 
 class AnyModel(Model):
-    """Networks of any kind, computed one after the other."""
+    """Networks of any kind, evaluated one after the other."""
 
     def __call__(self, observations: Observations) -> Tensor:
         """Map the observations of all seeds to outputs (R, *output_shape)."""
@@ -71,7 +71,7 @@ class AnyModel(Model):
         return torch.cat([self._apply(network, row, part) for network, row, part in seeds])
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
-        """Compute one network with the weights of a row, so that autograd sees the matrix."""
+        """Apply one network with the weights of a row, so that gradients reach the matrix."""
         parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
         return cast(Tensor, functional_call(network, weights, (observations,)))
@@ -86,8 +86,8 @@ class StackedMLP(Model):
     def fits(network: Network) -> bool:
         """Return whether a network consists of linear layers and ReLU only.
 
-        Layers with a single input or output are excluded: a product with a vector is computed
-        differently for one seed and for several, with other bits as the result.
+        Layers with a single input or output are excluded, because matrix-vector products round
+        differently for one seed than for several.
         """
         kinds = (Network, nn.ModuleList, nn.Sequential, nn.Linear, nn.ReLU)
         plain = len(network.stems) == 1 and all(isinstance(m, kinds) for m in network.modules())
@@ -101,7 +101,7 @@ class StackedMLP(Model):
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
         count = columns.shape[2]
         if count == 1:
-            # Products with a vector have other bits for one seed than for several.
+            # Matrix-vector products round differently for one seed than for several.
             columns = columns.expand(-1, -1, 2)
         parts = self.weights.split_with_sizes(self._sizes, 1)[:-1]
         last = len(parts) // 2 - 1
@@ -118,13 +118,13 @@ def build_model(networks: Sequence[Network]) -> Model:
 
 
 class TargetNetwork:
-    """A model that gets the weights of a learning model at intervals.
+    """Copy of a learning model, synced at intervals.
 
-    Its outputs do not change in between. Where that takes less time than computing them for each
-    batch, they are computed once for the whole dataset and then looked up.
+    Outputs are constant between two syncs. If that is faster than a forward pass for each batch,
+    they are computed once for the whole dataset and then looked up.
 
     Attributes:
-        model: The K target networks.
+        model: K target networks.
     """
 
     def __init__(
@@ -138,10 +138,10 @@ class TargetNetwork:
         """Copy `model`.
 
         Args:
-            model: The model that learns.
-            buffer: Its training data.
+            model: Learning model.
+            buffer: Training data.
             rows_per_sync: Approximate number of rows per seed between two calls of `sync`.
-            next_states: Whether the outputs are those of the next states, or of the states.
+            next_states: Whether to evaluate the next states instead of the states.
         """
         self.model = model.clone()
         self._buffer = buffer
@@ -163,7 +163,7 @@ class TargetNetwork:
 
     @torch.no_grad()
     def outputs(self, batch: Batch) -> Tensor:
-        """Return the outputs (R, ...) for the batch's states, or next states; no gradient."""
+        """Return the outputs (R, ...) for the batch's states, or next states, without gradient."""
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
         if self._table is None:

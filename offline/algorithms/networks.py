@@ -37,7 +37,7 @@ class Architecture:
 
 
 class Network(nn.Module):
-    """A network that maps observations to outputs (B, *output_shape)."""
+    """Network that maps observations to outputs (B, *output_shape)."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class Network(nn.Module):
             vector_width: Length of the vector; 0 if there is none.
             images: Shape and normalization of each image.
             output_shape: Shape of the outputs for one observation; (A, ...) for A actions.
-            architecture: Hidden layers.
+            architecture: Architecture of the network.
         """
         super().__init__()
         self.output_shape = output_shape
@@ -98,11 +98,11 @@ class NatureConvolutions(nn.Module):
     scale: Tensor
 
     def __init__(self, image: ImageInput, channels: tuple[int, ...]) -> None:
-        """Build for images of this shape, with this number of output channels per convolution."""
+        """Build the convolutions for an image input, with these numbers of output channels."""
         super().__init__()
         first, second, third = channels
         shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
-        # They are not learned, and are saved with the normalization of the other observations.
+        # Constants, which are saved with the normalization of the other observations.
         self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(

@@ -1,7 +1,7 @@
-"""The algorithms by name: the built-in ones, and those of installed packages.
+"""Algorithms by name: the built-in ones, and those of installed packages.
 
-A package adds an algorithm with an entry point of the group `mcaprl.algorithms`: the algorithm's
-name, and its `Learner` subclass as `module:Class`.
+A package adds an algorithm with an entry point of the group `mcaprl.algorithms`, which maps
+the algorithm's name to its `Learner` subclass, `module:Class`.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _load(entry: EntryPoint) -> type[Learner]:
     """Import the algorithm of an entry point, and check it."""
     try:
         found = entry.load()
-    except Exception as error:  # Any code can run in an import.
+    except Exception as error:  # An import can raise anything.
         raise _broken(entry, f"{type(error).__name__}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, Learner)):
         raise _broken(entry, "it is not a subclass of Learner")

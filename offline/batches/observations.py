@@ -1,11 +1,10 @@
 """Encoding of an environment's observations as network inputs: a vector, images, an action mask.
 
-Everything that is not an image (floats, flags, counters; at any depth of a Dict space) becomes part
-of one float32 vector: Discrete parts as one-hot codes, uint8 numbers divided by 255. Images stay
-uint8.
+Everything that is not an image, at any depth of a Dict space, becomes part of one float32 vector:
+discrete values are one-hot encoded, and uint8 numbers are divided by 255. Images stay uint8.
 
-The top-level key `action_mask` of a Dict space, with one flag per action, is not an input: it lists
-the allowed actions, as in PettingZoo. It is in the log because it is part of the observation.
+The top-level key `action_mask` of a Dict space, with one flag per action, is not an input: the mask
+marks the allowed actions, as in PettingZoo. Logs contain it as part of the observation.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ MIN_CONVOLUTION_EDGE = 36
 """Smallest image edge in pixels for which the output of the convolutions is not empty."""
 MASK_KEY = "action_mask"
 _MAX_IMAGES = 10_000
-"""Maximum number of images in a mean, evenly spaced."""
+"""Maximum number of images, evenly spaced, for computing a mean image."""
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
-"""Variance of pixels (0 to 255) below which it is rounding error of equal images."""
+"""Variance of pixels (0 to 255) up to which images count as equal, because of rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +57,13 @@ class Observations:
         return [self.vector, *self.images, *mask]
 
     def like(self, parts: Sequence[Tensor]) -> Observations:
-        """Return observations of other tensors, in the order of `parts`."""
+        """Return observations with other tensors, in the order that `self.parts` returns."""
         n_images = len(self.images)
         mask = None if self.mask is None else parts[-1]
         return Observations(parts[0], tuple(parts[1 : 1 + n_images]), mask)
 
     def rows(self, index: Tensor) -> Observations:
-        """Return a copy of the rows of an index (R,)."""
+        """Return a copy of the rows with these indexes (R,)."""
         if not self.images and self.mask is None:
             return Observations(self.vector.index_select(0, index))
         return self.like([part.index_select(0, index) for part in self.parts()])
@@ -75,7 +74,7 @@ class Observations:
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return stacks of `count` successive observations, each with the mask of its last."""
+        """Return stacks of `count` successive observations, each with its last mask."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -93,11 +92,11 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class ImageInput:
-    """The shape and normalization of one camera's images: (pixels - shift) / scale.
+    """Shape and normalization of one camera's images: (pixels - shift) / scale.
 
     Attributes:
         shape: (height, width, channels).
-        shift: (height, width, channels) float32, in 0 to 255; None is 0 everywhere.
+        shift: (height, width, channels) float32, from 0 to 255; None is all zeros.
         scale: Divisor of the shifted pixels.
     """
 
@@ -112,7 +111,7 @@ class ImageInput:
         return replace(self, shape=(height, width, channels * count), shift=shift)
 
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
-        """Return the input whose shift is the mean image and whose scale is the deviation.
+        """Return the input with the mean image as shift and the standard deviation as scale.
 
         All pixels share one scale, so pixels that hardly change stay small.
 
@@ -133,7 +132,7 @@ class ImageInput:
 
 
 class ObservationEncoder:
-    """An encoder of observations of one space as tensors; saved with each policy.
+    """Encoder from observations of one space to tensors, saved with each policy.
 
     Attributes:
         space: Space of one observation.
@@ -141,7 +140,7 @@ class ObservationEncoder:
         image_inputs: Shape and normalization of each image.
         images: Leaves of the space that are images.
         numbers: Leaves that form the vector, with their spaces.
-        mask: Leaf that is the action mask, if any.
+        mask: Leaf of the action mask, if any.
         shift: (V,) float32, subtracted from the vector.
         scale: (V,) float32, divisor of the shifted vector.
     """
@@ -195,7 +194,7 @@ class ObservationEncoder:
             observations: Arrays (B, *shape), or nested dicts of such arrays.
 
         Raises:
-            SpaceError: They have other shapes.
+            SpaceError: The observations have other shapes.
         """
         for leaf in self.leaves:
             _check_shape(leaf, observations)
@@ -234,15 +233,15 @@ class ObservationEncoder:
         if self.mask is None:
             return None
         allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # After the end of an episode no action may be allowed; values there are never used.
+        # The mask after an episode's end may allow no action; values there are never used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 
 
 def _is_image(space: spaces.Space[Any]) -> bool:
-    """Return whether a space is of images: uint8, (height, width) or (height, width, channels).
+    """Return whether a space has uint8 images (height, width) or (height, width, channels).
 
     Raises:
-        SpaceError: It is, but the convolutions do not support its shape.
+        SpaceError: The convolutions do not support the shape of the images.
     """
     if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
         return False
@@ -265,7 +264,7 @@ def _part_of(space: spaces.Space[Any], path: tuple[str, ...]) -> spaces.Space[An
 
 
 def discrete_sizes(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
-    """Return the number of values of each counter of a discrete space; None for other spaces."""
+    """Return the sizes of a Discrete or MultiDiscrete space; None for other spaces."""
     if isinstance(space, spaces.Discrete):
         return np.array([space.n])
     return space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else None
@@ -277,7 +276,7 @@ def _width(space: spaces.Space[Any]) -> int:
 
 
 def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return the numbers (B, width) of a part of the space: counters as one-hot codes."""
+    """Return a part of the space as numbers (B, width); discrete values are one-hot encoded."""
     sizes = discrete_sizes(space)
     flat = np.asarray(values).reshape(len(values), -1)
     if sizes is None:
@@ -300,4 +299,4 @@ def _check_shape(leaf: Leaf, observations: Any) -> None:
     if len(got) == 0 or got[1:] != leaf.shape:
         wanted = ", ".join(map(str, ("B", *leaf.shape)))
         where = f" of {'.'.join(leaf.path)}" if leaf.path else ""
-        raise SpaceError(f"takes observations ({wanted}){where}, got {got}")
+        raise SpaceError(f"expects observations ({wanted}){where}, got {got}")

@@ -1,4 +1,4 @@
-"""Datasets from several weighted logs: the argument `DATA...` of commands."""
+"""Datasets from several weighted logs, for the argument `DATA...` of commands."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
         threads: Number of threads that read chunks.
 
     Raises:
-        UsageError: A weight is negative or infinite, or a file is named with two weights.
+        UsageError: A weight is negative or infinite, or a file has two weights.
         LogError: A file is missing, damaged, not an MCAP file, or has no finished episode.
         SpaceError: The spaces of the logs differ.
     """
@@ -42,7 +42,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
 
 
 def _split_weight(part: str) -> tuple[str, float]:
-    """Split `logs/a.mcap:2` into name and weight, unless a file has this whole name."""
+    """Split `logs/a.mcap:2` into name and weight, unless a file with the whole name exists."""
     name, colon, number = part.rpartition(":")
     if not colon or Path(part).exists():
         return part, 1.0

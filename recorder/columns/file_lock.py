@@ -39,15 +39,15 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
         if path.exists():
             return replaced(path, reopen(path), 0)
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = _locked(FileIO(path, "x"), path)
+        with contextlib.suppress(FileExistsError):
+            file = _locked(FileIO(path, "x"), path)
+            if is_at(file.fileno(), path):
+                return file
+            release(file)
     except OSError as error:
-        # Another process may have created the file since it was looked for.
-        check_target(path, overwrite=overwrite)
         raise LogError(f"cannot write {path}: {error.strerror or error}") from error
-    if not is_at(file.fileno(), path):
-        release(file)
-        raise _taken(path)
-    return file
+    # Another process has created or replaced the file since it was looked for.
+    raise _taken(path)
 
 
 def reopen(path: Path) -> FileIO:

@@ -1,1 +1,1 @@
-"""Reading logs into datasets of NumPy arrays."""
+"""Datasets of NumPy arrays, read from logs."""

@@ -22,7 +22,7 @@ class Episode:
         rewards: (T,) float64.
         terminated: (T,) bool; only the last element can be set.
         truncated: (T,) bool; only the last element can be set.
-        next_observations: like `observations`, one step later.
+        next_observations: Next observations, in the form of `observations`.
         behavior_probs: (T,) float32; NaN where unknown.
         log_time_ns: (T + 1,) log_time of each observation, nanoseconds.
         summary: The log's summary of the episode: seed, end reason, policy, ...
@@ -51,7 +51,7 @@ class Episode:
 
     @property
     def reason(self) -> str:
-        """Reason of the end, as the environment reported it."""
+        """Reason of the episode's end, as the environment reported it."""
         return self.summary.reason
 
     @property
@@ -61,7 +61,7 @@ class Episode:
 
     @property
     def policy(self) -> str:
-        """Name of the policy that acted."""
+        """Name of the behavior policy."""
         return self.summary.policy
 
     @property
@@ -82,7 +82,7 @@ class Episode:
         )
 
 
-# The public path, for reprs and pickles.
+# Public import path, for reprs and pickles.
 Episode.__module__ = "mcaprl"
 
 

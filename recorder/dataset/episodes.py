@@ -1,4 +1,4 @@
-"""Episodes of a log: their order, their lengths, and their summaries from `/rl/episode`."""
+"""Order, lengths and summaries of a log's episodes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mcaprl.recorder.format.reading import Columns, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
-"""Fields that give a record's episode, its step, and whether it is the final record."""
-# This many rows of a column fit into a processor's cache.
+"""Fields of a record's episode, its step, and whether it is the final record."""
+# Number of rows of a column that fit into the processor's cache.
 _BLOCK_ROWS = 2**15
 
 
@@ -34,8 +34,8 @@ def time_order(topic: Topic) -> NDArray[np.int64] | None:
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
     """Return the order of `/rl/step` records that yields whole episodes; None for file order.
 
-    This is the order of log_time. If two robots wrote at the same time, each on its own channel,
-    it is one channel after the other.
+    Records are ordered by log_time, or by channel and then log_time if channels were recorded at
+    the same time, for example by two robots.
 
     Raises:
         CorruptLogError: No order yields whole episodes.
@@ -67,7 +67,7 @@ def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     read = int(finals[-1]) + 1
     steps, episodes = columns["step"][:read], columns["episode"][:read]
-    # An episode begins after a final record; every other record is followed by the next step.
+    # An episode begins after a final record; the next step follows every other record.
     begins = np.concatenate([[0], finals[:-1] + 1])
     breaks = np.concatenate([_breaks(steps, 1), _breaks(episodes, 0)])
     wrong = [begins[steps[begins] != 0], breaks[~final[breaks]] + 1]
@@ -96,21 +96,21 @@ def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
 
 
 class EpisodeTopic:
-    """The summaries on `/rl/episode`; none if the topic has another writer's message type."""
+    """The summaries on `/rl/episode`; empty if the topic has another message type."""
 
     def __init__(self, topic: Topic) -> None:
-        """Refer to the topic; nothing is read yet."""
+        """Store the topic without reading messages."""
         self._topic = topic
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) transitions of each episode; empty if the messages are out of order."""
+        """(E,) number of transitions of each episode; empty if messages are out of order."""
         if not self._is_ours or not (np.diff(self._columns["end_time_ns"]) > 0).all():
             return np.empty(0, np.int64)
         return self._columns["length"].astype(np.int64)
 
     def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-        """Read the summaries of the episodes that end at these log_times, and maybe of others."""
+        """Read at least the summaries of the episodes that end at these log_times."""
         if not self._is_ours:
             return []
         fields, rows = EpisodeSummary._fields, None
@@ -139,18 +139,18 @@ class EpisodeTopic:
 def summaries(
     path: object, columns: Columns, lengths: NDArray[np.int64], recorded: list[EpisodeSummary]
 ) -> tuple[EpisodeSummary, ...]:
-    """Return a summary of each episode, computed from its records where none was recorded.
+    """Return a summary of each episode, computed from its records if not recorded.
 
     Args:
         path: Path of the log for error messages.
         columns: Columns of `/rl/step`.
-        lengths: (E,) transitions of each episode.
+        lengths: (E,) number of transitions of each episode.
         recorded: Summaries from `/rl/episode`.
 
     Raises:
-        CorruptLogError: A recorded summary does not agree with the records.
+        CorruptLogError: A recorded summary disagrees with the records.
     """
-    # Keyed by the final record's time, because appended recordings count episodes from 0 again.
+    # Keyed by the final record's time, because indexes restart from 0 in appended recordings.
     by_end = {summary.end_time_ns: summary for summary in recorded}
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()

@@ -1,11 +1,11 @@
-"""Logs of other writers: spaces inferred from `/rl/step` where there is no metadata.
+"""Logs of other writers, without metadata: spaces are inferred from `/rl/step`.
 
-Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema`, of any numeric type
-and in any order; other fields are ignored, and `behavior_prob` may be missing. Vectors are in
+Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema.py`, of any numeric
+type and in any order; other fields are ignored, and `behavior_prob` is optional. Vectors are in
 `observation`, or in `observation_<key>` for each key of a Dict space; images are on topics
 `/rl/observation/<key>`, with the log_times of the step records. The inferred spaces are unbounded
-Boxes; integer actions are Discrete up to the largest action. A field `observation` beside fields
-`observation_<key>` becomes the key `state`.
+Boxes; integer actions are Discrete up to the largest action. If there are both `observation` and
+`observation_<key>` fields, `observation` becomes the key `state`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _OBSERVATION, _STATE, _IMAGE_TOPIC = "observation", "observation_state", "/rl/ob
 
 
 def observation_fields(fields: Iterable[str]) -> list[str]:
-    """Return the names of the fields that are observations."""
+    """Return the names of the observation fields."""
     return [name for name in fields if name == _OBSERVATION or name.startswith(f"{_OBSERVATION}_")]
 
 

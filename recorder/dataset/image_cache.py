@@ -1,4 +1,4 @@
-"""Storage of image observations, including an uncompressed copy that can be memory-mapped."""
+"""Storage of image observations in memory, or on disk in uncompressed chunks."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def free_memory_bytes() -> float:
 def image_cache(
     reader: McapReader, topic: Topic, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
 ) -> McapReader:
-    """Open the copy of a log's images in uncompressed chunks; write it beside the log if needed.
+    """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
     Args:
         reader: Reader of the log.

@@ -1,4 +1,4 @@
-"""Reads `/rl/learner`: exploration and version of the policy while it was learning."""
+"""Reader of `/rl/learner`: the policy's exploration and version during learning."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mcaprl.recorder.format.topics import LEARNER_TOPIC
 
 @dataclass(frozen=True, eq=False)
 class LearnerColumns:
-    """State of the learner at each of a log's N transitions, in order.
+    """Exploration and policy version at each of a log's N transitions, in order.
 
     Attributes:
         log_time_ns: (N,) log_time of the transition's observation, nanoseconds.
@@ -29,10 +29,10 @@ class LearnerColumns:
 
 
 def read_learner(path: str | Path) -> LearnerColumns:
-    """Read what `RecordVecMcap(..., policy_version=...)` recorded with the transitions.
+    """Read the learner's columns that `RecordVecMcap(..., policy_version=...)` recorded.
 
     Raises:
-        LogError: The file has no such topic, or is damaged.
+        LogError: The file has no topic `/rl/learner`, or is damaged.
     """
     topic = Topic(McapReader(path), LEARNER_TOPIC)
     if not topic.fields:

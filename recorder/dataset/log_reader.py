@@ -1,4 +1,4 @@
-"""Reads one log of format version 1, or what is asked for of it: chunks -> columns -> episodes."""
+"""Reader of one log of format version 1: chunks -> columns -> episodes."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from mcaprl.recorder.format.schema import is_intact, stored_dtype
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves, restricted, select
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
-# Steps; see `_without`.
+# Number of steps; see `_without`.
 _LONG_EPISODE = 100
 REQUIRED_FIELDS = ("reward", "action", "terminated", "truncated", *COUNTERS)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What of a log is to be read, and how; see `reader.open_logs`."""
+    """Columns to read of a log, and their storage; see `open_logs`."""
 
     columns: tuple[str, ...] | None = None
     images: Storage = "memory"
@@ -47,13 +47,13 @@ class Selection:
 
 
 class LogReader:
-    """One log, open for reading."""
+    """A log that is open for reading."""
 
     def __init__(self, path: Path, selection: Selection | None = None) -> None:
-        """Open the file. Only its summary is read.
+        """Open the file and read its summary section.
 
         Raises:
-            LogError: it is no MCAP, has no steps, or its metadata is damaged.
+            LogError: The file is not an MCAP file, has no steps, or its metadata is damaged.
         """
         self.path = path
         self._selection = selection or Selection()
@@ -64,13 +64,13 @@ class LogReader:
 
     @cached_property
     def lengths(self) -> NDArray[np.int64]:
-        """(E,) transitions of each finished episode.
+        """(E,) number of transitions of each finished episode.
 
         Raises:
-            CorruptLogError: records are missing, doubled or out of order.
-            NoEpisodesError: there is no finished episode.
+            CorruptLogError: Records are missing, duplicated or out of order.
+            NoEpisodesError: The log has no finished episode.
         """
-        # The summaries are compared with the records when these are read.
+        # Reading the records validates these lengths.
         listed = self._summaries.lengths if self._reader.complete else np.empty(0, np.int64)
         if self._steps.chunks_rise and int(listed.sum()) + len(listed) == len(self._steps):
             return listed
@@ -81,10 +81,10 @@ class LogReader:
         """Read whole episodes.
 
         Args:
-            episodes: their numbers, rising; default: all.
+            episodes: Increasing indexes of the episodes; default: all.
 
         Raises:
-            LogError: chunks are damaged, records are missing, or fields are.
+            LogError: Chunks are damaged, or records or fields are missing.
         """
         wanted = self._wanted()
         self._check_fields(wanted)
@@ -112,18 +112,17 @@ class LogReader:
         lengths = self.lengths
         firsts = np.cumsum(lengths + 1) - (lengths + 1)
         rows = ranges(firsts[episodes], lengths[episodes] + 1)
-        # The order is found in the indexes of all chunks, or need not be.
         if not self._steps.chunks_rise and self._order is not None:
             rows = self._order[rows]
         columns = self._steps.read(wanted, rows, threads=self._selection.threads)
         if not np.array_equal(episode_lengths(columns, self._name), lengths[episodes]):
             raise CorruptLogError(
-                f"{self.path}: {EPISODE_TOPIC} and {STEP_TOPIC} do not agree on the episodes"
+                f"{self.path}: {EPISODE_TOPIC} and {STEP_TOPIC} contain different episodes"
             )
         return columns, lengths[episodes]
 
     def _wanted(self) -> list[str]:
-        """The fields of `/rl/step` that are to be read."""
+        """Return the names of the fields to read from `/rl/step`."""
         fields = self._steps.fields
         wanted = [*REQUIRED_FIELDS, *(name for name in ("behavior_prob",) if name in fields)]
         if self._metadata is None:
@@ -131,7 +130,7 @@ class LogReader:
         return wanted + [leaf.name for leaf in self._leaves(self._metadata) if not leaf.encoding]
 
     def _leaves(self, metadata: LogMetadata) -> list[Leaf]:
-        """The observations that are to be read, by their names in the file."""
+        """Return the observation leaves to read."""
         every = observation_leaves(metadata.observation_space)
         return select(every, self._selection.columns)
 
@@ -145,14 +144,14 @@ class LogReader:
         odd = [name for name in wanted if fields[name].kind == "O"]
         if odd:
             raise LogError(
-                f"{self.path}: {', '.join(odd)} of {STEP_TOPIC} is neither number nor array"
+                f"{self.path}: {', '.join(odd)} of {STEP_TOPIC} is neither a number nor an array"
             )
 
     def _finished(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
         """Warn about records after the last finished episode.
 
         Raises:
-            NoEpisodesError: there is no finished one.
+            NoEpisodesError: The log has no finished episode.
         """
         if not len(lengths):
             raise NoEpisodesError(f"{self.path} has no finished episode")
@@ -205,25 +204,25 @@ class LogReader:
 
 
 def describe(reader: McapReader) -> LogMetadata:
-    """The metadata of a log.
+    """Return the metadata of a log, or empty metadata if the log has none.
 
     Raises:
-        NoStepsError: the file has no steps.
-        LogError: its metadata is missing, of a later version, or damaged.
+        NoStepsError: The file has no steps.
+        LogError: The metadata is incomplete, of a later version, or damaged.
     """
     _steps_of(reader)
     return described(reader) or LogMetadata.from_strings({})
 
 
 def described(reader: McapReader) -> LogMetadata | None:
-    """The metadata of a log; None if it has none, for it is not one of ours.
+    """Return the metadata of a log, or None if the log is of another writer.
 
     Raises:
-        LogError: it is of a later version, or damaged.
+        LogError: The metadata is of a later version, or damaged.
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The channel's copy is also in the summary, which has a CRC.
+        # The summary section, which has a CRC, also contains the channel's copy.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata
@@ -246,7 +245,7 @@ def _steps_of(reader: McapReader) -> Topic:
     if not channels:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
-            f"{reader.path} has no topic {STEP_TOPIC}, so no transitions (topics: {topics})"
+            f"{reader.path} has no topic {STEP_TOPIC}, hence no transitions (topics: {topics})"
         )
     for schema in map(reader.schema_of, channels):
         if not is_intact(schema.name, schema.data):
@@ -255,10 +254,10 @@ def _steps_of(reader: McapReader) -> Topic:
 
 
 def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
-    """A field's column with the shape and dtype of its leaf.
+    """Return a field's column in the shape and dtype of its leaf.
 
     Raises:
-        CorruptLogError: it does not fit the leaf without loss.
+        CorruptLogError: The column does not convert exactly.
     """
     column = columns[leaf.name]
     if column[0].size == leaf.size:
@@ -277,17 +276,17 @@ def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
 
 
 def _flags(column: NDArray[Any]) -> NDArray[np.bool_]:
-    """A column of bytes as bools; anything but 0 is true."""
+    """Convert a column of bytes to bools; every value other than 0 is true."""
     if column.dtype == np.uint8 and column.max(initial=0) <= 1:
         return column.view(np.bool_)
     return column.astype(np.bool_)
 
 
 def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Return a column without some rows; the input array may be overwritten."""
+    """Return a column without these rows; the input may be overwritten."""
     if len(column) < _LONG_EPISODE * len(rows):
         return np.delete(column, rows, axis=0)
-    # Moving long runs of rows is cheaper than allocating another column.
+    # Moving long ranges of rows is cheaper than allocating another column.
     starts, stops = rows[:-1] + 1, rows[1:]
     for moved, (start, stop) in enumerate(zip(starts.tolist(), stops.tolist(), strict=True), 1):
         column[start - moved : stop - moved] = column[start:stop]

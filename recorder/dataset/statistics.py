@@ -16,7 +16,7 @@ from mcaprl.recorder.format.spaces import Leaf
 
 @dataclass(frozen=True)
 class Column:
-    """Statistics of one observation leaf: per element for a vector, over all pixels for images.
+    """Statistics of an observation leaf: per element of a vector, or over all pixels of images.
 
     Attributes:
         mean: Mean of the finite values.
@@ -43,7 +43,7 @@ class Statistics:
         returns: (E,) undiscounted return of each episode.
         lengths: (E,) number of transitions of each episode.
         ends: Number of episodes by end reason.
-        duration_s: Simulated time of all episodes, seconds.
+        duration_s: Total simulated time of the episodes, seconds.
         observations: Statistics of the observations by leaf name.
         action_counts: Number of steps by action, for integer actions; otherwise empty.
     """
@@ -108,7 +108,7 @@ def _describe(leaf: Leaf, frames: Frames) -> Column:
 
 
 def _describe_image(frames: Frames) -> Column:
-    """Compute statistics from the pixels' histogram; float copies would not fit into memory."""
+    """Compute statistics from a histogram of the pixels, to avoid float copies of the images."""
     counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
     codes = np.arange(256.0)
     seen = codes[counts > 0] if len(frames) else np.full(1, np.nan)

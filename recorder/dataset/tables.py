@@ -1,6 +1,6 @@
-"""Datasets as PyArrow tables. Requires the extra `tables`.
+"""Conversion of datasets to PyArrow tables. Requires the extra `tables`.
 
-A vector becomes one column per element, `observation.<name>` or `observation.<index>`; an array of
+A vector becomes one column per element, `observation.<name>` or `observation.<index>`. An array of
 more than MAX_COLUMNS elements, such as an image, becomes one column of flat lists.
 """
 

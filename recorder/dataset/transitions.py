@@ -1,8 +1,8 @@
-"""The columns of a dataset: one row per observation, and one per transition for the rest.
+"""The columns of a dataset.
 
 E episodes with N transitions in total have F = N + E frames: each episode's T + 1 observations, in
-order. The next observation of a transition is the frame after its own, so no observation is stored
-twice.
+order. A transition's observation and next observation are consecutive frames, so no observation is
+stored twice.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ class Transitions:
     """Columns of whole episodes.
 
     Attributes:
-        frames: (F, *shape) for each leaf of the observation space.
+        frames: (F, *shape) array of each leaf of the observation space.
         log_time_ns: (F,) int64, nanoseconds since the Unix epoch.
         actions: (N,) or (N, *shape).
         rewards: (N,) float64.
         terminated: (N,) bool.
         truncated: (N,) bool.
         behavior_probs: (N,) float32; NaN where unknown.
-        episodes: Summaries of the episodes, in order; their lengths give the episodes' rows.
+        episodes: Summaries of the episodes, in order; their lengths determine the episodes' rows.
     """
 
     frames: tuple[Frames, ...]
@@ -66,12 +66,12 @@ class Transitions:
         return self.first_steps + np.arange(len(self.episodes))
 
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) frame index of each transition's observation; + 1 for the next observation."""
+        """Return the (N,) frame index k of each transition's observation; the next one is k + 1."""
         episode_of_step = np.repeat(np.arange(len(self.episodes)), self.lengths)
         return np.arange(len(self.rewards)) + episode_of_step
 
     def take(self, chosen: Sequence[int]) -> Transitions:
-        """Copy some episodes, in the order given."""
+        """Copy the chosen episodes, in the given order."""
         rows = np.array(chosen, np.int64)
         steps = ranges(self.first_steps[rows], self.lengths[rows])
         frames = ranges(self.first_frames[rows], self.lengths[rows] + 1)
@@ -102,7 +102,7 @@ class Transitions:
 
 @dataclass(frozen=True)
 class TransitionBatch:
-    """B transitions of a dataset, copied.
+    """A copy of B transitions of a dataset.
 
     Attributes:
         observations: (B, *shape), or nested dicts of such arrays.
@@ -110,7 +110,7 @@ class TransitionBatch:
         rewards: (B,) float64.
         terminated: (B,) bool.
         truncated: (B,) bool.
-        next_observations: like `observations`, one step later.
+        next_observations: Next observations, in the form of `observations`.
         behavior_probs: (B,) float32; NaN where unknown.
     """
 

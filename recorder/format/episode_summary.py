@@ -1,4 +1,4 @@
-"""The summary of an episode on `/rl/episode`, and the sum of its rewards."""
+"""Summary of an episode on `/rl/episode`, and sums of rewards."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcaprl.recorder.format import messages
 
 INTERRUPTED = "interrupted"
-"""End reason of an episode that was ended by the recorder instead of the environment."""
+"""End reason of an episode that the recorder ended, not the environment."""
 
 
 class EpisodeSummary(NamedTuple):
@@ -64,13 +64,13 @@ class EpisodeSummary(NamedTuple):
 
 
 def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
-    """Add up rewards in order, which gives the same bits on every machine.
+    """Add up rewards in order, with bit-identical results on every machine.
 
-    `np.sum` adds pairwise and `sum` compensates rounding errors from Python 3.12 on.
+    `np.sum` adds pairwise, and `sum` compensates rounding errors since Python 3.12.
 
     Args:
         rewards: (T,) rewards.
-        start: Sum of the rewards before these.
+        start: Sum of all earlier rewards.
     """
     if start:
         rewards = np.concatenate([[start], rewards])

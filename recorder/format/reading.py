@@ -1,4 +1,4 @@
-"""Reading MCAP files: what the rooms above `format` use of `columns`."""
+"""Re-exports of `columns` for packages that read MCAP files."""
 
 from __future__ import annotations
 

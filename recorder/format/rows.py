@@ -1,6 +1,6 @@
-"""Preallocated message records of one topic, addressed by field; `/rl/step` is defined by StepRows.
+"""Preallocated message records of one topic, addressed by field.
 
-A block of rows has the shape (rows,), or (episodes, rows) where several episodes are open at once.
+A block of rows has the shape (rows,), or (episodes, rows) if several episodes are open at once.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from mcaprl.recorder.format.schema import fill_image_constants, image_dtype, mes
 from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
 Write = Callable[[NDArray[Any]], None]
-"""Write message records of one channel as one chunk."""
-# What a final record contains besides the episode's last observation.
+"""Function that writes message records of one channel as one chunk."""
+# Values of a final record besides the episode's last observation.
 _FINAL = {
     "action": 0,
     "reward": 0.0,
@@ -34,7 +34,7 @@ class TopicRows:
     """Message records of one topic.
 
     Attributes:
-        fields: The columns of the message by name, as views.
+        fields: Views of the fields of all rows, by field name.
     """
 
     def __init__(self, rows: NDArray[Any], write: Write) -> None:
@@ -50,7 +50,7 @@ class TopicRows:
         Args:
             text: ROS 2 definition of the message.
             channel_id: Channel of the topic.
-            most: Number of rows; fewer are allocated where these exceed a chunk's size.
+            most: Maximum number of rows; all rows also have to fit into a chunk.
             write: Function that writes rows as one chunk.
         """
         dtype = message_dtype(text)
@@ -86,7 +86,7 @@ class TopicRows:
         return block
 
     def put(self, field: str, where: Any, values: Any) -> None:
-        """Put values of a field.
+        """Set values of a field.
 
         Args:
             field: Name in the message.
@@ -99,12 +99,12 @@ class TopicRows:
         column[where] = values
 
     def write(self, where: Any, times_ns: Any) -> None:
-        """Set the log_time of a run of rows, and write them as one chunk."""
+        """Set the log_time of consecutive rows, and write these rows as one chunk."""
         self._log_time[where] = times_ns
         self._write(self._rows[where])
 
     def write_columns(self, times_ns: NDArray[Any], columns: Mapping[str, Any]) -> None:
-        """Write a message for each log_time, in chunks of at most as many as there are rows.
+        """Write a message for each log_time, in chunks of at most `len(self)` messages.
 
         Args:
             times_ns: (K,) log_times.
@@ -121,12 +121,12 @@ class TopicRows:
 class StepRows(TopicRows):
     """Rows of `/rl/step`: the T transitions of an episode, then its final record.
 
-    `number` sets the counters of a run of rows and clears the flags of an earlier use; `put` then
+    `number` sets the counters of consecutive rows and clears their end flags; `put` then
     sets the other fields, `finish` makes the last rows final, and `write` adds the times.
     """
 
     def number(self, where: Any, episode: Any, steps: Any) -> None:
-        """Set `episode` and `step` of a run of rows, and mark none of them as an end.
+        """Set `episode` and `step` of consecutive rows, and clear their end flags.
 
         Args:
             where: Index of K rows.
@@ -139,7 +139,7 @@ class StepRows(TopicRows):
             fields[name][where] = False
 
     def finish(self, where: Any) -> None:
-        """Make rows final: each keeps the observation, the episode and the step."""
+        """Make rows final; their observation, episode and step stay unchanged."""
         for name, value in _FINAL.items():
             self.fields[name][where] = value
 
@@ -160,14 +160,14 @@ class ImageRows(TopicRows):
         return cls(rows, write)
 
     def write(self, where: Any, times_ns: Any) -> None:
-        """Set log_time and the header's stamp of a run of rows, and write them as one chunk."""
+        """Set log_time and header stamp of consecutive rows, and write these as one chunk."""
         seconds, self.fields["nanosec"][where] = np.divmod(times_ns, 10**9)
         self.fields["sec"][where] = seconds
         super().write(where, times_ns)
 
 
 def make_final(message: NDArray[Any]) -> None:
-    """Turn transitions that are written already into final records, in place."""
+    """Turn encoded transitions into final records, in place."""
     for name, value in _FINAL.items():
         if name in (message.dtype.names or ()):
             message[name] = value

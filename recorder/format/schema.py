@@ -6,18 +6,18 @@ is a NumPy structured dtype, so a chunk of messages is one array.
 
 The fields of `/rl/step` are sorted by decreasing size, so there is no padding:
 
-    float64 reward              of the action taken here; 0 in a final record
+    float64 reward              reward of this record's action; 0 in a final record
     int64 | float32[M] action   0 in a final record
     float32[N] observation      one field per leaf of a Dict space, `observation_<key>`
     float32 behavior_prob       probability of the action under the policy that took it, or NaN
     uint32 episode, step        counted from 0
-    bool terminated, truncated  of the transition that starts here
-    bool final                  this record holds only an episode's last observation
+    bool terminated, truncated  flags of the transition that starts in this record
+    bool final                  whether the record contains only an episode's last observation
 
 `/rl/learner` has one message for each transition, with the transition's log_time:
 
     float64 epsilon             probability of a random action; NaN if unknown
-    int64 policy_version        updates that the policy had seen; -1 if unknown
+    int64 policy_version        number of updates of the policy; -1 if unknown
 
 Observations and actions keep their dtype (float16 is widened to float32). Image observations are
 `sensor_msgs/msg/Image` messages on separate topics, with the same log_time.
@@ -57,7 +57,7 @@ _FIELD = re.compile(r"(\w+)(?:\[(\d+)\])?\s+([a-z][a-z0-9_]*)")
 def step_schema(
     observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
 ) -> tuple[str, str]:
-    """Name and definition text of `/rl/step` for a pair of spaces.
+    """Return the type name and definition of `/rl/step` for a pair of spaces.
 
     The name contains a hash of the text, because a viewer with several logs open expects one
     layout for each name.
@@ -82,25 +82,25 @@ def step_schema(
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
-    """Name and definition text of a message of float32 scalars, one per name: they are to plot.
+    """Return the type name and definition of a message with one float32 scalar per name.
 
     Raises:
-        SpaceError: a name is no ROS field name.
+        SpaceError: A name is not a ROS field name.
     """
     names = list(names)
     for name in names:
         if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name):
             raise SpaceError(
-                f"telemetry '{name}' is no ROS field name: lower case letters, digits and single"
-                " underscores"
+                f"telemetry name '{name}' is not a ROS field name: use lowercase letters, digits"
+                " and single underscores"
             )
     return _named("Telemetry", [("float32", 0, name) for name in names])
 
 
 def telemetry_message(values: Iterable[float]) -> bytes:
-    """A message of `telemetry_schema`.
+    """Encode a message of `telemetry_schema`.
 
-    Values are rounded to 16 significant bits, more than four digits, which is enough for plots and
+    Values are rounded to 16 significant bits (more than four digits), which is enough for plots and
     compresses better.
     """
     mantissas, exponents = np.frexp(np.fromiter(values, np.float64))
@@ -109,19 +109,19 @@ def telemetry_message(values: Iterable[float]) -> bytes:
 
 
 def values_schema(actions: int) -> tuple[str, str]:
-    """Name and definition text of what a policy thinks of a step: `/rl/values`.
+    """Return the type name and definition of `/rl/values`, a policy's evaluation of a step.
 
     float32[A] q            value of each action; NaN if the policy has none
-    float32[A] preference   of each action: probabilities, or the softmax of the values
-    float32 value           of the state: the largest of q
-    float32 advantage       of the logged action: its q less `value`
+    float32[A] preference   probability of each action, or softmax of the values
+    float32 value           value of the state: maximum of q
+    float32 advantage       q of the logged action minus `value`
     float32 td_error        r + gamma max q(next) - q of the logged action
-    float32 entropy         of `preference`: 0 where it is sure, 1 where all are alike
-    int64 policy_action     what the policy would do
-    bool agrees             whether that is the logged action
+    float32 entropy         normalized entropy of `preference`: 1 if uniform
+    int64 policy_action     action that the policy selects
+    bool agrees             whether `policy_action` is the logged action
 
     Args:
-        actions: A, how many there are.
+        actions: Number of actions A.
     """
     fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
     fields += [("float32", actions, "preference")]
@@ -130,14 +130,14 @@ def values_schema(actions: int) -> tuple[str, str]:
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:
-    """The memory layout of a ROS 2 message definition, encapsulation header included.
+    """Return the memory layout of a ROS 2 message, including the encapsulation header.
 
     Args:
-        text: the definition, without nested types.
+        text: Definition without nested types.
 
     Returns:
-        A structured dtype with a field for each of the message's, and `encapsulation`; None if the
-        message has no fixed length.
+        Structured dtype with the fields of the message and `encapsulation`; None if the message has
+        no fixed length.
     """
     names, offsets = ["encapsulation"], [0]
     formats: list[np.dtype[Any]] = [np.dtype("<u4")]
@@ -162,12 +162,12 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
     except (ValueError, OverflowError):
-        # A field twice, or of a size that no memory holds.
+        # A repeated field name, or a size that overflows.
         return None
 
 
 def is_intact(name: str, text: bytes) -> bool:
-    """Whether a definition is the one that its name was made for; others' names tell nothing."""
+    """Return whether a definition matches the hash in its name; True if there is no hash."""
     match = re.fullmatch(r"mcaprl_msgs/msg/(?:Step|Telemetry|Values)([0-9a-f]{8})", name)
     return match is None or match[1] == _digest(text)
 
@@ -175,17 +175,17 @@ def is_intact(name: str, text: bytes) -> bool:
 def image_dtype(
     height: int, width: int, channels: int, encoding: str, frame_id: str, item_bytes: int = 1
 ) -> np.dtype[Any]:
-    """The memory layout of a `sensor_msgs/msg/Image` whose size and texts are known.
+    """Return the memory layout of a `sensor_msgs/msg/Image` of known size and strings.
 
-    Its strings are of fixed content, so every message of the topic has one length.
+    The strings are constant, so all messages of the topic have the same length.
 
     Args:
-        height: rows.
-        width: columns.
-        channels: values per pixel.
-        encoding: such as `mono8`.
-        frame_id: of the header.
-        item_bytes: bytes per value.
+        height: Number of rows.
+        width: Number of columns.
+        channels: Number of values per pixel.
+        encoding: Encoding, such as `mono8`.
+        frame_id: Frame of the header.
+        item_bytes: Number of bytes per value.
     """
     layout: list[tuple[str, Any]] = [("encapsulation", "<u4"), ("sec", "<i4"), ("nanosec", "<u4")]
     used = 12
@@ -218,7 +218,7 @@ def fill_image_constants(
     encoding: str,
     frame_id: str,
 ) -> None:
-    """Write the fields that are the same in every image of a topic."""
+    """Set the fields that are the same in every image of a topic."""
     data_bytes = messages.dtype["data"].itemsize
     messages["encapsulation"] = ENCAPSULATION
     messages["frame_id_length"], messages["frame_id"] = len(frame_id) + 1, frame_id.encode()
@@ -228,7 +228,7 @@ def fill_image_constants(
 
 
 def stored_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The dtype that holds a leaf's values in a message: ROS has no float16, and bool is a byte."""
+    """Return the dtype of a leaf in a message: ROS has no float16, and bool is a byte."""
     if dtype == np.float16:
         return np.dtype("<f4")
     return np.dtype("u1") if dtype == np.bool_ else dtype.newbyteorder("<")

@@ -1,1 +1,1 @@
-"""Recording: Gymnasium environments to rows of the log format."""
+"""Wrappers that record Gymnasium environments to MCAP logs."""

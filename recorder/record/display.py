@@ -1,11 +1,10 @@
-"""Topics that only viewers read, written beside the transitions and under the same times.
+"""Topics that only viewers read, with the same log times as the transitions.
 
 /scene, /scene/static   shapes: moving ones at most five times a second and at each episode's start
-                        and end; static ones when they differ from those of the episode before. A
-                        viewer that jumps into the file fetches the last message of each topic, and
-                        needs no other
+                        and end; static ones when they differ from the previous episode's. A viewer
+                        that seeks needs only the latest message of each topic
 /tf, /tf_static         frames: moving ones at each step; static ones as above
-/telemetry              numbers to plot: the environment's, and the return so far
+/telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
 """
 
@@ -33,9 +32,9 @@ from mcaprl.recorder.record.step_rows import ImageColumn
 
 SCENE, SCENE_STATIC = "/scene", "/scene/static"
 TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
-# Display messages are written when they exceed this size, or the episode ends.
+# Display messages are written when they exceed this size or the episode ends.
 _CHUNK_BYTES = 2**20
-# Bodies move with their frames at each step; other moving shapes are drawn again after this time.
+# Bodies move with their frames at each step; other moving shapes are redrawn after this time.
 _SCENE_PERIOD_NS = 200_000_000
 
 
@@ -49,7 +48,7 @@ class ShownTopics:
     """
 
     def __init__(self, log: LogTopics, source: object) -> None:
-        """Announce the topics that `source` can fill; it has been reset."""
+        """Announce the topics that `source`, an environment after `reset`, provides."""
         types: dict[str, str] = {}
         self.telemetry_names: tuple[str, ...] = ()
         self.follow_frame = ""
@@ -73,15 +72,14 @@ class Display:
     """The display messages of an episode, collected and written in separate chunks."""
 
     def __init__(self, log: LogTopics, source: object, *, scene: bool, camera: bool) -> None:
-        """Prepare for an environment.
+        """Select the topics to record.
 
         Args:
-            log: Log that is written to.
-            source: Unwrapped environment. What it shows depends on which protocols of `scene` it
-                has.
+            log: Log to write to.
+            source: Unwrapped environment, which implements any of the protocols in `scene.py`.
             scene: Whether to record shapes, frames and telemetry.
-            camera: Whether to record the depth camera. Environments whose observations have images
-                record it in any case.
+            camera: Whether to record the depth camera, which is always recorded if observations
+                contain images.
         """
         self._log, self._source = log, source if scene else None
         self._messages: list[tuple[int, int, bytes]] = []
@@ -96,22 +94,22 @@ class Display:
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._shown: ShownTopics | None = None
         self._static: dict[str, bytes] = {}
-        # The latest shapes that were not drawn yet: an episode's last ones are drawn at its end.
+        # Latest shapes that are not drawn yet; they are drawn at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
 
     @property
     def shown(self) -> ShownTopics:
-        """The topics that are written; defined after the first `begin`."""
+        """The announced scene and telemetry topics; defined after the first `begin`."""
         assert self._shown is not None, "no episode has begun"
         return self._shown
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Names of the topics that are written; defined after the first `begin`."""
+        """Names of all display topics; defined after the first `begin`."""
         return (*self.shown.channels, *((DEPTH,) if self._depth_images else ()))
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Begin an episode; the environment has just been reset.
+        """Begin an episode after the environment's reset.
 
         Args:
             start_ns: log_time of the first observation.
@@ -132,10 +130,10 @@ class Display:
             self._depth_images.begin(start_ns, step_ns)
 
     def observe(self, step: int, reward: float) -> None:
-        """Add what the environment shows after `step` steps.
+        """Add the environment's display messages after `step` steps.
 
         Args:
-            step: Steps since the episode's start.
+            step: Number of steps since the episode's start.
             reward: Reward of the last step; 0 at the start.
         """
         self._return_so_far += reward
@@ -164,12 +162,12 @@ class Display:
     def clear(self) -> None:
         """Drop the messages that are not written yet."""
         if self._messages:
-            # The static scene may have been among them.
+            # The dropped messages may include the static scene.
             self.resend_static()
         self._messages, self._bytes, self._pending = [], 0, None
 
     def resend_static(self) -> None:
-        """Write the static scene again with the next episode, because another file begins."""
+        """Write the static scene again with the next episode, for a new file."""
         self._static = {}
 
     def _draw_pending(self) -> None:
@@ -190,7 +188,7 @@ class Display:
             self._flush_messages()
 
     def _flush_messages(self) -> None:
-        # Sorted by topic, similar messages are close to each other: files are a tenth smaller.
+        # Sorting by topic puts similar messages next to each other, which saves 10% of file size.
         self._messages.sort(key=itemgetter(0))
         self._log.sink.write_messages(self._messages)
         self._messages, self._bytes = [], 0

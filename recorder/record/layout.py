@@ -1,8 +1,8 @@
-"""A Foxglove layout for a log: what to look at, and which series to plot.
+"""A Foxglove layout for a log: its panels and plotted series.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
-Foxglove and in Lichtblick. Each plotted series names one number: a slice would be drawn as one
-zig-zag line.
+Foxglove and in Lichtblick. Each plotted series is a scalar: array elements of a slice would all be
+joined into one line.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 TRAINING_TOPIC = "/rl/training"
-# Largest number of series in a plot; only the first ones are plotted.
+# Maximum number of series in a plot; further series are left out.
 MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
-# Telemetry that shows how well an agent follows its course, by the ends of names.
+# Plots of telemetry: title and suffix of the names.
 PLOTTED_ENDINGS = {"speed": "speed_m_s", "offsets": "offset_m"}
-# The depth image's colors cover this range, millimeters.
+# Range of the depth image's color map, millimeters.
 DEPTH_RANGE_MM = (0, 50_000)
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
 
@@ -100,7 +100,7 @@ def _plots(
     learning: Mapping[str, str],
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
-    """Add plots of reward and return, and below them tabs with all other numbers of the log."""
+    """Add plots of reward and return, and tabs below with all other numbers of the log."""
     returns = {"return of episode": "/rl/episode.total_reward"}
     if RETURN_SO_FAR in telemetry_names:
         returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
@@ -125,7 +125,7 @@ def _plots(
 
 
 def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the speeds and the offsets from the course, which share a plot by unit."""
+    """Return the series of each plot in `PLOTTED_ENDINGS`."""
     return {
         title: {name: f"/telemetry.{name}" for name in names if name.endswith(ending)}
         for title, ending in PLOTTED_ENDINGS.items()
@@ -133,7 +133,7 @@ def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return for each annotating policy its action values, TD error, advantage and entropy."""
+    """Return each annotating policy's action values, TD error, advantage and entropy."""
     series = {}
     for topic in topics:
         if not is_values_topic(topic):
@@ -147,7 +147,7 @@ def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dic
 
 
 def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return a series per number of an action, or per discrete action the steps that took it."""
+    """Return a series per component of an action, or per discrete action that marks its steps."""
     names = metadata.action_names()
     if names:
         taken = {
@@ -161,7 +161,7 @@ def _action_series(metadata: LogMetadata) -> dict[str, str]:
 
 
 def _observation_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return a named path per number of the vector observations, up to `MAX_SERIES`."""
+    """Return a series per component of the vector observations, up to `MAX_SERIES`."""
     paths = {}
     for leaf in observation_leaves(metadata.observation_space):
         if leaf.encoding is not None:
@@ -264,7 +264,7 @@ def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
 
 
 def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:
-    """Stack panels of equal size, unless the first one's share is given."""
+    """Stack panels of equal size, or with the first one's share given."""
     first, *rest = nodes
     if not rest:
         return first

@@ -1,8 +1,8 @@
 """Conversion of a simulator's scene into ROS messages.
 
 A simulator provides a scene by implementing one or more of the protocols below on its unwrapped
-environment. Any objects with these attributes describe shapes and frames, so a simulator imports
-nothing from here. Axes are those of REP 103: right-handed, z up, meters.
+environment. Shapes and frames are any objects with these attributes, so a simulator does not need
+to import this module. Axes follow REP 103: right-handed, z up, meters.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mcaprl.recorder.format import messages
 Vector = tuple[float, float, float]
 Quad = tuple[float, float, float, float]
 
-# visualization_msgs/msg/Marker: type of each kind of shape.
+# `type` of visualization_msgs/msg/Marker by kind of shape.
 MARKER_TYPES = {
     "arrow": 0,
     "box": 1,
@@ -33,22 +33,22 @@ MARKER_TYPES = {
 }
 _ADD, _DELETE_ALL = 0, 3
 _FOREVER = (0, 0)
-# Values rounded to binary fractions below a viewer's resolution take half the space in a log.
+# Rounding values to binary fractions, finer than viewers resolve, halves their size in a log.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**10
 _ROTATIONS_PER_ONE = 2**14
 
 
 class Shape(Protocol):
-    """One shape to draw."""
+    """A shape to draw."""
 
     @property
     def name(self) -> str:
-        """Unique in its scene."""
+        """Name, unique in the scene."""
 
     @property
     def kind(self) -> str:
-        """One of MARKER_TYPES."""
+        """Key of MARKER_TYPES."""
 
     @property
     def color(self) -> Quad:
@@ -56,31 +56,31 @@ class Shape(Protocol):
 
     @property
     def points(self) -> NDArray[np.float64]:
-        """(N, 3) meters, for all but `box`, `sphere`, `cylinder` and `text`."""
+        """(N, 3) points in meters; unused by `box`, `sphere`, `cylinder` and `text`."""
 
     @property
     def size(self) -> Vector:
-        """Edges in meters; of lines, the width is the first."""
+        """Edge lengths in meters; for lines, the first is the width."""
 
     @property
     def position(self) -> Vector:
-        """In its frame, meters."""
+        """Position in its frame, meters."""
 
     @property
     def yaw_rad(self) -> float:
-        """Turn about z."""
+        """Rotation about z."""
 
     @property
     def frame(self) -> str:
-        """The frame that it is fixed to."""
+        """Name of the frame that the shape is fixed to."""
 
     @property
     def text(self) -> str:
-        """Text of the kind `text`."""
+        """Text of a shape of kind `text`."""
 
 
 class Frame(Protocol):
-    """A coordinate frame, placed in another."""
+    """A coordinate frame, relative to its parent."""
 
     @property
     def name(self) -> str:
@@ -88,29 +88,29 @@ class Frame(Protocol):
 
     @property
     def parent(self) -> str:
-        """Name of the frame that it is placed in."""
+        """Name of the parent frame."""
 
     @property
     def position(self) -> Vector:
-        """Its origin in the parent, meters."""
+        """Position of the origin in the parent, meters."""
 
     @property
     def rotation(self) -> Quad:
-        """Quaternion x, y, z, w."""
+        """Quaternion (x, y, z, w) in the parent."""
 
 
 @runtime_checkable
 class SceneSource(Protocol):
-    """An environment that describes its world."""
+    """An environment that provides shapes and frames."""
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return shapes constant in an episode, including bodies fixed to moving frames."""
+        """Return the shapes constant in an episode, including bodies fixed to moving frames."""
 
     def scene(self) -> Sequence[Shape]:
         """Return the current shapes that change from step to step."""
 
     def static_frames(self) -> Sequence[Frame]:
-        """Return frames that are fixed in their parents."""
+        """Return the frames that are fixed in their parents."""
 
     def frames(self) -> Sequence[Frame]:
         """Return the moving frames at their current poses."""
@@ -118,10 +118,10 @@ class SceneSource(Protocol):
 
 @runtime_checkable
 class TelemetrySource(Protocol):
-    """An environment that has numbers to plot."""
+    """An environment that provides numbers to plot."""
 
     def telemetry(self) -> Mapping[str, float]:
-        """Return numbers by name, always the same names: ROS field names with units."""
+        """Return numbers by name; names are constant and are ROS field names with units."""
 
 
 @runtime_checkable
@@ -135,9 +135,9 @@ class DepthSource(Protocol):
 def marker_array(shapes: Iterable[Shape]) -> bytes:
     """Encode shapes as one `visualization_msgs/msg/MarkerArray`.
 
-    It begins by deleting what the topic showed before, so that a viewer which jumps to this message
-    shows these shapes and no others. The message's log_time is the markers' time: their stamps are
-    0, which means "where the frame is now", and does not differ from message to message.
+    The first marker deletes all earlier ones, so that a viewer which seeks to this message shows
+    only these shapes. Stamps are 0, which means the latest transform of the frame, so that equal
+    shapes encode to equal messages.
     """
     markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
     return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))
@@ -162,7 +162,7 @@ def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
 
 
 def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Convert depth to 16UC1 millimeters; 0, as in REP 118, where empty or beyond 65.5 m."""
+    """Convert depth to 16UC1 millimeters; 0 (REP 118) where empty or beyond 65.5 m."""
     millimeters = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
     return np.where(millimeters <= np.iinfo(np.uint16).max, millimeters, 0).astype("<u2")
 
@@ -213,7 +213,7 @@ def _marker(
         scale=_vector(size),
         color=new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=opacity),
         lifetime=new("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
-        # Moves with its frame between messages, as a body that is described once must.
+        # The marker moves with its frame between messages; static bodies are sent only once.
         frame_locked=True,
         points=[_point(point) for point in _rounded(points, _POINTS_PER_M)],
         colors=[],

@@ -1,7 +1,7 @@
-"""Rows of the episodes that many environments have open at once.
+"""Buffers for the open episodes of a vector environment.
 
-Each environment has its own row in a block of message records, (environments, capacity). A field is
-written for all environments by one fancy index; an episode that ends is one contiguous run.
+A block of message records, (environments, capacity), contains a row per environment. One indexed
+assignment writes a field for all environments, and each episode is contiguous in memory.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
-# Number of steps that the block has room for at first, or fewer where they exceed this size. The
-# block is doubled when an episode needs more.
+# Initial capacity of the block in steps, limited by its size in bytes. The capacity doubles when
+# an episode needs more.
 _FIRST_CAPACITY = 64
 _FIRST_BYTES = 2**20
 
@@ -25,7 +25,7 @@ class OpenRows(Generic[Rows]):
     """Message records of one topic for all open episodes."""
 
     def __init__(self, chunk: Rows, environments: int) -> None:
-        """Make room for the first steps of each environment.
+        """Allocate the block.
 
         Args:
             chunk: Preallocated rows of one chunk, with the constant fields set.
@@ -37,22 +37,22 @@ class OpenRows(Generic[Rows]):
 
     @property
     def capacity(self) -> int:
-        """The first step that has no row."""
+        """Number of steps that fit the block."""
         return len(self._rows)
 
     def make_room(self, step: int) -> None:
-        """Make sure that `step` has a row."""
+        """Grow the block until `step` fits."""
         if step >= self.capacity:
             self._rows = self._rows.grown(max(2 * self.capacity, step + 1))
 
     def put(self, field: str, environments: Any, steps: Any, values: Any) -> None:
-        """Put values at steps of environments.
+        """Set a field at the given steps of environments.
 
         Args:
-            field: Name in the message.
+            field: Name of the message field.
             environments: (K,) indexes of environments, or one index.
             steps: (K,) step of each environment, or one step.
-            values: (K, *shape), or one scalar for all.
+            values: (K, *shape) values, or one scalar for all.
         """
         self._rows.put(field, (environments, steps), values)
 
@@ -60,7 +60,7 @@ class OpenRows(Generic[Rows]):
         """Write the first `count` rows of an environment, in chunks.
 
         Args:
-            environment: Number of the environment.
+            environment: Index of the environment.
             count: Number of rows.
             start_ns: log_time of the first row.
             step_ns: Time between two rows.
@@ -75,7 +75,7 @@ class OpenSteps(OpenRows[StepRows]):
     """Rows of `/rl/step` of all open episodes."""
 
     def end(self, environment: int, summary: EpisodeSummary, step_ns: int) -> None:
-        """Number the rows of an episode, mark its end and write them."""
+        """Number an episode's rows, mark its end and write the rows."""
         rows, count, last = self._rows, summary.length + 1, summary.length - 1
         rows.number((environment, slice(count)), summary.episode, np.arange(count))
         rows.put("terminated", (environment, last), summary.terminated)

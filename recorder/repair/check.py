@@ -60,7 +60,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
             action = "the MCAP file itself is valid, but it is not an mcaprl log"
         found.append(Problem(_without_path(error, path), STEP_TOPIC))
     problems = [*found, *found.rest()]
-    return [replace(problem, next=action, file=str(path)) for problem in problems]
+    return [replace(found, next=found.next or action, file=str(path)) for found in problems]
 
 
 def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: int) -> None:

@@ -37,6 +37,8 @@ from mcaprl.recorder.format.spaces import Leaf, observation_leaves, outside
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("action", "reward", "terminated", "truncated", *COUNTERS)
+IMPOSSIBLE_ACTION = "leave the episode out of training"
+"""Next step for an action outside its space, which is no damage of the file."""
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
 # A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
@@ -164,6 +166,7 @@ class EpisodeCheck:
                 Problem(
                     f"action {found['action'][row]} is outside of {self._metadata.action_space}",
                     f"episode {found['episode'][row]} step {found['step'][row]}",
+                    next=IMPOSSIBLE_ACTION,
                 )
             )
 

@@ -26,6 +26,7 @@ from mcaprl.recorder.format.reading import Damage, McapReader
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.format.writing import recover_file
 from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder.repair.episode_check import IMPOSSIBLE_ACTION
 from mcaprl.recorder.repair.whole_episodes import (
     DroppedEpisode,
     EpisodePlan,
@@ -148,7 +149,8 @@ def _keep_whole_episodes(
         recovery.messages = _count_messages(McapReader(result))
     else:
         os.replace(copied, result)
-    if problems := check_log(result):
+    problems = [one for one in check_log(result) if one.next != IMPOSSIBLE_ACTION]
+    if problems:
         what, where = problems[0].what, problems[0].where
         raise LogError(f"{recovery.source} cannot be recovered: {what} ({where})")
 

@@ -1,1 +1,1 @@
-"""What viewers such as Foxglove show of a log: live server, layout, annotations, video, report."""
+"""Display of logs in viewers such as Foxglove: live server, layout, annotations, video, report."""

@@ -1,7 +1,7 @@
 """Playback of logs by a clock with pause, speed and seek.
 
-Nothing is read ahead. The positions of messages come from the indexes in the memory-mapped file,
-and only a few decompressed chunks are kept, so memory does not grow with the log.
+Messages are located by the indexes of the memory-mapped file and read on demand. Only a few
+decompressed chunks are cached, so memory use does not grow with the log.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Played(NamedTuple):
     """A message that is due.
 
     Attributes:
-        track: which log it is of, by its place in the player.
-        channel_id: of the topic, in its log.
-        time_ns: when, on the player's clock.
+        track: Index of the message's log in the player.
+        channel_id: Channel id of the topic in the log.
+        time_ns: Time of the message on the player's clock.
         data: Bytes of the message, as in the file.
     """
 
@@ -37,12 +37,12 @@ class Played(NamedTuple):
 
 
 class Track:
-    """One log, by time.
+    """Messages of one log, by time.
 
     Attributes:
-        reader: of the file.
-        start_ns: log_time of its first message that is played.
-        end_ns: log_time of its last message that is played.
+        reader: Reader of the log.
+        start_ns: log_time of the first message to play.
+        end_ns: log_time of the last message to play.
     """
 
     def __init__(
@@ -52,15 +52,15 @@ class Track:
         *,
         topics: Collection[str] | None = None,
     ) -> None:
-        """Find where the messages are.
+        """Read the message indexes.
 
         Args:
-            reader: of the file.
-            window_ns: play what has a log_time from the first to the last of these; default: all.
-            topics: play these only; default: all.
+            reader: Reader of the log.
+            window_ns: First and last log_time to play; default: all.
+            topics: Topics to play; default: all.
 
         Raises:
-            CorruptLogError: an index is damaged.
+            CorruptLogError: An index is damaged.
         """
         self.reader = reader
         self._topics = [
@@ -76,14 +76,14 @@ class Track:
         self._records = lru_cache(_CHUNKS_KEPT)(self._inflated)
 
     def between(self, start_ns: int, stop_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
-        """Yield time, channel and bytes of messages in the half-open interval, by time."""
+        """Yield time, channel and bytes of the messages in [start_ns, stop_ns), by time."""
         start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns + 1)
         found = [place for topic in self._topics for place in topic.between(start_ns, stop_ns)]
         for place in sorted(found, key=lambda place: place.time_ns):
             yield place.time_ns, place.channel, self._message(place)
 
     def latest(self, time_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
-        """Yield the last message of each topic up to a moment: all that is to be seen then.
+        """Yield the latest message of each topic up to a time, which defines the display.
 
         Messages before the window are included.
         """
@@ -113,7 +113,7 @@ class _Place(NamedTuple):
 
 
 class _TopicIndex:
-    """The messages of one channel; the times of each range rise."""
+    """The message ranges of one channel, each sorted by time."""
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
         self.channel = channel
@@ -145,7 +145,7 @@ class _TopicIndex:
 
 
 def _rows_before(part: MessageRange, time_ns: int) -> int:
-    # Compared with a signed integer, times would be rounded to floats.
+    # NumPy would compare uint64 times with a signed integer as floats.
     return int(np.searchsorted(part.index["log_time"], np.uint64(max(time_ns, 0))))
 
 
@@ -158,13 +158,13 @@ def _by_time(part: MessageRange) -> MessageRange:
 
 @dataclass
 class Player:
-    """The clock over one or several logs, which all start at the first one's start.
+    """Playback clock of one or more logs; all logs are shifted to start at the first one's start.
 
     Attributes:
-        tracks: the logs.
-        speed: simulated seconds in a second.
-        loops: whether it begins again at the end.
-        playing: whether the clock runs.
+        tracks: Logs to play.
+        speed: Number of simulated seconds per second.
+        loops: Whether to restart at the end.
+        playing: Whether the clock runs.
     """
 
     tracks: Sequence[Track]
@@ -178,12 +178,12 @@ class Player:
         self.shifts_ns = [self.start_ns - track.start_ns for track in self.tracks]
         self.end_ns = max(t.end_ns + s for t, s in zip(self.tracks, self.shifts_ns, strict=True))
         self.time_ns = self.start_ns
-        # Messages before this have been played.
+        # Messages before this time have been played.
         self._next_ns = self.start_ns
 
     @property
     def ended(self) -> bool:
-        """Whether all has been played."""
+        """Whether the clock is at the end."""
         return self.time_ns >= self.end_ns
 
     def seek(self, time_ns: int) -> None:
@@ -192,7 +192,7 @@ class Player:
         self._next_ns = self.time_ns + 1
 
     def current_messages(self) -> list[Played]:
-        """Return the last message of each topic: the state that a new viewer needs."""
+        """Return the latest message of each topic, as needed by a new viewer."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
@@ -200,7 +200,7 @@ class Player:
         ]
 
     def advance(self, elapsed_s: float) -> list[Played]:
-        """Let time go by; the messages that have become due, by time."""
+        """Advance the clock and return the messages that are due, by time."""
         if not self.playing:
             return []
         self.time_ns = min(self.time_ns + round(elapsed_s * self.speed * 1e9), self.end_ns)

@@ -1,4 +1,4 @@
-"""What a log has to be seen at a moment: shapes and frames, from its markers and transforms."""
+"""Reader of a log's scene: the shapes and frames at each step of an episode."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ADD = 0
 
 @dataclass(frozen=True)
 class SeenShape:
-    """A marker in the terms of `scene.Shape`; of its turn, that about z."""
+    """A marker as a `scene.Shape`, with only the rotation about z."""
 
     name: str
     kind: str
@@ -39,7 +39,7 @@ class SeenShape:
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A transform in the terms of `scene.Frame`."""
+    """A transform as a `scene.Frame`."""
 
     name: str
     position: Vector
@@ -49,14 +49,14 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class SeenStep:
-    """What is to be seen at one step.
+    """The scene at one step.
 
     Attributes:
-        step: of the episode; the last is the final observation.
-        static: shapes that do not change; the same list as long as they do not.
-        moving: shapes that do.
-        frames: all of them.
-        follow: the frame that moves first in the tree.
+        step: Index of the step; the last is that of the final observation.
+        static: Static shapes; the same list object until they change.
+        moving: Moving shapes.
+        frames: Moving and static frames.
+        follow: Name of the first moving frame; empty if there is none.
     """
 
     step: int
@@ -67,10 +67,10 @@ class SeenStep:
 
 
 def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[SeenStep]:
-    """Yield what is to be seen at each step of an episode.
+    """Yield the scene at each step of an episode.
 
     Raises:
-        LogError: the log has no scene.
+        LogError: The log has no scene.
     """
     if reader.channel_of(SCENE) is None:
         raise LogError(

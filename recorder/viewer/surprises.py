@@ -1,4 +1,4 @@
-"""The moments of an annotated log that are worth a look."""
+"""Steps of an annotated log with large TD errors or with disagreement of the policy."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.record.layout import is_values_topic
 
 SHOWN = 5
-"""Moments of each kind and topic."""
+"""Maximum number of steps for each kind and topic."""
 
 
 @dataclass(frozen=True)
 class Surprise:
-    """A step that surprised a policy, or that it would have done otherwise.
+    """A step with a large TD error, or whose logged action a policy disagrees with.
 
     Attributes:
-        file: path of the log.
-        topic: of the policy.
-        kind: `td_error`, or `disagreement`.
-        time_ns: log_time, to jump to.
-        episode: its index in the log.
-        step: of the episode.
-        value: the TD error; of a disagreement, the advantage of the logged action, or, of a policy
-            without values, its normalized entropy.
+        file: Path of the log.
+        topic: Topic of the policy's outputs.
+        kind: `td_error` or `disagreement`.
+        time_ns: log_time of the step.
+        episode: Index of the episode in the log.
+        step: Index of the step in the episode.
+        value: TD error; for a disagreement, the logged action's advantage, or the policy's
+            normalized entropy if the policy has no values.
     """
 
     file: str
@@ -42,7 +42,7 @@ class Surprise:
     value: float
 
     def __str__(self) -> str:
-        """On one line; the time as viewers take it."""
+        """Return a one-line summary, with the time in the viewers' format."""
         seconds, rest_ns = divmod(self.time_ns, 10**9)
         return (
             f"{self.topic} {self.kind} {self.value:+.3g} in episode {self.episode}, step"
@@ -51,10 +51,10 @@ class Surprise:
 
 
 def moments_of(path: Path) -> list[Surprise]:
-    """The greatest TD errors and the clearest disagreements of each policy that annotated a log.
+    """Return the largest TD errors and strongest disagreements of each policy in a log.
 
     Raises:
-        LogError: the log is damaged.
+        LogError: The log is damaged.
     """
     reader = McapReader(path)
     topics = sorted({c.topic for c in reader.channels.values() if is_values_topic(c.topic)})
@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Those that cost most by the policy's own values; without values, the surest."""
+    """Yield the disagreements of lowest advantage, or of lowest entropy without values."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]
@@ -97,7 +97,7 @@ def _largest(numbers: NDArray[Any], chosen: NDArray[np.bool_]) -> list[int]:
 
 
 def _places(steps: Topic) -> dict[int, tuple[int, int]]:
-    """Episode and step of each log_time."""
+    """Return the episode and step of each log_time."""
     times = steps.times
     order = np.argsort(times, kind="stable")
     step = steps.read(("step",))["step"][order]

@@ -1,8 +1,8 @@
-"""Comparison of a log with an environment that repeats it.
+"""Comparison of a log with a replay in the environment.
 
 A deterministic environment that is reset with the logged seed and stepped with the logged actions
-returns the same observations, rewards and flags, bit for bit. An episode that was reset without a
-seed continues the random state of the episode before it, so it is stepped directly after that one.
+returns bit-identical observations, rewards and flags. An episode that was reset without a seed
+continues the random state of the previous episode, so it is replayed directly after that episode.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _MOST_EPISODES = 10
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """One number that is different.
+    """A value that differs.
 
     Attributes:
-        name: `reward`, `terminated`, `truncated`, or the name of the number in the observation.
+        name: `reward`, `terminated`, `truncated`, or the name of the observation element.
         logged: Value in the log.
         now: Value that the environment returned.
     """
@@ -46,14 +46,14 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first record that is different.
+    """The first record that differs.
 
     Attributes:
         episode: Index of the episode in the dataset.
-        step: Step of the observation; 0 is the one that `reset` returned.
+        step: Step of the observation; 0 after `reset`.
         time_ns: log_time of the observation.
         time_s: Time of the observation since the start of the episode.
-        fields: Numbers that are different; only the first ones if there are many.
+        fields: Values that differ, limited to the first `_MOST_FIELDS`.
     """
 
     episode: int
@@ -63,11 +63,11 @@ class Difference:
     fields: tuple[FieldDifference, ...]
 
     def to_problem(self, file: str = "") -> Problem:
-        """Describe the difference."""
+        """Return a description of the difference."""
         fields = [f"{one.name} logged {one.logged}, now {one.now}" for one in self.fields]
         return Problem(
             f"episode {self.episode} differs first at step {self.step}",
-            f"{self.time_s:.3f} s in, log_time {self.time_ns} ns",
+            f"{self.time_s:.3f} s after its start, log_time {self.time_ns} ns",
             "; ".join(fields),
             file=file,
         )
@@ -78,9 +78,9 @@ class Verification:
     """Result of a comparison.
 
     Attributes:
-        episodes: Number of episodes that were compared.
-        steps: Number of their steps that were compared.
-        unseeded: Indexes of episodes that cannot be repeated, since their start is unknown.
+        episodes: Number of compared episodes.
+        steps: Number of compared steps.
+        unseeded: Indexes of episodes that cannot be replayed, since their start is unknown.
         difference: The first difference; None if there is none.
     """
 
@@ -95,7 +95,7 @@ class Verification:
         if self.unseeded:
             more = ", ..." if len(self.unseeded) > _MOST_EPISODES else ""
             where = f"episodes {', '.join(map(str, self.unseeded[:_MOST_EPISODES]))}{more}"
-            what = f"{len(self.unseeded)} not compared, since the log has no seed for them"
+            what = f"{len(self.unseeded)} episodes without a seed were not compared"
             found.insert(0, Problem(what, where, file=file, severity="note"))
         return found
 
@@ -111,14 +111,14 @@ def verify(
 
     Args:
         dataset: Dataset of one log.
-        env: New environment of the same kind; it is reset and stepped here.
-        only: Index of the only episode to compare; earlier episodes are stepped only if its
-            random state depends on them. Default: all episodes.
-        on_frame: Callback with the episode and the step after each observation that is the same,
+        env: New environment of the same kind, which is reset and stepped.
+        only: Index of the only episode to return a difference for; earlier episodes are stepped
+            too if its random state depends on them. Default: all episodes.
+        on_frame: Callback with the episode and step, called after each identical observation,
             while the environment is in that state.
 
     Raises:
-        SpaceError: The spaces of the environment are not those of the log.
+        SpaceError: The spaces of the environment and the log differ.
         LogError: The environment fails on a logged action.
     """
     _check_spaces(dataset, env)
@@ -130,7 +130,7 @@ def verify(
         is_start_known = episode.seed is not None or continues
         difference = _compare(dataset, env, episode, on_frame) if is_start_known else None
         if difference is not None and episode.seed is None and difference.step == 0:
-            # It started from another state, which is unknown, so nothing is wrong.
+            # The episode started from an unknown state, so a difference is expected.
             is_start_known, difference = False, None
         if not is_start_known:
             unseeded.append(episode.index)
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return one episode and those that its start depends on; all if `only` is None."""
+    """Return an episode and those that its start depends on; all if `only` is None."""
     if only is None:
         return episodes
     first = only
@@ -153,7 +153,7 @@ def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, .
 
 
 def _follows(episodes: tuple[Episode, ...], index: int) -> bool:
-    """Return whether an episode directly follows the one before it in the same recording."""
+    """Return whether an episode directly follows the previous one in the same recording."""
     number = episodes[index].summary.episode
     return index > 0 and number > 0 and episodes[index - 1].summary.episode == number - 1
 
@@ -187,7 +187,7 @@ _Frame = tuple[Any, float, bool, bool]
 def _stepped(
     env: gym.Env[Any, Any], episode: Episode, action_space: spaces.Space[Any]
 ) -> Iterator[_Frame]:
-    """Yield observation, reward, terminated and truncated: of `reset` first, then of each step."""
+    """Yield observation, reward, terminated and truncated of `reset` and of each step."""
     options = json.loads(episode.summary.options) if episode.summary.options else None
     step = 0
     try:
@@ -201,8 +201,8 @@ def _stepped(
     # An environment can raise any exception.
     except Exception as error:
         raise LogError(
-            f"the environment fails at step {step} of episode {episode.index}, which the log"
-            f" contains: {type(error).__name__}: {error}"
+            f"the environment fails at step {step} of the logged episode {episode.index}:"
+            f" {type(error).__name__}: {error}"
         ) from error
 
 
@@ -242,7 +242,7 @@ def _leaf_differences(
 
 
 def _bits(array: NDArray[Any]) -> NDArray[Any]:
-    """View an array as integers, so that NaN equals itself and 0.0 does not equal -0.0."""
+    """View an array as integers, so that NaN equals NaN and 0.0 differs from -0.0."""
     return np.ascontiguousarray(array).view(f"u{array.dtype.itemsize}").reshape(array.shape)
 
 

@@ -23,12 +23,12 @@ _GAP_PX = 6
 
 
 def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
-    """Check that a video or contact sheet can be written, before the images are rendered.
+    """Check that a video or contact sheet can be written before rendering images.
 
     Args:
         path: Path of the output.
         kinds: Supported suffixes.
-        overwrite: Whether an existing file is replaced.
+        overwrite: Whether to replace an existing file.
 
     Raises:
         UnknownNameError: The path has another suffix.
@@ -62,7 +62,7 @@ def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
     with replacing(path, ReportError) as unfinished:
         count = _write(unfinished, path.suffix, images, fps)
         if count == 0:
-            raise UsageError(f"{path}: there is nothing to show")
+            raise UsageError(f"{path}: the video has no frames")
     return count
 
 
@@ -76,7 +76,7 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
             imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    # The name of the temporary file does not show its format.
+    # The temporary file's name has no format suffix.
     options = {"extension": kind, "plugin": "pyav", "container": kind.removeprefix(".")}
     with imageio.imopen(path, "w", **options) as video:
         video.init_video_stream("libx264", fps=float(fps))
@@ -87,7 +87,7 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
 
 
 def write_sheet(path: Path, images: Sequence[Image]) -> None:
-    """Write images as one PNG at half their size, see `contact_sheet`.
+    """Write a contact sheet of images as PNG; see `contact_sheet`.
 
     Raises:
         ReportError: The file cannot be written.
@@ -112,14 +112,14 @@ def contact_sheet(images: Sequence[Image]) -> Image:
 
 
 def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
-    """Choose the steps of an episode that a video shows, and its frame rate.
+    """Return the steps of an episode that a video shows, and its frame rate.
 
-    Every step is shown unless the frame rate would exceed `MAX_FPS`; then every second or third one
-    etc., and always the last.
+    Steps are skipped at a constant stride if the frame rate would exceed `MAX_FPS`; the last step
+    is always shown.
 
     Args:
         length: Number of steps of the episode.
-        steps_per_s: Steps per second at the video's speed.
+        steps_per_s: Number of steps per second at the video's speed.
     """
     stride = max(1, math.ceil(steps_per_s / MAX_FPS - 1e-9))
     return range(length % stride, length + 1, stride), steps_per_s / stride

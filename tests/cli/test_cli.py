@@ -110,7 +110,7 @@ def test_evaluate_from_the_log_alone(cartpole: Path, capsys: pytest.CaptureFixtu
     assert result["coverage"]["random"] == pytest.approx(0.5)
     assert result["ranking"]["trusted"] is False
     assert run(ask) == 0
-    assert "do not choose by this order" in capsys.readouterr().out
+    assert "do not rely on this order" in capsys.readouterr().out
     line = fails_after(capsys, 2, "evaluate", "pilot", "--data", str(cartpole))
     assert "pilot has no network to evaluate on a log" in line
 
@@ -149,7 +149,7 @@ def test_appended_and_rotated_recordings_are_the_same(capsys: pytest.CaptureFixt
     assert mcaprl.open("parts").fingerprint == expected
     capsys.readouterr()
     assert run([*common, "--episodes", "2", "--out", "x", "--append", "--envs", "2"]) == 2
-    assert "leave out one" in capsys.readouterr().err
+    assert "omit one option" in capsys.readouterr().err
 
 
 def test_shards_contain_the_same_episodes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -282,7 +282,7 @@ def test_logs_are_not_overwritten_by_other_outputs(
     before = cartpole.read_bytes()
     for source in ("lane", str(cartpole)):
         line = fails_after(capsys, 2, "layout", source, "--out", str(cartpole), "--overwrite")
-        assert "a layout is JSON" in line
+        assert "a layout is a JSON file" in line
     evaluate = ["evaluate", "random", "--sim", "CartPole-v1", "--episodes", "1", "--overwrite"]
     both = ["--behavior", str(cartpole), "--record", str(cartpole)]
     assert "record the episodes elsewhere" in fails_after(capsys, 2, *evaluate, *both)
@@ -352,10 +352,10 @@ def test_layout_of_file_and_sim(capsys: pytest.CaptureFixture[str]) -> None:
         (["evaluate", "pilot", "--sim", "line"], 2, "did you mean lane"),
         (["evaluate", "taken", "--sim", "lane"], 1, "taken"),
         (["evaluate", "nowhere", "--sim", "lane"], 2, "unknown policy 'nowhere'"),
-        (["evaluate", "pilot"], 2, "--sim SIM or --data DATA, one of the two"),
-        (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "one of the two"),
-        (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma is of use"),
-        (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record is of use"),
+        (["evaluate", "pilot"], 2, "either --sim SIM or --data DATA"),
+        (["evaluate", "pilot", "--sim", "lane", "--data", "taken"], 2, "either --sim SIM"),
+        (["evaluate", "pilot", "--sim", "lane", "--gamma", ".9"], 2, "--gamma requires --data"),
+        (["evaluate", "pilot", "--data", "lane.mcap", "--record", "x"], 2, "--record requires"),
         (["evaluate", "random", "--data", "nothing"], 1, "no such file"),
         (["layout", "lane"], 2, "--out"),
         (["record", "lane", "--steps", "5", "--out", "x", "--epsilon", "nan"], 2, "0 to 1"),
@@ -378,8 +378,8 @@ def test_mistakes_are_one_line(
 
 def test_spaces_that_differ(cartpole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     both = [str(cartpole), str(LANE_LOG)]
-    assert "do not fit together" in fails_after(capsys, 1, "info", *both)
-    assert "do not fit together" in fails_after(capsys, 1, "train-offline", *both, "--out", "r")
+    assert "differ in" in fails_after(capsys, 1, "info", *both)
+    assert "differ in" in fails_after(capsys, 1, "train-offline", *both, "--out", "r")
     small = ["--updates", "5", "--hidden", "8", "--algo", "bc"]
     assert run(["train-offline", str(cartpole), "--out", "run", *small]) == 0
     line = fails_after(capsys, 1, "evaluate", "run", "--sim", "lane")
@@ -437,7 +437,7 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
     process.send_signal(number)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert err.strip() == "mcaprl: interrupted; what was finished is kept"
+    assert err.strip() == "mcaprl: interrupted; finished work is kept"
     assert run(["check", "stopped.mcap"]) == 0
     assert len(mcaprl.open(path).episodes) >= 1
 

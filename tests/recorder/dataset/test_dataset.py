@@ -148,7 +148,7 @@ def test_logs_of_other_spaces_are_refused(tmp_path: Path) -> None:
     box = spaces.Box(-1, 1, (2,), np.float32)
     record(tmp_path / "a.mcap", box, spaces.Discrete(2), [2])
     record(tmp_path / "b.mcap", box, spaces.Discrete(3), [2])
-    with pytest.raises(SpaceError, match=r"a\.mcap and .*b\.mcap do not fit.*action_space"):
+    with pytest.raises(SpaceError, match=r"a\.mcap and .*b\.mcap differ in action_space"):
         mcaprl.open(tmp_path)
 
 

@@ -275,7 +275,10 @@ def test_observations_of_several_lengths(log_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("message_encoding", "schema_encoding", "reported"),
-    [("json", "jsonschema", "messages of /rl/step are 'json'"), ("cdr", "ros2idl", "'ros2idl'")],
+    [
+        ("json", "jsonschema", "messages of /rl/step have encoding 'json'"),
+        ("cdr", "ros2idl", "'ros2idl'"),
+    ],
 )
 def test_other_encodings(
     log_path: Path, message_encoding: str, schema_encoding: str, reported: str

@@ -146,7 +146,7 @@ def test_image_layout_equals_that_of_rosbags(height: int, width: int, frame: str
 
 @pytest.mark.parametrize("name", ["Speed m/s", "2nd", "a__b", "a_", "größe"])
 def test_telemetry_names_must_be_ros_field_names(name: str) -> None:
-    with pytest.raises(SpaceError, match="no ROS field name"):
+    with pytest.raises(SpaceError, match="not a ROS field name"):
         telemetry_schema(["speed_m_s", name])
 
 

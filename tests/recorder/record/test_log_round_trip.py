@@ -94,7 +94,7 @@ def test_space_json_round_trip(space: spaces.Space[Any]) -> None:
 def test_a_damaged_space_description_is_one_error(old: str, new: str) -> None:
     text = space_to_json(spaces.Box(0, 255, (2, 3), np.uint8))
     assert old in text
-    with pytest.raises(SpaceError, match="not a description of a space"):
+    with pytest.raises(SpaceError, match=r"not a description of a space|too large"):
         space_from_json(text.replace(old, new))
 
 

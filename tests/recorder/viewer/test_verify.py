@@ -129,7 +129,7 @@ def test_the_first_difference_is_reported_with_its_place(
     assert [field.name for field in difference.fields] == names
     for field in difference.fields:
         assert field.logged != field.now
-    assert "episode 1 differs first at step 4 (0.400 s in" in str(difference.to_problem())
+    assert "episode 1 differs first at step 4 (0.400 s after" in str(difference.to_problem())
 
 
 def test_an_episode_without_a_seed_continues_the_random_state(log_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_frames_are_drawn_in_the_state_of_their_step(log_path: Path) -> None:
 
 def test_failing_or_different_environments_are_reported(log_path: Path) -> None:
     data = walk(log_path, [1])
-    with pytest.raises(LogError, match=r"fails at step 3 of episode 0.*engine is on fire"):
+    with pytest.raises(LogError, match=r"fails at step 3 of the logged episode 0.*on fire"):
         verify(data, Walk(("crash", 2)))
     with pytest.raises(SpaceError, match=r"CartPole-v1 has Box"):
         verify(data, make_sim("CartPole-v1"))
@@ -182,6 +182,9 @@ def test_command_exits_with_1_on_a_difference(
         for _ in range(3):
             recorder.step(1)
     assert run(["replay", str(log_path), "--verify"]) == 1
-    assert "episode 0 differs first at step 1 (0.020 s in, log_time" in capsys.readouterr().out
+    assert (
+        "episode 0 differs first at step 1 (0.020 s after its start, log_time"
+        in capsys.readouterr().out
+    )
     assert run(["replay", str(log_path), "--verify", "--episode", "1"]) == 2
     assert "has episodes 0 to 0" in capsys.readouterr().err

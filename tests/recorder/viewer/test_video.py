@@ -180,5 +180,5 @@ def test_a_log_without_a_scene_has_no_video(
         env.step(0)
     video = ["replay", str(path), "--video", str(tmp_path / "video.mp4")]
     assert run(video) == 1
-    assert "has no scene, and no seed of episode 0" in capsys.readouterr().err
+    assert "has no scene, and episode 0 has no seed" in capsys.readouterr().err
     assert not (tmp_path / "video.mp4").exists()
