@@ -160,7 +160,7 @@ def _compete(path: Path, barrier: Any, results: Any) -> None:
 @pytest.mark.parametrize("exists", [False, True])
 def test_of_two_recorders_that_start_together_one_is_refused(log_path: Path, exists: bool) -> None:
     context = multiprocessing.get_context("fork")
-    for _ in range(25):
+    for _ in range(6):
         log_path.unlink(missing_ok=True)
         if exists:
             log_path.write_bytes(b"old")
