@@ -37,13 +37,11 @@ def columns_of_arrays(
     Raises:
         SpaceError: Lengths or shapes do not agree with each other or with the spaces.
     """
-    derived = _space_of(observations)
-    registered, of_actions = _registered_spaces(env_id)
-    if registered is not None and not _same_shapes(registered, derived):
-        registered, of_actions = None, None
+    if observation_space is None and action_space is None:
+        observation_space, action_space = _registered_spaces(env_id, observations)
     description = LogMetadata(
-        observation_space=observation_space or registered or derived,
-        action_space=action_space or of_actions or action_space_of(np.asarray(actions)),
+        observation_space=observation_space or _space_of(observations),
+        action_space=action_space or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
     )
@@ -69,24 +67,19 @@ def columns_of_arrays(
 
 
 def _registered_spaces(
-    env_id: str,
+    env_id: str, observations: Any
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]] | tuple[None, None]:
-    """Return the spaces of a registered environment; None if it is unknown or cannot be created."""
+    """Return the spaces of a registered environment that has observations of these shapes."""
     if env_id not in gym.registry:
         return None, None
     try:
         with closing(gym.make(env_id)) as env:
-            return env.observation_space, env.action_space
-    # An environment may lack its own dependencies.
+            leaves = observation_leaves(env.observation_space)
+            fits = all(leaf.of(observations).shape[1:] == leaf.shape for leaf in leaves)
+            return (env.observation_space, env.action_space) if fits else (None, None)
+    # An environment may lack its own dependencies, and the observations its keys.
     except Exception:
         return None, None
-
-
-def _same_shapes(space: spaces.Space[Any], other: spaces.Space[Any]) -> bool:
-    mine, others = observation_leaves(space), observation_leaves(other)
-    return [(leaf.path, leaf.shape) for leaf in mine] == [
-        (leaf.path, leaf.shape) for leaf in others
-    ]
 
 
 def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
