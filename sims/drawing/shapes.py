@@ -1,4 +1,4 @@
-"""Shapes that several sims use: the ground, labels, and the parts of cars.
+"""Colors and shapes that several sims use: the ground, observations, and the parts of cars.
 
 The parts of a car are fixed to the frame `car`: x forward, y left, z up.
 """
@@ -7,12 +7,23 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Shape
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
 
 Vector = tuple[float, float, float]
+
+WHITE: Color = (0.92, 0.92, 0.90, 1.0)
+STEEL: Color = (0.66, 0.69, 0.72, 1.0)
+GLASS: Color = (0.12, 0.17, 0.22, 1.0)
+RUBBER: Color = (0.07, 0.07, 0.08, 1.0)
+LAMP: Color = (1.0, 0.96, 0.78, 1.0)
+TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
+RAY: Color = (0.98, 0.80, 0.28, 0.8)
+LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 
 
 def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, float]) -> Shape:
@@ -28,17 +39,32 @@ def label(text: str, color: Color, height_m: float, frame: str = "car") -> Shape
     return Shape("speed", "text", color, size=(1.0, 1.0, 0.8), position=at, frame=frame, text=text)
 
 
-def steering_arrow(color: Color, axle_m: float, wheel_rad: float) -> Shape:
+def trail(places_m: Sequence[tuple[float, ...]], width_m: float) -> Shape:
+    """Return the line through a car's last positions, (x, y) in the map; at least one."""
+    return Shape("trail", "line", TRAIL, raised(path(places_m), 0.06), size=(width_m, 0.0, 0.0))
+
+
+def lookahead(points_m: NDArray[np.float64]) -> Shape:
+    """Return points of the path ahead (N, 2), which the agent observes."""
+    return Shape("lookahead", "points", LOOK, raised(points_m, 0.3), size=(0.6, 0.6, 0.6))
+
+
+def steering_arrow(axle_m: float, wheel_rad: float) -> Shape:
     """Return an arrow above the front axle in the direction of the front wheels."""
     axle = np.array([axle_m, 0.0, 1.0])
     tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
     ends = np.array([axle, tip])
-    return Shape("steering", "arrow", color, ends, size=(0.12, 0.3, 0.4), frame="car")
+    return Shape("steering", "arrow", LOOK, ends, size=(0.12, 0.3, 0.4), frame="car")
 
 
 def car_part(name: str, color: Color, size_m: Vector, middle_m: Vector) -> Shape:
     """Return a box that is a part of a car."""
     return Shape(f"car_{name}", "box", color, size=size_m, position=middle_m, frame="car")
+
+
+def car_frame(x_m: float, y_m: float, yaw_rad: float) -> Frame:
+    """Return the frame `car` at a pose in the map."""
+    return Frame("car", (x_m, y_m, 0.0), yaw_rotation(yaw_rad))
 
 
 def wheels(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
+from mcaprl.sims.drawing.shapes import car_frame
 from mcaprl.sims.highway import scene as highway_scene
 from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
 from mcaprl.sims.highway.scene import Car
@@ -341,7 +342,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     def frames(self) -> Sequence[Frame]:
         """Return the car's frame in the map."""
-        return (highway_scene.car_frame(self._car),)
+        return (car_frame(self._car.x_m, self._car.y_m, self._car.yaw_rad),)
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]

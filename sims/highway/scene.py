@@ -13,22 +13,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
-from mcaprl.sims.drawing.shapes import car_part, ground, label, steering_arrow, wheels
+from mcaprl.sims.drawing import shapes
+from mcaprl.sims.drawing.scene import Color, Shape, raised
+from mcaprl.sims.drawing.shapes import LAMP, WHITE, car_part
 from mcaprl.sims.highway.course import FLIP, Course
 
 Floats = NDArray[np.float64]
 
 GRASS: Color = (0.33, 0.43, 0.34, 1.0)
 ASPHALT: Color = (0.22, 0.23, 0.25, 1.0)
-WHITE: Color = (0.92, 0.92, 0.90, 1.0)
 PAINT: Color = (0.13, 0.55, 0.47, 1.0)
 OTHER_PAINT: Color = (0.86, 0.62, 0.16, 1.0)
-GLASS: Color = (0.12, 0.17, 0.22, 1.0)
-RUBBER: Color = (0.07, 0.07, 0.08, 1.0)
-LAMP: Color = (1.0, 0.96, 0.78, 1.0)
-TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
-LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 
 MARGIN_M = 60.0
 """Width of the grass around the road."""
@@ -66,7 +61,7 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M
     return (
-        ground(GRASS, (low + high) / 2, high - low),
+        shapes.ground(GRASS, (low + high) / 2, high - low),
         Shape("road", "triangles", ASPHALT, raised(_asphalt(network), 0.0)),
         Shape("lines", "segments", WHITE, raised(_lines(network), 0.02), size=(0.15, 0.0, 0.0)),
         *_own_car(),
@@ -112,11 +107,11 @@ def _lines(network: Any) -> Floats:
 def _own_car() -> list[Shape]:
     return [
         car_part("body", PAINT, (5.0, 1.9, 0.55), (0.0, 0.0, 0.6)),
-        car_part("cabin", GLASS, (2.5, 1.65, 0.45), (-0.35, 0.0, 1.1)),
+        car_part("cabin", shapes.GLASS, (2.5, 1.65, 0.45), (-0.35, 0.0, 1.1)),
         car_part("roof", PAINT, (2.0, 1.6, 0.08), (-0.4, 0.0, CAR_HEIGHT_M - 0.04)),
         car_part("lamp_left", LAMP, (0.08, 0.4, 0.16), (2.5, 0.68, 0.66)),
         car_part("lamp_right", LAMP, (0.08, 0.4, 0.16), (2.5, -0.68, 0.66)),
-        *wheels(RUBBER, 1.5, -1.5, 0.85, 0.34, 0.26),
+        *shapes.wheels(shapes.RUBBER, 1.5, -1.5, 0.85, 0.34, 0.26),
     ]
 
 
@@ -137,10 +132,10 @@ def moving_shapes(
         steering_rad: Angle of the front wheels, left positive.
     """
     return (
-        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
-        Shape("lookahead", "points", LOOK, raised(np.array(aims_m), 0.3), size=(0.6, 0.6, 0.6)),
-        steering_arrow(LOOK, 1.5, steering_rad),
-        label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
+        shapes.trail(trail_m, 0.25),
+        shapes.lookahead(np.array(aims_m)),
+        shapes.steering_arrow(1.5, steering_rad),
+        shapes.label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
         *(_other_car(f"other_{number}", other) for number, other in enumerate(others)),
     )
 
@@ -154,8 +149,3 @@ def _other_car(name: str, car: Car) -> Shape:
         position=(car.x_m, car.y_m, CAR_HEIGHT_M / 2),
         yaw_rad=car.yaw_rad,
     )
-
-
-def car_frame(car: Car) -> Frame:
-    """Return the car's frame in the map."""
-    return Frame("car", (car.x_m, car.y_m, 0.0), yaw_rotation(car.yaw_rad))

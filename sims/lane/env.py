@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
+from mcaprl.sims.drawing.shapes import car_frame
 from mcaprl.sims.lane import scene as lane_scene
 from mcaprl.sims.lane.fleet import LaneFleet
 from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
@@ -146,22 +147,8 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     """
 
     metadata = METADATA
+    fleet_type = LaneFleet
     success_reasons = ("time_limit",)
-
-    def __init__(
-        self,
-        rules: str = "default",
-        observation: str = "state",
-        start: str | None = None,
-        render_mode: RenderMode | None = None,
-    ) -> None:
-        """Make the environment; see "Arguments" of the class.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-        """
-        super().__init__(LaneFleet(1, rules, observation, start), render_mode)
-        self._has_rays = observation == "rays"
 
     @property
     def car(self) -> Car:
@@ -195,7 +182,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     def scene(self) -> Sequence[Shape]:
         """Return the shapes that change with each step."""
-        return lane_scene.moving_shapes(self.car, self.trail, self._has_rays)
+        return lane_scene.moving_shapes(self.car, self.trail, self.fleet.has_rays)
 
     def static_frames(self) -> Sequence[Frame]:
         """Return the camera's frame in the car: x right, y down, z along the view."""
@@ -203,7 +190,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     def frames(self) -> Sequence[Frame]:
         """Return the car's frame in the map."""
-        return (lane_scene.car_frame(self.car),)
+        return (car_frame(self.car.x_m, self.car.y_m, self.car.yaw_rad),)
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]

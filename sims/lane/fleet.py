@@ -16,11 +16,7 @@ from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
 from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, step_classic
 from mcaprl.sims.lane.course import COURSE, NEXT_TURN
-from mcaprl.sims.lane.rays import (
-    RAY_OBSERVATION_LIMIT,
-    RAY_OBSERVATION_NAMES,
-    observe_all_rays,
-)
+from mcaprl.sims.lane.rays import RAY_OBSERVATION_LIMIT, RAY_OBSERVATION_NAMES, observe_all_rays
 from mcaprl.sims.lane.rules import (
     ACTION_MEANINGS,
     DECISION_S,
@@ -31,10 +27,10 @@ from mcaprl.sims.lane.rules import (
     observe,
     store_car,
 )
-from mcaprl.sims.lane.start import ALONG, STARTED_AT, car_from, start_cars, start_one_of
+from mcaprl.sims.lane.start import ALONG, STARTED_AT, car_from, start_car, start_cars
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
-from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 RULES = ("default", "classic", "classic-code")
 STARTS = ("anywhere", "line")
@@ -82,9 +78,9 @@ class LaneFleet(Fleet):
         self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
-        self._has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
+        self.has_rays, self._has_dashboard = observation == "rays", observation == "dashboard"
         self._has_images = observation == "depth" or self._has_dashboard
-        self._seen = self._rays if self._has_rays else self._states
+        self._seen = self._rays if self.has_rays else self._states
         self._has_fast_step = observation == "state" and not self._classic
         self._encode = encode_nearness if self._classic else encode_depth
         self._camera: CarCamera | None = None
@@ -106,7 +102,7 @@ class LaneFleet(Fleet):
         else:
             self._draws.one(i, self._shares)
             self._start_one(i)
-        if self._has_rays:
+        if self.has_rays:
             observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
         self._depth_m.pop(i, None)
 
@@ -116,7 +112,7 @@ class LaneFleet(Fleet):
         draws.draw_ahead(chosen)
         chances = (draws.numbers, draws.used, *kind)
         start_cars(chosen, *chances, self._cars, self.rewards, self.ends, self._states)
-        if self._has_rays:
+        if self.has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
             observe_all_rays(self._cars[chosen], seen)
             self._rays[chosen] = seen
@@ -127,7 +123,7 @@ class LaneFleet(Fleet):
     def advance(self) -> None:
         """Advance all cars by a decision."""
         self._step()
-        if self._has_rays:
+        if self.has_rays:
             observe_all_rays(self._cars, self._rays)
         if self._depth_m:
             self._depth_m.clear()
@@ -139,7 +135,7 @@ class LaneFleet(Fleet):
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
         if self._depth_m:
             self._depth_m.clear()
-        # Inlined copy of `_named`.
+        # Faster than `zip` of `CAR_INFO`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -155,7 +151,7 @@ class LaneFleet(Fleet):
     @cached_property
     def _start_one(self) -> Callable[[int], None]:
         kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
-        return ready(start_one_of, self._shares, *kind, self._cars, *outcome, examples=(0,))
+        return ready(start_car, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
     # Functions for a fleet of one car.
 
@@ -163,11 +159,6 @@ class LaneFleet(Fleet):
     def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
         arrays = (self._cars, self.rewards, self.ends, self._states)
         return ready(step_only_car, *arrays, examples=(0,))
-
-    @cached_property
-    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
-        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
-        return copy
 
     def observation(self, i: int) -> Any:
         """Return the observation of car i."""
@@ -207,25 +198,14 @@ class LaneFleet(Fleet):
         """Return the `info` of car i."""
         car = self._cars[i, SPEED:].tolist()
         speed_m_s, _, along_m, offset_m, heading_error_rad, _, started_at_m = car
-        return _named(offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
+        values = (offset_m, heading_error_rad, speed_m_s, along_m - started_at_m)
+        return dict(zip(CAR_INFO, values, strict=True))
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all cars."""
         values = np.empty((4, self.count))
         car_info(self._cars, values)
-        return _named(*values)
-
-
-def _named(
-    offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any
-) -> dict[str, Any]:
-    """Return the `info` of one car or of all cars."""
-    return {
-        "lateral_offset_m": offset_m,
-        "heading_error_rad": heading_error_rad,
-        "speed_m_s": speed_m_s,
-        "progress_m": progress_m,
-    }
+        return dict(zip(CAR_INFO, values, strict=True))
 
 
 def _space(observation: str) -> spaces.Space[Any]:

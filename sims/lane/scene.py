@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
-from mcaprl.sims.drawing.shapes import car_part, ground, label, steering_arrow, wheels
+from mcaprl.sims.drawing import shapes
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, raised
+from mcaprl.sims.drawing.shapes import LOOK, RAY, WHITE, car_part
 from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.lane import course
 from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
@@ -22,16 +23,8 @@ from mcaprl.sims.lane.rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
 
 GRASS: Color = (0.36, 0.44, 0.33, 1.0)
 ASPHALT: Color = (0.21, 0.22, 0.24, 1.0)
-WHITE: Color = (0.92, 0.92, 0.90, 1.0)
 YELLOW: Color = (0.93, 0.76, 0.22, 1.0)
-STEEL: Color = (0.66, 0.69, 0.72, 1.0)
 PAINT: Color = (0.83, 0.18, 0.16, 1.0)
-GLASS: Color = (0.12, 0.17, 0.22, 1.0)
-RUBBER: Color = (0.07, 0.07, 0.08, 1.0)
-LAMP: Color = (1.0, 0.96, 0.78, 1.0)
-TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
-RAY: Color = (0.98, 0.80, 0.28, 0.8)
-LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 WALLS: tuple[Color, ...] = (
     (0.80, 0.73, 0.63, 1.0),
     (0.69, 0.48, 0.39, 1.0),
@@ -72,7 +65,7 @@ def _road() -> list[Shape]:
     side_m = 420.0
     middle = course.COURSE.points_m.mean(axis=0)
     return [
-        ground(GRASS, middle, (side_m, side_m)),
+        shapes.ground(GRASS, middle, (side_m, side_m)),
         Shape("road", "triangles", ASPHALT, _asphalt()),
         Shape(
             name="lane_borders",
@@ -96,10 +89,11 @@ def _upright(name: str, box: course.Box, color: Color) -> Shape:
 
 
 def _surroundings() -> list[Shape]:
-    shapes = [_upright(f"rail_{i}", box, STEEL) for i, box in enumerate(course.rails())]
-    for i, box in enumerate(course.buildings()):
-        shapes.append(_upright(f"building_{i}", box, WALLS[i % len(WALLS)]))
-    return shapes
+    rails, houses = enumerate(course.rails()), enumerate(course.buildings())
+    return [
+        *(_upright(f"rail_{i}", box, shapes.STEEL) for i, box in rails),
+        *(_upright(f"building_{i}", box, WALLS[i % len(WALLS)]) for i, box in houses),
+    ]
 
 
 def _car() -> list[Shape]:
@@ -107,13 +101,13 @@ def _car() -> list[Shape]:
     return [
         car_part("body", PAINT, (BODY_LENGTH_M, BODY_WIDTH_M, 0.5), (BODY_FORWARD_M, 0.0, 0.58)),
         car_part("bonnet", PAINT, (1.2, 1.65, 0.12), (1.45, 0.0, 0.88)),
-        car_part("cabin", GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
+        car_part("cabin", shapes.GLASS, (2.1, 1.5, 0.5), (-0.35, 0.0, 1.08)),
         car_part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
-        car_part("lamp_left", LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
-        car_part("lamp_right", LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
+        car_part("lamp_left", shapes.LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
+        car_part("lamp_right", shapes.LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
         car_part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
         car_part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
-        *wheels(RUBBER, axle_m, -axle_m, side_m, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
+        *shapes.wheels(shapes.RUBBER, axle_m, -axle_m, side_m, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
 
@@ -137,27 +131,21 @@ def moving_shapes(
     nearest = point_at(course.COURSE, car.along_m)
     link = np.array([(car.x_m, car.y_m), nearest])
     wheel_rad = wheel_angle(car.steering, car.speed_m_s)
-    return (
-        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.25, 0.0, 0.0)),
-        Shape("lookahead", "points", LOOK, raised(aims, 0.3), size=(0.6, 0.6, 0.6)),
+    seen = (
+        shapes.trail(trail_m, 0.25),
+        shapes.lookahead(aims),
         Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
-        steering_arrow(LOOK, WHEELBASE_M / 2, wheel_rad),
-        label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
-        *(_rays(car) if has_rays else ()),
+        shapes.steering_arrow(WHEELBASE_M / 2, wheel_rad),
+        shapes.label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
     )
-
-
-def _rays(car: Car) -> tuple[Shape, ...]:
+    if not has_rays:
+        return seen
     lines_m = ray_lines(car)
     return (
+        *seen,
         Shape("rays", "segments", RAY, raised(lines_m, 0.5), size=(0.06, 0.0, 0.0)),
         Shape("hits", "points", LOOK, raised(lines_m[:, 1], 0.75), size=(0.3, 0.3, 0.3)),
     )
-
-
-def car_frame(car: Car) -> Frame:
-    """Return the car's frame in the map."""
-    return Frame("car", (car.x_m, car.y_m, 0.0), yaw_rotation(car.yaw_rad))
 
 
 def camera_frame() -> Frame:

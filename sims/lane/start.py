@@ -13,15 +13,7 @@ from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import leg_at, project
 from mcaprl.sims.lane.classic import CLASSIC_SUBSTEPS, STRAIGHT
 from mcaprl.sims.lane.course import COURSE, LANE_HALF_WIDTH_M
-from mcaprl.sims.lane.rules import (
-    DRIVING,
-    MAX_SPEED_M_S,
-    Car,
-    drive,
-    located,
-    observe,
-    store_car,
-)
+from mcaprl.sims.lane.rules import DRIVING, MAX_SPEED_M_S, Car, drive, located, observe, store_car
 from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread, take
 
@@ -77,39 +69,30 @@ def start_car(
     shares: NDArray[np.float64],
     on_line: bool,
     classic: bool,
-    row: NDArray[np.float64],
-    observation: NDArray[np.float32],
-) -> None:
-    """Start a car at random; write its state and observation.
-
-    Args:
-        shares: (4,) random numbers from 0 to 1.
-        on_line: Whether to start on the start line instead of anywhere.
-        classic: Whether a car on the start line first drives straight ahead for a second.
-        row: (10,) output: the `Car`, and its initial distance along the path.
-        observation: (12,) output.
-    """
-    car = start_on_line(shares) if on_line else start_anywhere(shares)
-    if on_line and classic:
-        car = drive(car, STRAIGHT, CLASSIC_SUBSTEPS)
-    store_car(car, row)
-    row[STARTED_AT] = car.along_m
-    observe(car, observation)
-
-
-@compiled
-def start_one_of(
-    shares: NDArray[np.float64],
-    on_line: bool,
-    classic: bool,
     cars: NDArray[np.float64],
     rewards: NDArray[np.float64],
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
     i: int,
 ) -> None:
-    """Start car i of N; other arguments as in `start_car` and `start_cars`."""
-    start_car(shares, on_line, classic, cars[i], observations[i])
+    """Start car i of N at random.
+
+    Args:
+        shares: (4,) random numbers from 0 to 1.
+        on_line: Whether to start on the start line instead of anywhere.
+        classic: Whether a car on the start line first drives straight ahead for a second.
+        cars: (N, 10) output: the `Car`, and its initial distance along the path.
+        rewards: (N,) output: 0.
+        ends: (N,) output: DRIVING.
+        observations: (N, 12) output.
+        i: Index of the car.
+    """
+    car = start_on_line(shares) if on_line else start_anywhere(shares)
+    if on_line and classic:
+        car = drive(car, STRAIGHT, CLASSIC_SUBSTEPS)
+    store_car(car, cars[i])
+    cars[i, STARTED_AT] = car.along_m
+    observe(car, observations[i])
     rewards[i], ends[i] = 0.0, DRIVING
 
 
@@ -125,22 +108,13 @@ def start_cars(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Start K of N cars with `start_car`.
+    """Start the cars with the indices `chosen` (K,); other arguments as in `start_car`.
 
-    Args:
-        chosen: (K,) indices of the cars.
-        numbers: Random numbers of a `Draws` with 4 numbers per start.
-        used: Counters of the same `Draws`.
-        on_line: As in `start_car`.
-        classic: As in `start_car`.
-        cars: (N, 10) rows, as in `start_car`.
-        rewards: (N,) output: 0.
-        ends: (N,) output: DRIVING.
-        observations: (N, 12) output.
+    `numbers` and `used` are those of a `Draws` with 4 numbers per start.
     """
     for i in chosen:
-        start_car(take(numbers, used, i), on_line, classic, cars[i], observations[i])
-        rewards[i], ends[i] = 0.0, DRIVING
+        shares = take(numbers, used, i)
+        start_car(shares, on_line, classic, cars, rewards, ends, observations, i)
 
 
 def car_from(options: dict[str, Any]) -> Car:

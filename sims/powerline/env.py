@@ -134,28 +134,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     """
 
     metadata = METADATA
+    fleet_type = PowerlineFleet
     success_reasons = ("finished",)
-
-    def __init__(
-        self,
-        rules: str = "default",
-        observation: str = "state",
-        camera: str = "down",
-        start: str = "anywhere",
-        plant: str | None = None,
-        wind_m_s: float = 0.0,
-        gust_m_s: float = 0.0,
-        render_mode: RenderMode | None = None,
-    ) -> None:
-        """Make the environment; see "Arguments" of the class.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-            UsageError: A number is outside its range.
-        """
-        fleet = PowerlineFleet(1, rules, observation, camera, start, plant, wind_m_s, gust_m_s)
-        super().__init__(fleet, render_mode)
-        self._camera = camera
 
     @property
     def flight(self) -> Flight:
@@ -185,7 +165,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     def static_frames(self) -> Sequence[Frame]:
         """Return the camera's frame in the drone: x right, y down, z along the view."""
-        return (powerline_scene.camera_frame(self._camera),)
+        return (powerline_scene.camera_frame(self.fleet.camera_view),)
 
     def frames(self) -> Sequence[Frame]:
         """Return the drone's level frame in the map, and the body's frame in the level frame."""

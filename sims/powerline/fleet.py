@@ -26,7 +26,6 @@ from mcaprl.sims.powerline.rules import (
     OBSERVATION_NAMES,
     REASONS,
     VELOCITY_STEP_M_S,
-    Bearing,
     Flight,
     flight_at,
     observe,
@@ -45,6 +44,7 @@ MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 MOTION = slice(3, 9)
 """Indices of the state that `motion` contains: velocity, and command minus velocity."""
+_INFO = ("lateral_offset_m", "vertical_offset_m", "line_distance_m", "speed_m_s", "progress_m")
 
 
 class PowerlineFleet(Fleet):
@@ -91,16 +91,13 @@ class PowerlineFleet(Fleet):
         self._on_line = start == "line"
         self._wind_m_s, self._gust_m_s = wind_m_s, float(gust_m_s)
         self._shows_state = observation == "state"
-        self._camera_view = camera
+        self.camera_view = camera
         self._camera: DroneCamera | None = None
         self._depth_m: dict[int, NDArray[np.float32]] = {}
-        self._make_arrays()
-
-    def _make_arrays(self) -> None:
-        self._flights = np.zeros((self.count, FLIGHT_SIZE))
-        self._bearings = np.zeros((self.count, len(Bearing._fields)))
-        self._started_at_m = np.zeros(self.count)
-        self._seen = np.zeros((self.count, len(OBSERVATION_NAMES)), dtype=np.float32)
+        self._flights = np.zeros((count, FLIGHT_SIZE))
+        self._bearings = np.zeros((count, len(_INFO)))
+        self._started_at_m = np.zeros(count)
+        self._seen = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
 
     def flight(self, i: int) -> Flight:
         """Return the state of a drone, NED."""
@@ -159,7 +156,7 @@ class PowerlineFleet(Fleet):
         """Return drone i's (84, 84) distances along each ray, meters, or infinity."""
         if i not in self._depth_m:
             if self._camera is None:
-                self._camera = DroneCamera(self._camera_view)
+                self._camera = DroneCamera(self.camera_view)
             self._depth_m[i] = self._camera.image_m(self.flight(i).drone)
         return self._depth_m[i]
 
@@ -170,23 +167,14 @@ class PowerlineFleet(Fleet):
 
     def info(self, i: int) -> dict[str, Any]:
         """Return the `info` of drone i."""
-        return _named(self._bearings[i].tolist(), self._started_at_m.item(i))
+        *numbers, along_m = self._bearings[i].tolist()
+        values = (*numbers, along_m - self._started_at_m.item(i))
+        return dict(zip(_INFO, values, strict=True))
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all drones."""
-        return _named(self._bearings.T.copy(), self._started_at_m)
-
-
-def _named(bearing: Any, started_at_m: Any) -> dict[str, Any]:
-    """Return the `info` of one drone (5 numbers) or of all drones (5 rows)."""
-    lateral_m, vertical_m, distance_m, along_m, speed_m_s = bearing
-    return {
-        "lateral_offset_m": lateral_m,
-        "vertical_offset_m": vertical_m,
-        "line_distance_m": distance_m,
-        "speed_m_s": speed_m_s,
-        "progress_m": along_m - started_at_m,
-    }
+        *numbers, along_m = self._bearings.T.copy()
+        return dict(zip(_INFO, (*numbers, along_m - self._started_at_m), strict=True))
 
 
 def _space(observation: str, classic: bool) -> spaces.Space[Any]:

@@ -158,15 +158,7 @@ def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
     left = math.exp(-duration_s / POINT_LAG_S)
     error = minus(drone.velocity_m_s, command_m_s)
     moved = plus(times(duration_s, command_m_s), times(POINT_LAG_S * (1.0 - left), error))
-    return Drone(
-        plus(drone.position_m, moved),
-        plus(command_m_s, times(left, error)),
-        drone.attitude,
-        drone.rates_rad_s,
-        drone.thrusts_n,
-        drone.reference_m_s,
-        drone.integral_m_s2,
-    )
+    return Drone(plus(drone.position_m, moved), plus(command_m_s, times(left, error)), *drone[2:])
 
 
 @inlined
@@ -178,11 +170,7 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
     reference_rate = times(REFERENCE_GAIN_PER_S, minus(command_m_s, reference))
     moved = move(drone, rotors, wind_m_s)
     return Drone(
-        moved.position_m,
-        moved.velocity_m_s,
-        moved.attitude,
-        moved.rates_rad_s,
-        moved.thrusts_n,
+        *moved[:5],
         plus(reference, times(TIME_STEP_S, reference_rate)),
         Vector(
             _integrated(drone.integral_m_s2.x, reference.x - drone.velocity_m_s.x, wanted.x),
@@ -297,8 +285,7 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
         unit(attitude),
         rates,
         thrusts,
-        drone.reference_m_s,
-        drone.integral_m_s2,
+        *drone[5:],
     )
 
 

@@ -167,12 +167,12 @@ def next_gust(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64])
 @compiled
 def collides(position_m: Vector) -> bool:
     """Return whether a drone at a position touches a conductor, a tower or the ground."""
-    if wire_distance(position_m) < WIRE_CLEARANCE_M:
-        return True
-    if tower_distance(position_m) < TOWER_CLEARANCE_M:
-        return True
     height_m = -position_m.z - ground_height(position_m.x, position_m.y)
-    return height_m < GROUND_CLEARANCE_M
+    return (
+        wire_distance(position_m) < WIRE_CLEARANCE_M
+        or tower_distance(position_m) < TOWER_CLEARANCE_M
+        or height_m < GROUND_CLEARANCE_M
+    )
 
 
 @compiled
@@ -224,39 +224,24 @@ def observe(flight: Flight, observation: NDArray[np.float32]) -> None:
         observation[i] = min(max(observation[i], -limit), limit)
 
 
-class Bearing(NamedTuple):
-    """Position of a drone relative to the line, in ROS axes."""
-
-    lateral_m: float
-    """Horizontal offset from the line, left positive."""
-    vertical_m: float
-    """Vertical offset from the line, up positive."""
-    distance_m: float
-    """Distance from the line."""
-    along_m: float
-    """Distance along the line of the nearest point."""
-    speed_m_s: float
-
-
-@compiled
-def bearing_of(drone: Drone) -> Bearing:
-    """Return the position of a drone relative to the line."""
-    place = nearest_on_line(drone.position_m)
-    away = minus(drone.position_m, place.point_m)
-    forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
-    level = math.hypot(forward_x, forward_y)
-    lateral_m = (forward_y * away.x - forward_x * away.y) / level
-    speed_m_s = norm(drone.velocity_m_s)
-    return Bearing(lateral_m, -away.z, place.distance_m, place.along_m, speed_m_s)
-
-
 @compiled
 def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) -> None:
-    """Write the bearings (N, 5) of N drones from their rows (N, 33) of `Flight`."""
+    """Compute where N drones are relative to the line, in ROS axes.
+
+    Args:
+        flights: (N, 33) rows of `Flight`.
+        bearings: (N, 5) output: offsets from the line to the left and up, distance from it, speed,
+            and distance along it.
+    """
     for i in range(len(flights)):
-        bearing = bearing_of(drone_at(flights[i]))
-        for k, value in enumerate(bearing):
-            bearings[i, k] = value
+        drone = drone_at(flights[i])
+        place = nearest_on_line(drone.position_m)
+        away = minus(drone.position_m, place.point_m)
+        forward_x, forward_y = TANGENTS[place.leg, 0], TANGENTS[place.leg, 1]
+        level = math.hypot(forward_x, forward_y)
+        bearings[i, 0] = (forward_y * away.x - forward_x * away.y) / level
+        bearings[i, 1], bearings[i, 2] = -away.z, place.distance_m
+        bearings[i, 3], bearings[i, 4] = norm(drone.velocity_m_s), place.along_m
 
 
 @compiled
@@ -284,7 +269,9 @@ def step_flights(
     """
     if gust_m_s > 0.0:
         for i in range(len(flights)):
-            store_next_gust(flights[i], gust_m_s, noise[i])
+            gust = next_gust(vector_at(flights[i], GUST), gust_m_s, noise[i])
+            for k in range(3):
+                flights[i, GUST + k] = gust[k]
     befores_m = flights[:, FURTHEST].copy()
     decide_all(plant, flights, actions, ends)
     for i in range(len(flights)):
@@ -294,21 +281,8 @@ def step_flights(
 
 
 @compiled
-def store_next_gust(
-    row: NDArray[np.float64], strength_m_s: float, noise: NDArray[np.float64]
-) -> None:
-    """Advance the gust in a flight's row; see `next_gust`."""
-    gust = next_gust(vector_at(row, GUST), strength_m_s, noise)
-    for k in range(3):
-        row[GUST + k] = gust[k]
-
-
-@compiled
 def decide_all(
-    plant: int,
-    flights: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    ends: NDArray[np.int64],
+    plant: int, flights: NDArray[np.float64], actions: NDArray[np.int64], ends: NDArray[np.int64]
 ) -> None:
     """Fly N drones, (N, 33) rows of `Flight`, for half a second or until their episodes end.
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, no_points, path
-from mcaprl.sims.drawing.shapes import label
+from mcaprl.sims.drawing.shapes import LOOK, STEEL, TRAIL, WHITE, label
 from mcaprl.sims.geometry.vectors import Vector, norm
 from mcaprl.sims.powerline import camera, course
 from mcaprl.sims.powerline.quadrotor import ROTOR_OFFSET_M, Drone
@@ -24,16 +24,12 @@ from mcaprl.sims.powerline.rules import Flight
 
 Floats = NDArray[np.float64]
 
-WHITE: Color = (0.92, 0.92, 0.90, 1.0)
-STEEL: Color = (0.66, 0.69, 0.72, 1.0)
 CERAMIC: Color = (0.45, 0.25, 0.18, 1.0)
 COPPER: Color = (0.10, 0.10, 0.12, 1.0)
 ROUTE: Color = (0.93, 0.76, 0.22, 1.0)
 BODY: Color = (0.16, 0.17, 0.20, 1.0)
 PAINT: Color = (0.83, 0.18, 0.16, 1.0)
 DISC: Color = (0.85, 0.88, 0.92, 0.45)
-TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
-LOOK: Color = (0.99, 0.55, 0.10, 1.0)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
 UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
@@ -67,10 +63,6 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
             red, green, blue = (min(1.0, bright * part) for part in color)
             shapes.append(Shape(f"{name}_{shade}", "triangles", (red, green, blue, 1.0), points))
     return shapes
-
-
-def _firs() -> Floats:
-    return np.concatenate([camera.tree_triangles(tree) for tree in course.trees()])
 
 
 def _lattice(tower: course.Tower) -> Floats:
@@ -160,8 +152,9 @@ def _part(
 @functools.cache
 def ground_shapes() -> tuple[Shape, ...]:
     """Return the ground and the firs."""
+    firs = np.concatenate([camera.tree_triangles(tree) for tree in course.trees()])
     ground = _shaded("ground", camera.ground_triangles(), GRASS)
-    return (*ground, *_shaded("firs", _firs(), NEEDLES))
+    return (*ground, *_shaded("firs", firs, NEEDLES))
 
 
 @functools.cache

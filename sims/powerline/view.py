@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.canvas import rgb
 from mcaprl.sims.drawing.follow_view import SIDE_PX, Body, FollowView
+from mcaprl.sims.drawing.shapes import STEEL
 from mcaprl.sims.geometry.vectors import norm
 from mcaprl.sims.powerline import scene
 from mcaprl.sims.powerline.course import (
@@ -101,7 +102,7 @@ class PowerlineView:
         draw.polygon(strip, _GROUND, [*ground, *below])
         for index, tower in enumerate(towers()):
             ends = pixels(ALONG_M[[index, index]], -np.array([tower.foot_z_m, tower.arm_z_m]))
-            draw.line(strip, rgb(scene.STEEL), *ends, 4)
+            draw.line(strip, rgb(STEEL), *ends, 4)
         draw.aalines(strip, rgb(scene.COPPER), False, pixels(*_middle_wire()))
         draw.aalines(strip, rgb(scene.ROUTE), False, pixels(ALONG_M, -POINTS_M[:, 2]))
         here = pixels(np.array([place.along_m]), np.array([height_m]))[0]

@@ -51,20 +51,8 @@ STARTED_AT = len(Car._fields)
 @compiled
 def car_at(row: NDArray[np.float64]) -> Car:
     """Read a car from a row of 12 floats."""
-    return Car(
-        row[0],
-        row[1],
-        row[2],
-        row[3],
-        row[4],
-        row[5],
-        row[6],
-        row[7],
-        row[8],
-        row[9],
-        row[10],
-        row[11],
-    )
+    motion, counts = (row[0], row[1], row[2], row[3], row[4]), (row[5], row[6], row[7], row[8])
+    return Car(*motion, *counts, row[9], row[10], row[11])
 
 
 @compiled
@@ -91,20 +79,8 @@ def placed(
         gate = (gate + 1) % count
     error_rad = wrap_angle(-heading_rad - place.yaw_rad)
     heading_rad = wrap_angle(heading_rad)
-    return Car(
-        x_px,
-        y_px,
-        heading_rad,
-        heading_rad,
-        speed_px,
-        float(gate),
-        0.0,
-        0.0,
-        0.0,
-        along_m,
-        place.offset_m,
-        error_rad,
-    )
+    motion, counts = (x_px, y_px, heading_rad, heading_rad, speed_px), (float(gate), 0.0, 0.0, 0.0)
+    return Car(*motion, *counts, along_m, place.offset_m, error_rad)
 
 
 @compiled

@@ -128,26 +128,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     """
 
     metadata = METADATA
+    fleet_type = RacerFleet
     success_reasons = ("time_limit",)
-
-    def __init__(
-        self,
-        rules: str = "default",
-        observation: str = "rays",
-        start: str | None = None,
-        actions: int = 9,
-        drift: bool = False,
-        track_seed: int | None = None,
-        render_mode: RenderMode | None = None,
-    ) -> None:
-        """Make the environment; see "Arguments" of the class.
-
-        Raises:
-            UnknownNameError: An argument has a value that is not in its list.
-            UsageError: The track's seed is not an integer of at least 0.
-        """
-        fleet = RacerFleet(1, rules, observation, start, actions, drift, track_seed)
-        super().__init__(fleet, render_mode)
 
     @property
     def car(self) -> Car:

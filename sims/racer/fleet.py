@@ -28,12 +28,13 @@ from mcaprl.sims.racer.rules import (
 )
 from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_car
 from mcaprl.sims.vehicle.arguments import check_name
-from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
+from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 RULES = ("default", "classic")
 OBSERVATIONS = ("rays",)
 STARTS = ("anywhere", "line")
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
+_INFO = (*CAR_INFO, "gates_passed")
 
 
 class RacerFleet(Fleet):
@@ -108,7 +109,7 @@ class RacerFleet(Fleet):
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
             self._numbers[action]
         )
-        # Inlined copy of `_named`.
+        # Faster than `zip` of `_INFO`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -137,20 +138,6 @@ class RacerFleet(Fleet):
     def _drive_only(self) -> Callable[[int], StepResult]:
         return ready(step_only_car, *self._arguments, examples=(0,))
 
-    @cached_property
-    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
-        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
-        return copy
-
-    def observation(self, i: int) -> NDArray[np.float32]:
-        """Return the observation of car i."""
-        seen: NDArray[np.float32] = self._seen[i].copy()
-        return seen
-
-    def observations(self) -> NDArray[np.float32]:
-        """Return the observations of all cars."""
-        return self._seen.copy()
-
     def places(self) -> NDArray[np.float64]:
         """Return the positions of all cars, (N, 2) x and y in the map, meters."""
         x_px, y_px = self._cars[:, 0], self._cars[:, 1]
@@ -160,28 +147,14 @@ class RacerFleet(Fleet):
         """Return the `info` of car i."""
         values = np.empty((5, 1))
         car_info(self._cars[i : i + 1], values)
-        offset_m, heading_error_rad, speed_m_s, progress_m, gates = values[:, 0].tolist()
-        return _named(offset_m, heading_error_rad, speed_m_s, progress_m, int(gates))
+        *numbers, gates = values[:, 0].tolist()
+        return dict(zip(_INFO, (*numbers, int(gates)), strict=True))
 
     def infos(self) -> dict[str, NDArray[Any]]:
         """Return the `info` of all cars."""
         values = np.empty((5, self.count))
         car_info(self._cars, values)
-        offset_m, heading_error_rad, speed_m_s, progress_m, gates = values
-        return _named(offset_m, heading_error_rad, speed_m_s, progress_m, gates.astype(np.int64))
-
-
-def _named(
-    offset_m: Any, heading_error_rad: Any, speed_m_s: Any, progress_m: Any, gates: Any
-) -> dict[str, Any]:
-    """Return the `info` of one car or of all cars."""
-    return {
-        "lateral_offset_m": offset_m,
-        "heading_error_rad": heading_error_rad,
-        "speed_m_s": speed_m_s,
-        "progress_m": progress_m,
-        "gates_passed": gates,
-    }
+        return dict(zip(_INFO, (*values[:4], values[4].astype(np.int64)), strict=True))
 
 
 def _track_of(seed: int | None) -> Track:

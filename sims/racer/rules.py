@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import project, wrap_angle
 from mcaprl.sims.geometry.ray_code import log_code
-from mcaprl.sims.racer.car import (
-    CAR_LENGTH_PX,
-    CAR_WIDTH_PX,
-    Car,
-    car_at,
-    corner_at,
-    store_car,
-)
+from mcaprl.sims.racer.car import CAR_LENGTH_PX, CAR_WIDTH_PX, Car, car_at, corner_at, store_car
 from mcaprl.sims.racer.course import IMAGE_HEIGHT_PX, METERS_PER_PX, Track
 from mcaprl.sims.racer.rays import (
     RAY_NAMES,
@@ -76,12 +69,8 @@ OBSERVATION_NAMES = (*RAY_NAMES, "speed")
 def walls_hit(track: Track, car: Car) -> int:
     """Return the number of walls that intersect an edge of the car."""
     count = 0
-    corners = (
-        corner_at(car, 1.0, -1.0),
-        corner_at(car, 1.0, 1.0),
-        corner_at(car, -1.0, 1.0),
-        corner_at(car, -1.0, -1.0),
-    )
+    front = corner_at(car, 1.0, -1.0), corner_at(car, 1.0, 1.0)
+    corners = (*front, corner_at(car, -1.0, 1.0), corner_at(car, -1.0, -1.0))
     for wall in track.walls_px:
         along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
         away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
@@ -115,44 +104,16 @@ def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Ca
     y_px = car.y_px + speed_px * math.sin(course_rad)
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)
     place = project(track.path, x_m, y_m, car.along_m - BACK_M, car.along_m + AHEAD_M)
-    moved = Car(
-        x_px,
-        y_px,
-        heading_rad,
-        course_rad,
-        speed_px,
-        car.next_gate,
-        car.gates,
-        car.idle_steps + 1.0,
-        car.steps + 1.0,
-        place.along_m,
-        place.offset_m,
-        wrap_angle(-heading_rad - place.yaw_rad),
-    )
-    return _with_gate(track, car, moved, classic)
-
-
-@compiled
-def _with_gate(track: Track, before: Car, after: Car, classic: bool) -> Car:
-    """Return the car after a step; count the next gate if the car passed it."""
-    gate = track.gates_px[int(after.next_gate)]
-    passed = sees_gate(after, gate) if classic else crosses_gate(before, after, gate)
+    motion = (x_px, y_px, heading_rad, course_rad, speed_px)
+    counts = (car.next_gate, car.gates, car.idle_steps + 1.0, car.steps + 1.0)
+    error_rad = wrap_angle(-heading_rad - place.yaw_rad)
+    moved = Car(*motion, *counts, place.along_m, place.offset_m, error_rad)
+    gate = track.gates_px[int(car.next_gate)]
+    passed = sees_gate(moved, gate) if classic else crosses_gate(car, moved, gate)
     if not passed:
-        return after
-    return Car(
-        after.x_px,
-        after.y_px,
-        after.heading_rad,
-        after.course_rad,
-        after.speed_px,
-        (after.next_gate + 1.0) % len(track.gates_px),
-        after.gates + 1.0,
-        0.0,
-        after.steps,
-        after.along_m,
-        after.offset_m,
-        after.heading_error_rad,
-    )
+        return moved
+    next_gate = (car.next_gate + 1.0) % len(track.gates_px)
+    return Car(*moved[:5], next_gate, car.gates + 1.0, 0.0, *moved[8:])
 
 
 @compiled

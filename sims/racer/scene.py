@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
-from mcaprl.sims.drawing.shapes import car_part, ground, label, wheels
+from mcaprl.sims.drawing import shapes
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, raised
+from mcaprl.sims.drawing.shapes import LOOK, RAY, car_part
 from mcaprl.sims.racer.car import Car
 from mcaprl.sims.racer.course import (
     IMAGE_HEIGHT_PX,
@@ -33,9 +34,6 @@ WHITE: Color = (0.93, 0.93, 0.91, 1.0)
 RED: Color = (0.80, 0.20, 0.17, 1.0)
 GATE: Color = (0.42, 0.45, 0.48, 1.0)
 NEXT_GATE: Color = (0.25, 0.85, 0.42, 1.0)
-RAY: Color = (0.98, 0.80, 0.28, 0.8)
-HIT: Color = (0.99, 0.55, 0.10, 1.0)
-TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
 PAINT: Color = (0.12, 0.36, 0.84, 1.0)
 CARBON: Color = (0.10, 0.10, 0.12, 1.0)
 RUBBER: Color = (0.05, 0.05, 0.06, 1.0)
@@ -43,11 +41,6 @@ HELMET: Color = (0.97, 0.88, 0.30, 1.0)
 
 WALL_HEIGHT_M, WALL_THICKNESS_M = 0.6, 0.3
 WHEEL_RADIUS_M, WHEEL_WIDTH_M = 0.3, 0.26
-
-
-def _ground() -> Shape:
-    width_m, height_m = IMAGE_WIDTH_PX * METERS_PER_PX, IMAGE_HEIGHT_PX * METERS_PER_PX
-    return ground(GRASS, (width_m / 2, height_m / 2), (width_m, height_m))
 
 
 def _wall(index: int, ends_m: Floats) -> Shape:
@@ -82,7 +75,7 @@ def _car() -> list[Shape]:
             position=(-0.1, 0.0, 0.6),
             frame="car",
         ),
-        *wheels(RUBBER, 0.95, -1.0, 0.55, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
+        *shapes.wheels(RUBBER, 0.95, -1.0, 0.55, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
 
@@ -90,8 +83,9 @@ def static_shapes(track: Track) -> tuple[Shape, ...]:
     """Return the shapes that never change: the world in `map`, the car's parts in `car`."""
     walls_m = to_map(track.walls_px.reshape(-1, 2, 2))
     gates_m = to_map(track.gates_px.reshape(-1, 2, 2))
+    width_m, height_m = IMAGE_WIDTH_PX * METERS_PER_PX, IMAGE_HEIGHT_PX * METERS_PER_PX
     return (
-        _ground(),
+        shapes.ground(GRASS, (width_m / 2, height_m / 2), (width_m, height_m)),
         Shape("road", "triangles", ASPHALT, raised(to_map(asphalt(track)), 0.0)),
         Shape("gates", "segments", GATE, raised(gates_m, 0.02), size=(0.15, 0.0, 0.0)),
         *(_wall(index, ends_m) for index, ends_m in enumerate(walls_m)),
@@ -112,16 +106,15 @@ def moving_shapes(
     gate_m = to_map(track.gates_px[int(car.next_gate)].reshape(2, 2))
     rays_m = to_map(ray_ends(track.walls_px, car))
     return (
-        Shape("trail", "line", TRAIL, raised(path(trail_m), 0.06), size=(0.15, 0.0, 0.0)),
+        shapes.trail(trail_m, 0.15),
         Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
         Shape("rays", "segments", RAY, raised(rays_m, 0.4), size=(0.1, 0.0, 0.0)),
-        Shape("hits", "points", HIT, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),
-        label(f"{car.speed_px:.0f} px/step, {int(car.gates)} gates", WHITE, 2.0),
+        Shape("hits", "points", LOOK, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),
+        shapes.label(f"{car.speed_px:.0f} px/step, {int(car.gates)} gates", WHITE, 2.0),
     )
 
 
 def car_frame(car: Car) -> Frame:
     """Return the car's frame in the map."""
-    x_m = METERS_PER_PX * car.x_px
-    y_m = METERS_PER_PX * (IMAGE_HEIGHT_PX - car.y_px)
-    return Frame("car", (x_m, y_m, 0.0), yaw_rotation(-car.heading_rad))
+    x_m, y_m = METERS_PER_PX * car.x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - car.y_px)
+    return shapes.car_frame(x_m, y_m, -car.heading_rad)

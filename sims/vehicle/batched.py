@@ -64,29 +64,27 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         if max_episode_steps is not None:
             _check_count("max_episode_steps", max_episode_steps)
         self.num_envs = num_envs
-        self.autoreset_mode = _mode_of(autoreset_mode)
-        self.fleet = self.fleet_type(num_envs, **kwargs)
+        if not isinstance(autoreset_mode, AutoresetMode):
+            check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
-        self._adopt_spaces(self.fleet)
-        self._truncates = np.array(self.fleet.truncates)
-        self._some_truncate = bool(self._truncates.any())
-        # A running episode has no reason.
-        self._reasons = np.array([None, *self.fleet.reasons[GOING_ON + 1 :]], dtype=object)
-        self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
-        self._ended = np.ones(num_envs, dtype=np.bool_)
-        self._is_started = False
-
-    def _adopt_spaces(self, fleet: Fleet) -> None:
-        """Copy the fleet's names and spaces, and derive the batched spaces from them."""
+        self.fleet = fleet = self.fleet_type(num_envs, **kwargs)
         self.step_duration_s = fleet.step_duration_s
         self.action_meanings = fleet.action_meanings
         self.observation_names = fleet.observation_names
         self.single_observation_space = fleet.observation_space
         self.single_action_space = spaces.Discrete(len(fleet.action_meanings))
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._truncates = np.array(fleet.truncates)
+        self._some_truncate = bool(self._truncates.any())
+        # A running episode has no reason.
+        self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
+        self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._randoms = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._ended = np.ones(num_envs, dtype=np.bool_)
+        self._is_started = False
 
     def reset(
         self,
@@ -128,14 +126,20 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             ResetNeeded: `reset` was not called.
         """
         self.fleet.actions[:] = check_actions(actions, self.num_envs, len(self.action_meanings))
-        fresh = self._check_can_step()
-        fleet = self.fleet
+        if not self._is_started:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
+            raise UsageError(
+                f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
+                " disabled: reset(options={'reset_mask': terminated | truncated}) first"
+            )
+        # The episodes that ended in an earlier step, which this step resets.
+        fresh, fleet = self._ended.copy(), self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():
                 fleet.noise[i] = self._randoms[i].standard_normal(fleet.noise.shape[1])
         fleet.advance()
         self._steps += 1
-        # This step resets the episodes that ended in an earlier step.
         self._begin_all(np.flatnonzero(fresh))
         has_reason = fleet.ends != GOING_ON
         terminated, truncated = has_reason, self._steps >= self._max_steps
@@ -150,17 +154,6 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def places(self) -> NDArray[np.float64]:
         """Return the positions of all vehicles, (N, 2) x and y in the map, meters."""
         return self.fleet.places()
-
-    def _check_can_step(self) -> Bools:
-        """Return a mask of the ended episodes, which this step resets."""
-        if not self._is_started:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
-            raise UsageError(
-                f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
-                " disabled: reset(options={'reset_mask': terminated | truncated}) first"
-            )
-        return self._ended.copy()
 
     def _begin_all(self, chosen: NDArray[np.int64]) -> None:
         if len(chosen):
@@ -202,12 +195,6 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
 def _check_count(argument: str, value: object) -> None:
     if not isinstance(value, int | np.integer) or value < 1:
         raise UsageError(f"{argument} must be an integer of at least 1, not {value!r}")
-
-
-def _mode_of(mode: AutoresetMode | str) -> AutoresetMode:
-    if not isinstance(mode, AutoresetMode):
-        check_name("autoreset_mode", mode, [known.value for known in AutoresetMode])
-    return AutoresetMode(mode)
 
 
 def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:

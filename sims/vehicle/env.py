@@ -70,18 +70,20 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
 class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
     """Environment of one vehicle; all sims share its seeding, steps, ends and rendering."""
 
+    fleet_type: type[AnyFleet]
     trail_length: int = 40
     success_reasons: ClassVar[tuple[str, ...]]
     """Reasons that count as success; `time_limit` includes truncation by the TimeLimit wrapper."""
 
-    def __init__(self, fleet: AnyFleet, render_mode: RenderMode | None) -> None:
-        """Wrap a fleet of one vehicle.
+    def __init__(self, *, render_mode: RenderMode | None = None, **kwargs: Any) -> None:
+        """Make the environment; see "Arguments" of the class.
 
         Raises:
-            UnknownNameError: There is no such render mode.
+            UnknownNameError: An argument has a value that is not in its list.
+            UsageError: A number is outside its range.
         """
         super().__init__(render_mode)
-        self.fleet = fleet
+        self.fleet = fleet = self.fleet_type(1, **kwargs)
         self.step_duration_s = fleet.step_duration_s
         self.action_meanings = fleet.action_meanings
         self.observation_names = fleet.observation_names

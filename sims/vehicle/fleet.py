@@ -15,6 +15,8 @@ from mcaprl.sims.geometry.compiled import ready
 
 GOING_ON = 0
 """Value of `Fleet.ends` while an episode runs."""
+CAR_INFO = ("lateral_offset_m", "heading_error_rad", "speed_m_s", "progress_m")
+"""Keys of the `info` of cars."""
 
 
 class Fleet(ABC):
@@ -37,6 +39,8 @@ class Fleet(ABC):
     """Reasons why an episode ends, indexed by `ends`."""
     truncates: ClassVar[tuple[bool, ...]]
     """Whether each reason truncates the episode instead of terminating it."""
+    _seen: NDArray[np.float32]
+    """(N, numbers) last observations, for fleets that observe numbers."""
 
     def __init__(
         self,
@@ -110,6 +114,12 @@ class Fleet(ABC):
         """Machine code of `_kernel`, compiled on first use."""
         return ready(*self._kernel())
 
+    @cached_property
+    def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
+        """Copy the numbers that the only vehicle of a fleet of one observes."""
+        copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
+        return copy
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for copies, without cached properties: they refer to our arrays."""
         kind = type(self)
@@ -133,13 +143,13 @@ class Fleet(ABC):
                 mine.pop(i, None)
                 mine |= {i: theirs[j]} if j in theirs else {}
 
-    @abstractmethod
     def observation(self, i: int) -> Any:
         """Return a new copy of the observation of vehicle i."""
+        return self._seen[i].copy()
 
-    @abstractmethod
     def observations(self) -> Any:
         """Return a new copy of all observations, with a leading dimension of N."""
+        return self._seen.copy()
 
     @abstractmethod
     def places(self) -> NDArray[np.float64]:
