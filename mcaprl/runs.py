@@ -13,7 +13,7 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,15 +109,8 @@ def locked_run(folder: Path, resume: bool) -> Iterator[None]:
         run_to_resume(folder)
     elif folder.is_file():
         raise OutputExistsError(f"{folder} is a file: choose another path")
-    is_new = not folder.exists()
     with locked_folder(folder, TrainingError):
-        try:
-            yield
-        finally:
-            if is_new:
-                # A refused request leaves no empty folder.
-                with suppress(OSError):
-                    folder.rmdir()
+        yield
 
 
 @contextmanager

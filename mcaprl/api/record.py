@@ -4,38 +4,39 @@ from __future__ import annotations
 
 import itertools
 import math
-import multiprocessing
-import signal
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import policies_of, policy_names
 from mcaprl.api.ranges import check_fraction, check_least
-from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.files import check_target, locked_file, locked_folder, work_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
+from mcaprl.texts import counted
+from mcaprl.workers import WorkerEndedError, run_workers
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Episodes that were recorded.
+    """Result of `record`.
 
     Attributes:
-        out: File or folder that was written.
+        out: Written file or folder.
         episodes: Number of episodes.
         steps: Number of steps.
         mean_return: Mean of the episodes' returns.
         return_std: Standard deviation of the episodes' returns.
-        size_bytes: Size of all files of `out`, earlier episodes included.
+        size_bytes: Size of all files of `out`, including earlier episodes.
         results: Result of each episode.
     """
 
@@ -94,7 +95,7 @@ def record(
     rotate_mb: float | None = None,
     progress: ProgressBar = no_progress,
 ) -> Recording:
-    """Record episodes of a sim into an MCAP file; each finished episode is on disk at once.
+    """Record episodes of a sim into an MCAP file; write each episode when it ends.
 
     Args:
         sim: Short name of a sim, or a Gymnasium id.
@@ -104,21 +105,21 @@ def record(
         episodes: Number of episodes; exclusive with `steps`.
         steps: Number of steps; exclusive with `episodes`.
         seed: Seed of the recording.
-        envs: Number of processes. A script that asks for more than one needs the usual
-            `if __name__ == "__main__"`, since each process imports it.
+        envs: Number of processes. With more than one, a script needs
+            `if __name__ == "__main__"`, since each process imports the script.
         observation: Observation that the sim returns, such as `depth`.
         rules: Rules of the sim, such as `classic`.
         sim_options: Other arguments of the environment.
-        scene: Whether the topics that only viewers show are recorded.
+        scene: Whether topics that only viewers use are recorded.
         camera: Whether metric depth images are recorded.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
-        rotate_mb: Size in MB after which another file is begun; None for one file.
-        progress: Opens the progress bar.
+        rotate_mb: Size in MB after which a new file is started; None for one file.
+        progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: The arguments contradict each other, or a number is out of its range.
+        UsageError: The arguments contradict each other, or a number is out of range.
         UnknownNameError: There is no such sim or policy.
         OutputExistsError: `out` exists and may not be replaced.
         LogError: The log cannot be written.
@@ -163,12 +164,12 @@ def record(
 
 def _check_request(request: _Request, envs: int) -> None:
     if (request.episodes is None) == (request.steps is None):
-        raise UsageError("record needs --episodes N or --steps N, one of the two")
+        raise UsageError("record needs either --episodes N or --steps N")
     check_fraction(epsilon=request.epsilon)
     check_least(1, episodes=request.episodes, steps=request.steps, envs=envs)
     check_least(0, seed=request.seed)
     if envs > 1 and request.append:
-        raise UsageError("--append needs one file, and --envs writes several: leave out one")
+        raise UsageError("--append needs one file, but --envs writes several: omit one option")
     if envs > 1 and request.out.suffix == ".mcap":
         raise UsageError(
             f"--envs {envs} writes one file per process into a folder; {request.out} is the name of"
@@ -177,7 +178,7 @@ def _check_request(request: _Request, envs: int) -> None:
 
 
 def _files(out: Path) -> list[Path]:
-    """Return what was written: a file, its parts, or the shards in a folder."""
+    """Return the written files: one file, its parts, or the shards in a folder."""
     if out.is_file():
         return [out]
     return sorted(out.glob("*.mcap") if out.is_dir() else out.parent.glob(f"{out.stem}-*.mcap"))
@@ -187,24 +188,9 @@ def _record_file(
     request: _Request, on_episode: Callable[[EpisodeResult], None] | None = None
 ) -> list[EpisodeResult]:
     """Record one file in this process."""
-    megabytes = request.rotate_mb
-    env = make_sim(request.sim, **request.sim_options)
-    with closing(env):
-        policy = policies_of(request.policy, env)[0]
-        behavior = EpsilonGreedy(policy, request.epsilon, env.action_space)
-        recorder = RecordMcap(
-            env,
-            request.out,
-            policy=policy_names([request.policy])[request.policy],
-            epsilon=behavior.epsilon,
-            seed=request.seed,
-            compression=request.compression,
-            overwrite=request.overwrite,
-            append=request.append,
-            max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
-            scene=request.scene,
-            camera=request.camera,
-        )
+    with closing(make_sim(request.sim, **request.sim_options)) as env:
+        behavior = _behavior(request, env)
+        recorder = _recorder(request, env, behavior)
 
         def set_probability(probability: float) -> None:
             recorder.behavior_prob = probability
@@ -216,25 +202,46 @@ def _record_file(
                 seed=request.seed,
                 episodes=request.episodes,
                 steps=request.steps,
-                # Appended episodes have the seeds that they would have had in one recording.
+                # Appended episodes have the same seeds as in a single recording.
                 first_episode=request.first_episode + recorder.episodes,
                 on_action=set_probability,
                 on_episode=on_episode,
             )
 
 
+def _behavior(request: _Request, env: gym.Env[Any, Any]) -> EpsilonGreedy:
+    return EpsilonGreedy(policies_of(request.policy, env)[0], request.epsilon, env.action_space)
+
+
+def _recorder(request: _Request, env: gym.Env[Any, Any], behavior: EpsilonGreedy) -> RecordMcap:
+    megabytes = request.rotate_mb
+    return RecordMcap(
+        env,
+        request.out,
+        policy=policy_names([request.policy])[request.policy],
+        epsilon=behavior.epsilon,
+        seed=request.seed,
+        compression=request.compression,
+        overwrite=request.overwrite,
+        append=request.append,
+        max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
+        scene=request.scene,
+        camera=request.camera,
+    )
+
+
 def _record_shards(
     whole: _Request, processes: int, on_episode: Callable[[EpisodeResult], None]
 ) -> list[EpisodeResult]:
-    """Record the episodes of one recording in parallel, as files of a folder.
+    """Record episodes in parallel, with one file per process.
 
     Raises:
         OutputExistsError: The folder contains logs that may not be replaced.
+        LogError: Another recording is writing to the folder, or a process was killed.
     """
-    # A wrong request fails before anything is written.
-    with closing(make_sim(whole.sim, **whole.sim_options)) as env:
-        policies_of(whole.policy, env)
-    _clear(whole.out, overwrite=whole.overwrite)
+    if whole.out.is_file():
+        raise OutputExistsError(f"{whole.out} is a file: choose the name of a folder")
+    sim, options = whole.sim, whole.sim_options
     shards = [
         replace(
             whole,
@@ -249,31 +256,52 @@ def _record_shards(
         )
         if end > start
     ]
-    context = multiprocessing.get_context("spawn")
-    results = []
-    with ProcessPoolExecutor(len(shards), context, initializer=_end_as_interrupted) as pool:
-        for shard_results in pool.map(_record_file, shards):
-            results += shard_results
-            for result in shard_results:
-                on_episode(result)
-    return results
+    with locked_folder(whole.out):
+        old = _replaceable(whole.out, overwrite=whole.overwrite)
+        # An invalid request fails before anything is replaced.
+        with work_folder(shards[0].out) as trial, closing(make_sim(sim, **options)) as env:
+            behavior = _behavior(whole, env)
+            _recorder(replace(shards[0], out=trial / "trial.mcap"), env, behavior).close()
+        for path in old:
+            with locked_file(path):
+                path.unlink()
+        results: list[list[EpisodeResult]] = [[] for _ in shards]
+
+        def on_message(shard: int, result: EpisodeResult) -> None:
+            results[shard].append(result)
+            on_episode(result)
+
+        try:
+            run_workers(_record_shard, shards, on_message)
+        except WorkerEndedError as error:
+            episodes = counted(len(results[error.index]), "finished episode")
+            raise LogError(
+                f"{shards[error.index].out}: its process {error.cause}; the {episodes} in it and"
+                " those of the other shards are kept"
+            ) from error
+    return [result for shard in results for result in shard]
 
 
-def _clear(folder: Path, *, overwrite: bool) -> None:
-    """Delete the shards of an earlier recording, and nothing else."""
-    old = sorted(folder.glob("*.mcap")) if folder.is_dir() else []
+def _record_shard(request: _Request, send: Callable[[EpisodeResult], None]) -> None:
+    _record_file(request, send)
+
+
+def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
+    """Return the shards of an earlier recording.
+
+    Raises:
+        OutputExistsError: They may not be replaced, or the folder contains other logs.
+        LogError: One of them is being recorded.
+    """
+    old = sorted(folder.glob("*.mcap"))
     foreign = [path.name for path in old if not path.name.startswith("shard-")]
     if foreign:
         raise OutputExistsError(f"{folder} has other logs ({foreign[0]}): choose another folder")
-    if (old and not overwrite) or folder.is_file():
+    if old and not overwrite:
         raise OutputExistsError(f"{folder} exists: choose another folder, or pass --overwrite")
     for path in old:
-        path.unlink()
-
-
-def _end_as_interrupted() -> None:
-    """Let SIGTERM end a shard as Ctrl-C does: with its file closed."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+        check_target(path, overwrite=True)
+    return old
 
 
 def _shares(total: int, parts: int) -> list[tuple[int, int]]:

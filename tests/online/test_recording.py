@@ -127,7 +127,7 @@ def test_a_log_is_in_its_place_throughout_its_recovery(
 
     batch = Task.for_sim("lane").batch(1)
     with monkeypatch.context() as patch:
-        patch.setattr(*((Path, "unlink") if operation == "unlink" else (os, operation)), killed)
+        patch.setattr(Path if operation == "unlink" else os, operation, killed)
         with pytest.raises(KeyboardInterrupt):
             recorded(batch, path, algo="dqn", seed=0, resume=True)
     assert path.read_bytes() == content

@@ -1,0 +1,172 @@
+"""Worker processes that end with their parent, however it ends."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection, wait
+from typing import Any, Literal, TypeVar
+
+from mcaprl.errors import McaprlError
+
+if sys.platform != "win32":
+    from multiprocessing import resource_tracker
+
+T = TypeVar("T")
+_Kind = Literal["message", "done", "interrupted", "error"]
+_STOPS = [
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+]
+# Shells let background processes ignore SIGINT; Windows has no SIGTERM from within.
+_END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
+
+
+class WorkerEndedError(Exception):
+    """A worker ended before its task was done.
+
+    Attributes:
+        index: Index of its request.
+        cause: Cause of the end, such as `was killed by SIGKILL`.
+    """
+
+    def __init__(self, index: int, exit_code: int) -> None:
+        """Describe the exit code of a process."""
+        self.index, self.cause = index, f"ended with exit code {exit_code}"
+        if exit_code < 0:
+            with suppress(ValueError):
+                self.cause = f"was killed by {signal.Signals(-exit_code).name}"
+        super().__init__(f"worker {index} {self.cause}")
+
+
+def run_workers(
+    task: Callable[[T, Callable[[Any], None]], None],
+    requests: Sequence[T],
+    on_message: Callable[[int, Any], None],
+) -> None:
+    """Run a task in one process for each request, until all are done.
+
+    If a worker fails, or this process is interrupted, all other tasks are interrupted with
+    KeyboardInterrupt and end before this function does. If this process is killed, too, they are.
+
+    Args:
+        task: Function of a module, called with a request and a function that sends a message.
+        requests: Arguments of the tasks; they are pickled.
+        on_message: Function called with the index of the request and the message.
+
+    Raises:
+        WorkerEndedError: A worker was killed.
+        KeyboardInterrupt: This process or a worker was interrupted.
+        Exception: The task of a worker raised it.
+    """
+    context = multiprocessing.get_context("spawn")
+    # No worker has the other end of this pipe: it closes when this process ends.
+    ours, held = context.Pipe(duplex=False)
+    processes = []
+    open_pipes: dict[Connection, int] = {}
+    try:
+        with _signals_blocked():
+            for index, request in enumerate(requests):
+                messages, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(task, request, ours, sender))
+                process.start()
+                sender.close()
+                processes.append(process)
+                open_pipes[messages] = index
+        while open_pipes:
+            ready = wait(list(open_pipes))
+            for messages, index in [item for item in open_pipes.items() if item[0] in ready]:
+                try:
+                    kind, content = messages.recv()
+                except (EOFError, ConnectionResetError):
+                    del open_pipes[messages]
+                    processes[index].join()
+                    raise WorkerEndedError(index, processes[index].exitcode or 0) from None
+                if kind == "message":
+                    on_message(index, content)
+                elif kind == "error":
+                    raise content
+                elif kind == "interrupted":
+                    raise KeyboardInterrupt
+                else:
+                    del open_pipes[messages]
+    finally:
+        held.close()
+        for messages in open_pipes:
+            # A worker that waits for room in its pipe would not end.
+            with suppress(EOFError, OSError):
+                while True:
+                    messages.recv_bytes()
+        for process in processes:
+            process.join()
+
+
+def _work(
+    task: Callable[[T, Callable[[Any], None]], None], request: T, parent: Connection, to: Connection
+) -> None:
+    """Run a task; send its messages and how it ended."""
+    outcome: tuple[_Kind, Any]
+    try:
+        for number in _STOPS:
+            if signal.getsignal(number) is not signal.SIG_IGN or number == _END:
+                signal.signal(number, _interrupt_once)
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        if sys.platform != "win32":
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
+        task(request, lambda content: to.send(("message", content)))
+        outcome = "done", None
+    except KeyboardInterrupt:
+        outcome = "interrupted", None
+    except BrokenPipeError:
+        # The parent was killed.
+        return
+    except Exception as error:
+        if not isinstance(error, McaprlError | OSError):
+            error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        outcome = "error", error
+    _ignore_stops()
+    with suppress(BrokenPipeError):
+        to.send(outcome)
+
+
+def _end_with(parent: Connection) -> None:
+    """Interrupt the main thread when the parent closes its end of a pipe, or ends."""
+    with suppress(EOFError, OSError):
+        parent.recv()
+    if sys.platform == "win32":
+        signal.raise_signal(_END)
+    else:
+        # This also interrupts a system call in which the thread waits.
+        thread = threading.main_thread().ident
+        assert thread is not None
+        signal.pthread_kill(thread, _END)
+
+
+def _interrupt_once(*_: Any) -> None:
+    # The terminal and the parent both interrupt; the second must not interrupt the clean-up.
+    _ignore_stops()
+    raise KeyboardInterrupt
+
+
+def _ignore_stops() -> None:
+    for number in _STOPS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def _signals_blocked() -> Iterator[None]:
+    """Block signals in this thread and in the processes that it starts, which unblock them."""
+    if sys.platform == "win32":
+        yield
+        return
+    # It would unblock the signals if it started later.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
