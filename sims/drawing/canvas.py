@@ -31,13 +31,7 @@ class Canvas:
         caption: str,
         images_per_s: int,
     ) -> None:
-        """Prepare an empty image.
-
-        Args:
-            render_mode: Render mode; `human` opens a window.
-            size_px: Width and height.
-            caption: Title of the window.
-            images_per_s: Frame rate of the window.
+        """Prepare an empty image with a width and a height; mode `human` opens a window.
 
         Raises:
             MissingExtraError: Pygame is not installed.

@@ -43,15 +43,9 @@ class FollowView:
         frames_per_s: int,
         floor: Iterable[Shape] = (),
     ) -> None:
-        """Prepare the shapes that never change.
+        """Prepare the static shapes; those of `floor` are drawn below all others.
 
-        Args:
-            render_mode: Render mode; `human` opens a window.
-            name: Name of the sim, for the window's title.
-            static: Shapes that never change.
-            width_m: Width of the ground in the image.
-            frames_per_s: Frame rate of the window.
-            floor: Static shapes that are drawn below all others, whatever their height.
+        `width_m` is the width of the ground in the image.
 
         Raises:
             MissingExtraError: Pygame is not installed.
@@ -65,12 +59,9 @@ class FollowView:
         self._width_m = width_m
 
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
-        """Draw the body and its surroundings; the caller may add to `canvas` before `show`.
+        """Draw the body, its surroundings, and a line of text at the bottom.
 
-        Args:
-            moving: Shapes that change.
-            body: Body in the middle of the image.
-            text: Line of text at the bottom.
+        The caller may add to `canvas` before `show`.
         """
         lifted = [
             patch._replace(top_m=patch.top_m + body.height_m) if patch.frame != "map" else patch

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, path, raised, yaw_rotation
+from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, path, raised, yaw_rotation
 
 Vector = tuple[float, float, float]
 
@@ -57,9 +57,11 @@ def steering_arrow(axle_m: float, wheel_rad: float) -> Shape:
     return Shape("steering", "arrow", LOOK, ends, size=(0.12, 0.3, 0.4), frame="car")
 
 
-def car_part(name: str, color: Color, size_m: Vector, middle_m: Vector) -> Shape:
-    """Return a box that is a part of a car."""
-    return Shape(f"car_{name}", "box", color, size=size_m, position=middle_m, frame="car")
+def car_part(
+    name: str, color: Color, size_m: Vector, middle_m: Vector, kind: Kind = "box"
+) -> Shape:
+    """Return a solid that is a part of a car."""
+    return Shape(f"car_{name}", kind, color, size=size_m, position=middle_m, frame="car")
 
 
 def car_frame(x_m: float, y_m: float, yaw_rad: float) -> Frame:
@@ -70,23 +72,12 @@ def car_frame(x_m: float, y_m: float, yaw_rad: float) -> Frame:
 def wheels(
     color: Color, front_m: float, rear_m: float, side_m: float, radius_m: float, width_m: float
 ) -> list[Shape]:
-    """Return the four wheels of a car.
-
-    Args:
-        color: Color of the tires.
-        front_m: Position of the front axle, x.
-        rear_m: Position of the rear axle, x.
-        side_m: Distance of the wheels from the car's middle, y.
-        radius_m: Radius of a wheel.
-        width_m: Width of a wheel.
-    """
-    hubs = {
-        "front_left": (front_m, side_m, radius_m),
-        "front_right": (front_m, -side_m, radius_m),
-        "rear_left": (rear_m, side_m, radius_m),
-        "rear_right": (rear_m, -side_m, radius_m),
-    }
-    return [_wheel(name, color, hub, radius_m, width_m) for name, hub in hubs.items()]
+    """Return the four wheels of a car with axles at x = `front_m` and `rear_m`, y = +-`side_m`."""
+    return [
+        _wheel(f"{end}_{side}", color, (x_m, y_m, radius_m), radius_m, width_m)
+        for end, x_m in (("front", front_m), ("rear", rear_m))
+        for side, y_m in (("left", side_m), ("right", -side_m))
+    ]
 
 
 def _wheel(name: str, color: Color, hub_m: Vector, radius_m: float, width_m: float) -> Shape:

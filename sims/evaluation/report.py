@@ -14,6 +14,7 @@ import numpy as np
 from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
 from mcaprl.page import Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
+from mcaprl.sims.drawing.top_view import patches
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
 from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.sims.evaluation.statistics import interquartile_mean, median
@@ -250,12 +251,5 @@ def _draw_world(axes: Any, world: Sequence[Shape]) -> None:
             strokes = np.pad(pairs, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
             axes.plot(*strokes.reshape(-1, 2).T, color=PALE, lw=1, zorder=0)
         elif shape.kind == "box" and shape.size[2] > _FLAT_M:
-            corners = _box_corners(shape)
-            axes.fill(corners[:, 0], corners[:, 1], color=PALE, alpha=0.6, lw=0.8, zorder=0)
-
-
-def _box_corners(shape: Shape) -> Any:
-    half_x, half_y = shape.size[0] / 2, shape.size[1] / 2
-    local = np.array([(half_x, half_y), (-half_x, half_y), (-half_x, -half_y), (half_x, -half_y)])
-    cos, sin = np.cos(shape.yaw_rad), np.sin(shape.yaw_rad)
-    return local @ np.array([(cos, sin), (-sin, cos)]) + np.array(shape.position[:2])
+            (patch,) = patches([shape])
+            axes.fill(*patch.corners_m.T, color=PALE, alpha=0.6, lw=0.8, zorder=0)

@@ -25,9 +25,6 @@ from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode
 
 Floats = NDArray[np.float64]
 
-RULES = ("default",)
-OBSERVATIONS = ("state",)
-STARTS = ("anywhere", "line")
 VIEW_M = 80.0
 """Width of the ground in the rendered image."""
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}
@@ -161,9 +158,9 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
             UnknownNameError: An argument has a value that is not in its list.
         """
         check_name("road", road, tuple(ROADS))
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
-        check_name("start", start, STARTS)
+        check_name("rules", rules, ("default",))
+        check_name("observation", observation, ("state",))
+        check_name("start", start, ("anywhere", "line"))
         super().__init__(render_mode)
         self._inner: Any = ROADS[road](config={"observation": _NO_OBSERVATION})
         frequency_hz = self._inner.config["policy_frequency"]

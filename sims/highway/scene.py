@@ -54,9 +54,7 @@ class Car(NamedTuple):
 def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
     """Return the shapes that never change: the world in `map`, the car's parts in `car`.
 
-    Args:
-        network: The `highway_env.road.road.RoadNetwork`.
-        courses: Courses of the road.
+    `network` is a `highway_env.road.road.RoadNetwork`.
     """
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M
@@ -122,15 +120,7 @@ def moving_shapes(
     aims_m: Sequence[tuple[float, float]],
     steering_rad: float,
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step.
-
-    Args:
-        car: Car that the agent drives.
-        others: Other cars.
-        trail_m: Last positions of the car, (x, y) in the map; at least one.
-        aims_m: Points of the lane ahead that the agent observes.
-        steering_rad: Angle of the front wheels, left positive.
-    """
+    """Return the shapes that change with each step; `aims_m` are the observed points ahead."""
     return (
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(np.array(aims_m)),
@@ -141,11 +131,5 @@ def moving_shapes(
 
 
 def _other_car(name: str, car: Car) -> Shape:
-    return Shape(
-        name=name,
-        kind="box",
-        color=OTHER_PAINT,
-        size=(car.length_m, car.width_m, CAR_HEIGHT_M),
-        position=(car.x_m, car.y_m, CAR_HEIGHT_M / 2),
-        yaw_rad=car.yaw_rad,
-    )
+    size, at = (car.length_m, car.width_m, CAR_HEIGHT_M), (car.x_m, car.y_m, CAR_HEIGHT_M / 2)
+    return Shape(name, "box", OTHER_PAINT, size=size, position=at, yaw_rad=car.yaw_rad)

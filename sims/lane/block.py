@@ -75,13 +75,6 @@ def step_only_car(
 ) -> tuple[float, int, float, float, float, float]:
     """Advance a single car like `step_cars`; also return the contents of its `info`.
 
-    Args:
-        cars: (1, 10) row: the `Car`, and its initial distance along the path.
-        rewards: (1,) output.
-        ends: (1,) output.
-        observations: (1, 12) output.
-        action: 0 to 5.
-
     Returns:
         Reward, end, offset, heading error, speed and progress.
     """

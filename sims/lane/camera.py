@@ -15,7 +15,6 @@ from mcaprl.sims.lane.course import (
     CAMERA_FORWARD_M,
     CAMERA_HEIGHT_M,
     GROUND_HALF_SIDE_M,
-    Box,
     buildings,
     rails,
 )
@@ -26,15 +25,13 @@ IMAGE_SHAPE = (84, 84)
 """Size of the averaged image; each pixel covers 3.05 x 1.71 rendered pixels."""
 
 
-def _solid(box: Box) -> NDArray[np.float64]:
-    middle_m = (box.x_m, box.y_m, box.height_m / 2)
-    return box_mesh(middle_m, (box.length_m, box.width_m, box.height_m))
-
-
 @functools.cache
 def lane_mesh() -> NDArray[np.float64]:
     """Return the surfaces of the course as (T, 3, 3) triangles, meters; do not modify them."""
-    solids = [_solid(box) for box in (*rails(), *buildings())]
+    solids = [
+        box_mesh((box.x_m, box.y_m, box.height_m / 2), (box.length_m, box.width_m, box.height_m))
+        for box in (*rails(), *buildings())
+    ]
     return np.concatenate([ground_mesh(GROUND_HALF_SIDE_M), *solids])
 
 

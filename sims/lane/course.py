@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -71,19 +70,14 @@ def street_bounds(half_width_m: float) -> NDArray[np.float64]:
     return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
 
 
-class Pavement(NamedTuple):
-    """Union of the street rectangles, divided into cells along the lines through their edges."""
+def pavement(
+    half_width_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Divide the union of the streets into cells along the lines through the edges of streets.
 
-    x_m: NDArray[np.float64]
-    """(M + 1,) cell borders."""
-    y_m: NDArray[np.float64]
-    """(N + 1,) cell borders."""
-    paved: NDArray[np.bool_]
-    """(M, N) mask of the cells on a street."""
-
-
-def pavement(half_width_m: float) -> Pavement:
-    """Divide the union of the streets into cells."""
+    Returns:
+        (M + 1,) x and (N + 1,) y of the cell borders, and a mask (M, N) of the cells on a street.
+    """
     bounds = street_bounds(half_width_m)
     x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
     middle_x, middle_y = (x_m[:-1] + x_m[1:]) / 2, (y_m[:-1] + y_m[1:]) / 2
@@ -91,7 +85,7 @@ def pavement(half_width_m: float) -> Pavement:
     for x0, y0, x1, y1 in bounds:
         inside_x, inside_y = (middle_x > x0) & (middle_x < x1), (middle_y > y0) & (middle_y < y1)
         paved |= np.outer(inside_x, inside_y)
-    return Pavement(x_m, y_m, paved)
+    return x_m, y_m, paved
 
 
 def outline(half_width_m: float) -> NDArray[np.float64]:
@@ -123,13 +117,10 @@ def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
 def _house(
     index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
 ) -> Box:
-    """Return house number `index`.
+    """Return a house, whose number determines its size and its distance from the street.
 
-    Args:
-        index: House number, which determines the size and the distance from the street.
-        at: (2,) point on the center line where the front of the house begins, meters.
-        forward: (2,) unit vector along the street.
-        left: (2,) unit vector from the street to the house.
+    Its front begins beside a point (2,) of the center line; `forward` is the unit vector along the
+    street, `left` the one from the street to the house.
     """
     front_m, deep_m = scattered(index, 8.0, 18.0), scattered(3 * index, 8.0, 15.0)
     garden_m = scattered(5 * index, 7.5, 11.5)
@@ -139,21 +130,15 @@ def _house(
     return Box(float(middle[0]), float(middle[1]), float(size[0]), float(size[1]), height_m)
 
 
-def _street_sides() -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, int]]:
-    """Yield start (2,), direction (2,), length in meters and side of each side of each street."""
-    for start, end in streets():
-        length_m = float(np.hypot(*(end - start)))
-        for side in (1, -1):
-            yield start, (end - start) / length_m, length_m, side
-
-
 @functools.cache
 def buildings() -> tuple[Box, ...]:
     """Return non-overlapping houses on both sides of each street."""
     taken = street_bounds(RAIL_OFFSET_M + 2.0)
     boxes: list[Box] = []
     index = 0
-    for start, forward, length_m, side in _street_sides():
+    for (start, end), side in itertools.product(streets(), (1, -1)):
+        length_m = float(np.hypot(*(end - start)))
+        forward = (end - start) / length_m
         left = side * np.array([-forward[1], forward[0]])
         along_m = -12.0
         while along_m < length_m + 12.0:

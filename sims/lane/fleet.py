@@ -32,9 +32,6 @@ from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.draws import Draws
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
-RULES = ("default", "classic", "classic-code")
-STARTS = ("anywhere", "line")
-OBSERVATIONS = ("state", "depth", "dashboard", "rays")
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
 """Index, in a car's row, of the first number that `info` uses."""
@@ -60,9 +57,9 @@ class LaneFleet(Fleet):
         Raises:
             UnknownNameError: An argument has a value that is not in its list.
         """
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
-        check_name("start", start, (None, *STARTS))
+        check_name("rules", rules, ("default", "classic", "classic-code"))
+        check_name("observation", observation, ("state", "depth", "dashboard", "rays"))
+        check_name("start", start, (None, "anywhere", "line"))
         self._classic, self._by_code = rules != "default", rules == "classic-code"
         self._on_line = start == "line" or (self._classic and start is None)
         super().__init__(

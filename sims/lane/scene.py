@@ -64,28 +64,18 @@ def _dashes() -> NDArray[np.float64]:
 def _road() -> list[Shape]:
     side_m = 420.0
     middle = course.COURSE.points_m.mean(axis=0)
+    borders = raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02)
     return [
         shapes.ground(GRASS, middle, (side_m, side_m)),
         Shape("road", "triangles", ASPHALT, _asphalt()),
-        Shape(
-            name="lane_borders",
-            kind="segments",
-            color=WHITE,
-            points=raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02),
-            size=(0.15, 0.0, 0.0),
-        ),
+        Shape("lane_borders", "segments", WHITE, borders, size=(0.15, 0.0, 0.0)),
         Shape("center_line", "segments", YELLOW, _dashes(), size=(0.12, 0.0, 0.0)),
     ]
 
 
 def _upright(name: str, box: course.Box, color: Color) -> Shape:
-    return Shape(
-        name=name,
-        kind="box",
-        color=color,
-        size=(box.length_m, box.width_m, box.height_m),
-        position=(box.x_m, box.y_m, box.height_m / 2),
-    )
+    size, at = (box.length_m, box.width_m, box.height_m), (box.x_m, box.y_m, box.height_m / 2)
+    return Shape(name, "box", color, size=size, position=at)
 
 
 def _surroundings() -> list[Shape]:
@@ -120,13 +110,7 @@ def static_shapes() -> tuple[Shape, ...]:
 def moving_shapes(
     car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step.
-
-    Args:
-        car: State of the car.
-        trail_m: Last positions of the car, (x, y) in the map; at least one.
-        has_rays: Whether rays are observed.
-    """
+    """Return the shapes that change with each step, with rays if the agent observes them."""
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
     link = np.array([(car.x_m, car.y_m), nearest])

@@ -37,9 +37,6 @@ from mcaprl.sims.powerline.start import draw_wind, flight_from, start_anywhere, 
 from mcaprl.sims.vehicle.arguments import check_name, check_range
 from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 
-RULES = ("default", "classic")
-OBSERVATIONS = ("state", "depth")
-STARTS = ("anywhere", "line")
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 MOTION = slice(3, 9)
@@ -70,10 +67,10 @@ class PowerlineFleet(Fleet):
             UnknownNameError: An argument has a value that is not in its list.
             UsageError: A number is outside its range.
         """
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
+        check_name("rules", rules, ("default", "classic"))
+        check_name("observation", observation, ("state", "depth"))
         check_name("camera", camera, CAMERAS)
-        check_name("start", start, STARTS)
+        check_name("start", start, ("anywhere", "line"))
         check_name("plant", plant, (None, *PLANTS))
         self.classic = classic = rules == "classic"
         check_range("wind_m_s", wind_m_s, 0.0, MAX_WIND_M_S)

@@ -92,17 +92,11 @@ def _arm(index: int, tower: course.Tower) -> list[Shape]:
     size = (2 * course.ARM_HALF_LENGTH_M, 0.5, 0.4)
     at = (float(middle[0]), float(middle[1]), float(middle[2]))
     shapes = [Shape(f"arm_{index}", "box", STEEL, size=size, position=at, yaw_rad=yaw_rad)]
+    size = (0.25, 0.25, course.ARM_BELOW_WIRES_M)
     for phase, phase_m in enumerate(course.PHASES_M):
         x_m, y_m, z_m = middle + phase_m * right + [0.0, 0.0, course.ARM_BELOW_WIRES_M / 2]
-        shapes.append(
-            Shape(
-                name=f"insulator_{index}_{phase}",
-                kind="cylinder",
-                color=CERAMIC,
-                size=(0.25, 0.25, course.ARM_BELOW_WIRES_M),
-                position=(float(x_m), float(y_m), float(z_m)),
-            )
-        )
+        name, at = f"insulator_{index}_{phase}", (float(x_m), float(y_m), float(z_m))
+        shapes.append(Shape(name, "cylinder", CERAMIC, size=size, position=at))
     return shapes
 
 
@@ -164,12 +158,7 @@ def static_shapes() -> tuple[Shape, ...]:
 
 
 def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step.
-
-    Args:
-        flight: State of the drone.
-        trail_m: Last positions of the drone, NED; at least one.
-    """
+    """Return the shapes that change with each step; `trail_m` are the last positions, NED."""
     position = flight.drone.position_m
     place = course.nearest_on_line(position)
     here = np.array(ros(position))

@@ -61,13 +61,7 @@ class PowerlineView:
     def draw(
         self, flight: Flight, trail_m: Sequence[tuple[float, ...]], reward: float
     ) -> NDArray[np.uint8]:
-        """Render the drone and its surroundings, (600, 600, 3).
-
-        Args:
-            flight: State of the drone.
-            trail_m: Last positions of the drone, NED; at least one.
-            reward: Reward of the last step.
-        """
+        """Render the drone and its surroundings, (600, 600, 3)."""
         drone = flight.drone
         x_m, y_m, z_m = scene.ros(drone.position_m)
         place = nearest_on_line(drone.position_m)

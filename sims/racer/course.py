@@ -76,13 +76,8 @@ class Track(NamedTuple):
 
 def to_map(points_px: Floats) -> Floats:
     """Return the map coordinates, meters, of points (..., 2) of the image."""
-    return np.stack(
-        [
-            METERS_PER_PX * points_px[..., 0],
-            METERS_PER_PX * (IMAGE_HEIGHT_PX - points_px[..., 1]),
-        ],
-        axis=-1,
-    )
+    x_px, y_px = points_px[..., 0], points_px[..., 1]
+    return np.stack([METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)], axis=-1)
 
 
 def asphalt(track: Track) -> Floats:

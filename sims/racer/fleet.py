@@ -30,9 +30,6 @@ from mcaprl.sims.racer.start import ANYWHERE, EXACTLY, ON_LINE, car_from, start_
 from mcaprl.sims.vehicle.arguments import check_name
 from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
-RULES = ("default", "classic")
-OBSERVATIONS = ("rays",)
-STARTS = ("anywhere", "line")
 ACTION_SETS = {5: (0, 1, 2, 3, 4), 8: (1, 2, 3, 4, 5, 6, 7, 8), 9: tuple(range(9))}
 _INFO = (*CAR_INFO, "gates_passed")
 
@@ -59,9 +56,9 @@ class RacerFleet(Fleet):
             UnknownNameError: An argument has a value that is not in its list.
             UsageError: The track's seed is not an integer of at least 0.
         """
-        check_name("rules", rules, RULES)
-        check_name("observation", observation, OBSERVATIONS)
-        check_name("start", start, (None, *STARTS))
+        check_name("rules", rules, ("default", "classic"))
+        check_name("observation", observation, ("rays",))
+        check_name("start", start, (None, "anywhere", "line"))
         check_name("number of actions", actions, tuple(ACTION_SETS))
         check_name("drift", drift, (False, True))
         self.classic = rules == "classic"

@@ -46,15 +46,10 @@ WHEEL_RADIUS_M, WHEEL_WIDTH_M = 0.3, 0.26
 def _wall(index: int, ends_m: Floats) -> Shape:
     """Return the wall between two points (2, 2); colors alternate from wall to wall."""
     along, middle = ends_m[1] - ends_m[0], ends_m.mean(axis=0)
-    length_m = float(np.hypot(*along)) + WALL_THICKNESS_M
-    return Shape(
-        name=f"wall_{index}",
-        kind="box",
-        color=RED if index % 2 else WHITE,
-        size=(length_m, WALL_THICKNESS_M, WALL_HEIGHT_M),
-        position=(float(middle[0]), float(middle[1]), WALL_HEIGHT_M / 2),
-        yaw_rad=math.atan2(along[1], along[0]),
-    )
+    size = (float(np.hypot(*along)) + WALL_THICKNESS_M, WALL_THICKNESS_M, WALL_HEIGHT_M)
+    at = (float(middle[0]), float(middle[1]), WALL_HEIGHT_M / 2)
+    color, yaw_rad = RED if index % 2 else WHITE, math.atan2(along[1], along[0])
+    return Shape(f"wall_{index}", "box", color, size=size, position=at, yaw_rad=yaw_rad)
 
 
 def _car() -> list[Shape]:
@@ -67,14 +62,7 @@ def _car() -> list[Shape]:
         car_part("rear_wing", WHITE, (0.26, 1.1, 0.08), (-1.37, 0.0, 0.80)),
         car_part("rear_wing_left", CARBON, (0.3, 0.05, 0.45), (-1.35, 0.55, 0.62)),
         car_part("rear_wing_right", CARBON, (0.3, 0.05, 0.45), (-1.35, -0.55, 0.62)),
-        Shape(
-            name="car_helmet",
-            kind="sphere",
-            color=HELMET,
-            size=(0.3, 0.3, 0.3),
-            position=(-0.1, 0.0, 0.6),
-            frame="car",
-        ),
+        car_part("helmet", HELMET, (0.3, 0.3, 0.3), (-0.1, 0.0, 0.6), "sphere"),
         *shapes.wheels(RUBBER, 0.95, -1.0, 0.55, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
@@ -96,13 +84,7 @@ def static_shapes(track: Track) -> tuple[Shape, ...]:
 def moving_shapes(
     track: Track, car: Car, trail_m: Sequence[tuple[float, ...]]
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step.
-
-    Args:
-        track: Track of the car.
-        car: State of the car.
-        trail_m: Last positions of the car, (x, y) in the map; at least one.
-    """
+    """Return the shapes that change with each step."""
     gate_m = to_map(track.gates_px[int(car.next_gate)].reshape(2, 2))
     rays_m = to_map(ray_ends(track.walls_px, car))
     return (

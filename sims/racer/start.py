@@ -22,13 +22,6 @@ ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
 
 
 @compiled
-def start_exactly(track: Track) -> Car:
-    """Return a car at rest exactly on the start line."""
-    x_px, y_px, heading_rad = track.start_px
-    return placed(track, x_px, y_px, heading_rad, 0.0, 0.0)
-
-
-@compiled
 def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
     """Return a car at rest near the line; two random numbers set its offset and heading."""
     x_px, y_px, heading_rad = track.start_px
@@ -75,7 +68,7 @@ def start_car(
     elif len(shares) == ON_LINE:
         car = start_on_line(track, shares)
     else:
-        car = start_exactly(track)
+        car = placed(track, *track.start_px, 0.0, 0.0)
     store_car(car, cars[i])
     cars[i, STARTED_AT] = car.along_m
     observe(track, car, classic, observations[i])

@@ -42,13 +42,7 @@ class RacerView:
     def draw(
         self, car: Car, trail_m: Sequence[tuple[float, ...]], action: int
     ) -> NDArray[np.uint8]:
-        """Render the track and the car, (600, 1000, 3).
-
-        Args:
-            car: State of the car.
-            trail_m: Last positions of the car, (x, y) in the map; at least one.
-            action: Last action, 0 to 8.
-        """
+        """Render the track, the car and its last action, (600, 1000, 3)."""
         moving = patches(moving_shapes(self._track, car, trail_m))
         for patch in sorted([*self._static, *moving], key=lambda each: each.top_m):
             self._fill(patch, car)

@@ -64,23 +64,16 @@ class Fleet(ABC):
 
     @abstractmethod
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
-        """Start an episode of vehicle i.
-
-        Args:
-            i: Index of the vehicle, 0 to N - 1.
-            random: Source of all random numbers.
-            options: Options of `reset`.
+        """Start an episode of vehicle i, with the options of `reset`.
 
         Raises:
             UsageError: `options` has an unknown key or an invalid pose.
         """
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
-        """Start an episode of some vehicles, as `begin` does without options.
+        """Start episodes of the vehicles with the indices `chosen` (K,), as `begin` does.
 
-        Args:
-            chosen: (K,) indices of the vehicles.
-            randoms: Generators of all N vehicles.
+        `randoms` are the generators of all N vehicles.
         """
         for i in chosen.tolist():
             self.begin(i, randoms[i], None)
@@ -90,10 +83,7 @@ class Fleet(ABC):
         """Advance each vehicle by one step with its action in `actions`."""
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only vehicle of a fleet of one.
-
-        Args:
-            action: Valid action.
+        """Advance the only vehicle of a fleet of one, with a valid action.
 
         Returns:
             Observation, reward, end as in `ends`, and `info`.
