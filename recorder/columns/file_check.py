@@ -1,17 +1,148 @@
-"""Checks of an MCAP file as a whole: summary, end and CRC of the data section, attachments."""
+"""Checks of a file: summary, CRCs, attachments, and chunks against their indexes."""
 
 from __future__ import annotations
 
 import struct
+from typing import Any
 
+import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, Statistics
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from mcaprl.problem import Problem
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
+from mcaprl.recorder.columns.chunks import chunk_header
+from mcaprl.recorder.columns.message_rows import (
+    INDEX_ENTRY,
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+    message_index,
+    windows,
+)
 from mcaprl.recorder.columns.reader import McapReader
-from mcaprl.recorder.columns.records import is_intact_attachment
+from mcaprl.recorder.columns.records import contents_of, is_intact_attachment, parse_record
+
+
+def place(reader: McapReader, chunk: ChunkIndex) -> str:
+    """Describe a chunk by its offset, topics and times."""
+    known = (reader.channels.get(channel_id) for channel_id in chunk.message_index_offsets)
+    topics = ", ".join(sorted(channel.topic for channel in known if channel)) or "unknown topics"
+    times = f"log_time {chunk.message_start_time} to {chunk.message_end_time}"
+    return f"chunk at byte {chunk.chunk_start_offset}, {topics}, {times}"
+
+
+def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Problem]:
+    """Compare a chunk with its header, its message indexes, and its entry in the summary.
+
+    Args:
+        reader: File of the chunk.
+        chunk: Element of `reader.chunks`.
+        records: Decompressed records of the chunk.
+
+    Raises:
+        CorruptLogError: An index or a record is damaged.
+    """
+    found = []
+    header = chunk_header(reader.view, chunk.chunk_start_offset)
+    listed = (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size)
+    if listed != (header.start_time, header.end_time, header.uncompressed_bytes):
+        found.append("the summary does not match the header of the chunk")
+    indexes = {
+        channel_id: message_index(reader.view, offset, channel_id)
+        for channel_id, offset in chunk.message_index_offsets.items()
+    }
+    if not _has_only(records, indexes):
+        found += _wrong_indexes(reader, indexes, contents_of(records).indexes)
+    times = [index["log_time"] for index in indexes.values() if len(index)]
+    if times:
+        first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+        if (first, last) != (header.start_time, header.end_time):
+            found.append("the times of the chunk do not match its messages")
+    return [Problem(what, place(reader, chunk)) for what in found]
+
+
+def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
+    """Return whether a chunk contains exactly the messages of its indexes.
+
+    A chunk with other records can be valid, too; the caller compares it record by record.
+    """
+    ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
+    if not len(ids):
+        return False
+    index = np.concatenate(list(indexes.values()))
+    if (index["offset"][1:] < index["offset"][:-1]).any():
+        order = np.argsort(index["offset"], kind="stable")
+        ids, index = ids[order], index[order]
+    offsets = index["offset"]
+    if offsets[0] or offsets[-1] >= len(records):
+        return False
+    # Each size is at least that of a header, so the lengths below do not wrap around.
+    sizes = np.diff(offsets, append=np.uint64(len(records)))
+    if (sizes < MESSAGE_HEADER.itemsize).any():
+        return False
+    if (sizes == sizes[0]).all():
+        heads = np.ndarray(len(sizes), MESSAGE_HEADER, records, strides=(int(sizes[0]),))
+    else:
+        heads = windows(records, offsets, MESSAGE_HEADER)
+    return bool(
+        (heads["length"] == sizes - np.uint64(RECORD_HEADER_BYTES)).all()
+        and (heads["opcode"] == Opcode.MESSAGE).all()
+        and (heads["channel_id"] == ids).all()
+        and (heads["log_time"] == index["log_time"]).all()
+    )
+
+
+def check_statistics(reader: McapReader) -> list[Problem]:
+    """Compare the counts of the summary with those of the file.
+
+    Raises:
+        CorruptLogError: An index is damaged.
+    """
+    found = []
+    if not reader.summary_start:
+        return []
+    for _, opcode, content in reader.records(reader.summary_start):
+        if opcode != Opcode.STATISTICS:
+            continue
+        listed: Statistics = parse_record(opcode, content)
+        counts = {
+            channel_id: sum(map(len, reader.message_ranges(channel)))
+            for channel_id, channel in reader.channels.items()
+        }
+        triples = [
+            ("messages", listed.message_count, sum(counts.values())),
+            ("chunks", listed.chunk_count, len(reader.chunks)),
+            ("channels", listed.channel_count, len(reader.channels)),
+        ]
+        triples += [
+            (f"messages of {reader.channels[id_].topic}", count, counts[id_])
+            for id_, count in listed.channel_message_counts.items()
+            if id_ in counts
+        ]
+        found += [
+            Problem(f"the summary counts {wrong} {name}, the file {count}", "the summary")
+            for name, wrong, count in triples
+            if wrong != count
+        ]
+    return found
+
+
+def _wrong_indexes(
+    reader: McapReader, listed: dict[int, NDArray[Any]], actual: dict[int, NDArray[Any]]
+) -> list[str]:
+    found, none = [], np.empty(0, INDEX_ENTRY)
+    for channel_id in sorted(listed.keys() | actual.keys()):
+        known = reader.channels.get(channel_id)
+        topic = known.topic if known else f"channel {channel_id}"
+        here = np.sort(listed.get(channel_id, none), order="offset")
+        there = np.sort(actual.get(channel_id, none), order="offset")
+        if channel_id not in listed:
+            found.append(f"{topic} is not in the message index")
+        elif not np.array_equal(here, there):
+            found.append(f"the message index of {topic} is wrong")
+    return found
 
 
 def check_file(reader: McapReader) -> list[Problem]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from mcaprl.recorder.columns.chunk_check import check_chunk, check_statistics, place
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.file_check import check_file
+from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.salvage import Damage

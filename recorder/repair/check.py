@@ -1,7 +1,7 @@
 """Checks of a whole log.
 
     file      summary, CRCs of the data section and attachments        (file_check)
-    chunks    CRCs, message indexes, chunk indexes of the summary      (chunk_check)
+    chunks    CRCs, message indexes, chunk indexes of the summary      (file_check)
     log       metadata, schema, episodes, order of steps, images       (episode_check)
 
 Each chunk is decompressed once.

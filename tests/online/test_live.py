@@ -21,11 +21,11 @@ from mcaprl.online.live import TRAINING_NAMES, LiveTraining
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
-from mcaprl.recorder.dataset.learner_topic import read_learner
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.viewer.live_stream import Pace
 from tests.conftest import need
+from tests.support.learner_topic import read_learner
 from tests.support.paths import NODE
 
 SHORT: dict[str, Any] = {

@@ -27,9 +27,9 @@ from mcaprl.online.train import train
 from mcaprl.online.vec_env import BatchedVecEnv
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.learner_topic import read_learner
 from mcaprl.runs import read_curve
 from mcaprl.sims import make_sim
+from tests.support.learner_topic import read_learner
 
 SHORT: dict[str, Any] = {
     "steps": 800,

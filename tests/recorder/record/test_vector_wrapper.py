@@ -21,8 +21,8 @@ import mcaprl
 from mcaprl.errors import LogError, NoStepsError, SpaceError, UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.learner_topic import read_learner
 from mcaprl.recorder.repair.check import check_log
+from tests.support.learner_topic import read_learner
 from tests.support.recordings import MIXED_SPACE, assert_same_bits, leaves_of
 
 MODES = list(AutoresetMode)

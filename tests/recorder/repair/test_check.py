@@ -18,7 +18,7 @@ from gymnasium import spaces
 import mcaprl
 from mcaprl.errors import LogError
 from mcaprl.problem import LISTED, Problem, Shortlist
-from mcaprl.recorder.columns import chunk_check, chunks
+from mcaprl.recorder.columns import chunks, file_check
 from mcaprl.recorder.columns import reader as mcap_reader
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER
 from mcaprl.recorder.columns.reader import McapReader
@@ -263,7 +263,7 @@ def test_arrays_find_what_a_scan_finds(
         log_path.write_bytes(spoilt)
         together = check_log(log_path)
         with monkeypatch.context() as patch:
-            patch.setattr(chunk_check, "_has_only", lambda *_: False)
+            patch.setattr(file_check, "_has_only", lambda *_: False)
             assert check_log(log_path) == together
         found |= {problem.what for problem in together}
     assert len(found) > 10, found
