@@ -136,7 +136,7 @@ def is_at(descriptor: int, path: Path) -> bool:
     """Return whether an open file or folder is the one at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return False
 
 

@@ -108,7 +108,7 @@ def locked_run(folder: Path, resume: bool) -> Iterator[None]:
     if resume:
         run_to_resume(folder)
     elif folder.is_file():
-        raise OutputExistsError(f"{folder} is a file: choose another path")
+        raise OutputExistsError(f"{folder} exists and is a file: choose another path")
     with locked_folder(folder, TrainingError):
         yield
 

@@ -153,8 +153,13 @@ def _interrupt_once(*_: Any) -> None:
 
 
 def _ignore_stops() -> None:
+    # With SIG_IGN, Python reports a signal that has already arrived.
     for number in _STOPS:
-        signal.signal(number, signal.SIG_IGN)
+        signal.signal(number, _ignore)
+
+
+def _ignore(*_: Any) -> None:
+    pass
 
 
 @contextmanager

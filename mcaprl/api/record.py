@@ -240,7 +240,7 @@ def _record_shards(
         LogError: Another recording is writing to the folder, or a process was killed.
     """
     if whole.out.is_file():
-        raise OutputExistsError(f"{whole.out} is a file: choose the name of a folder")
+        raise OutputExistsError(f"{whole.out} exists and is a file: choose the name of a folder")
     sim, options = whole.sim, whole.sim_options
     shards = [
         replace(

@@ -71,6 +71,8 @@ class EpisodeLog:
             SpaceError, OutputExistsError, LogError: As for `LogWriter`.
         """
         self._description = description
+        # The process may change its working folder before the end.
+        self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
         if self.step_ns < 1 or first_ns < 0:
@@ -144,7 +146,10 @@ class EpisodeLog:
 
     def close(self) -> None:
         """Finish the log, and remove its last file if that has no episode."""
+        in_place = self._is_in_place()
         self.log.close()
+        if not in_place:
+            raise self._removed()
         if self.episodes == self._first_in_file > 0 and self._parts is not None:
             self.log.mcap.path.unlink()
 
@@ -174,9 +179,22 @@ class EpisodeLog:
         )
 
     def advance(self, summary: EpisodeSummary) -> None:
-        """Count an episode after it is completely written."""
+        """Count an episode after it is completely written.
+
+        Raises:
+            LogError: The file is not at its path; it is closed.
+        """
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1
+        if not self._is_in_place():
+            self.log.close()
+            raise self._removed()
+
+    def _is_in_place(self) -> bool:
+        return self.log.mcap.is_at(self._folder / self.log.mcap.path)
+
+    def _removed(self) -> LogError:
+        return LogError(f"{self.log.mcap.path} was removed or replaced while it was being recorded")
 
 
 class _Parts:

@@ -6,6 +6,9 @@ import math
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
+import textwrap
 import threading
 import time
 from collections.abc import Iterator
@@ -24,6 +27,7 @@ from mcaprl.errors import LogError, NoStepsError, OutputExistsError, SpaceError,
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.repair.check import check_log
+from tests.support.paths import ROOT
 from tests.support.recordings import ScriptedEnv
 
 BOX = spaces.Box(-np.inf, np.inf, (2,), np.float32)
@@ -321,6 +325,101 @@ def test_disk_full_leaves_the_finished_episodes(
     env.close()
     with pytest.warns(UserWarning, match="cut off"):
         assert len(mcaprl.open(log_path).episodes) == 1
+
+
+@pytest.mark.parametrize("topic", ["/rl/step", "image"])
+def test_disk_full_within_an_episode_is_one_error(tmp_path: Path, topic: str) -> None:
+    script = f"""
+        import resource, signal, sys
+        import gymnasium as gym
+        import numpy as np
+        import mcaprl, mcaprl.errors
+        from tests.support.recordings import ScriptedEnv
+
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        shape, dtype = ((64, 64), np.uint8) if {topic!r} == "image" else ((2,), np.float32)
+        box = gym.spaces.Box(0, 255, shape, dtype)
+        rng = np.random.default_rng(0)
+        rows = [(box.sample(), 0.0, False, False) for _ in range(20_000)]
+        short = [rows[0], (rows[1][0], 0.0, True, False)]
+        scripted = ScriptedEnv(box, gym.spaces.Discrete(2), [short, rows])
+        env = mcaprl.RecordMcap(scripted, sys.argv[1])
+        env.reset()
+        env.step(0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
+        env.reset()
+        try:
+            for _ in range(19_000):
+                env.step(0)
+        except mcaprl.errors.LogError as error:
+            print(error)
+        env.close()
+    """
+    path = tmp_path / "log.mcap"
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script), str(path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.startswith(f"cannot write {path}: File too large; "), done
+    assert done.stderr == ""
+    with pytest.warns(UserWarning, match="cut off"):
+        assert len(mcaprl.open(path).episodes) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
+@pytest.mark.parametrize("way", ["removed", "replaced", "folder removed", "moved"])
+def test_a_removed_file_is_an_error_at_the_end_of_the_episode(log_path: Path, way: str) -> None:
+    folder = log_path.parent / "folder"
+    path = folder / "log.mcap"
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), path)
+    env.reset()
+    env.step(0)
+    env.step(0)
+    env.reset()
+    env.step(0)
+    if way == "moved":
+        path.rename(log_path)
+    else:
+        path.unlink()
+        if way == "replaced":
+            path.write_text("mine")
+        if way == "folder removed":
+            folder.rmdir()
+    with pytest.raises(LogError, match="was removed or replaced while it was being recorded"):
+        env.step(0)
+    env.close()
+    if way == "replaced":
+        assert path.read_text() == "mine"
+    if way == "moved":
+        assert check_log(log_path) == []
+        assert len(mcaprl.open(log_path).episodes) == 2
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
+def test_a_removed_file_is_an_error_of_close(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path)
+    env.reset()
+    env.step(0)
+    env.step(0)
+    log_path.unlink()
+    with pytest.raises(LogError, match="was removed or replaced while it was being recorded"):
+        env.close()
+
+
+def test_the_working_folder_may_change_while_recording(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(log_path.parent)
+    env = mcaprl.RecordMcap(scripted(ONE, ONE), log_path.name)
+    monkeypatch.chdir("/")
+    env.reset()
+    env.step(0)
+    env.step(0)
+    env.close()
+    assert len(mcaprl.open(log_path).episodes) == 1
 
 
 @pytest.fixture
