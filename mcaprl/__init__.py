@@ -23,20 +23,13 @@ from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
     from mcaprl.api.annotate import annotate
-    from mcaprl.api.check import check
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
-    from mcaprl.api.export import export
-    from mcaprl.api.info import info
-    from mcaprl.api.layout import layout
-    from mcaprl.api.policies import load_policy
+    from mcaprl.api.logs import check, info, layout, recover
+    from mcaprl.api.policies import export, load_policy
     from mcaprl.api.record import record
-    from mcaprl.api.recover import recover
-    from mcaprl.api.render import render
-    from mcaprl.api.replay import replay
-    from mcaprl.api.train import train
-    from mcaprl.api.train_online import train_online
-    from mcaprl.api.verify import verify
+    from mcaprl.api.replay import render, replay, verify
+    from mcaprl.api.train import train, train_online
     from mcaprl.recorder.record.vector_wrapper import RecordVecMcap
     from mcaprl.recorder.record.wrapper import RecordMcap
 
@@ -67,17 +60,16 @@ __all__ = [
 ]
 
 # Imported on first use, because they import the log writer, torch or numba.
-_COMMANDS = (
-    "annotate check estimate evaluate export info layout record recover render replay train"
-    " train_online verify"
-)
 __getattr__ = lazy_attributes(
     __name__,
-    {f"mcaprl.api.{name}": [name] for name in _COMMANDS.split()}
+    {f"mcaprl.api.{name}": [name] for name in ("annotate", "estimate", "evaluate", "record")}
     | {
+        "mcaprl.api.logs": ["check", "info", "layout", "recover"],
+        "mcaprl.api.policies": ["export", "load_policy"],
+        "mcaprl.api.replay": ["render", "replay", "verify"],
+        "mcaprl.api.train": ["train", "train_online"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
-        "mcaprl.api.policies": ["load_policy"],
     },
 )
 

@@ -1,4 +1,4 @@
-"""Policies by name: `pilot`, `random`, or the path of a trained policy."""
+"""Policies by name (`pilot`, `random`, or the path of a trained policy), and their export."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.errors import OutputExistsError, PolicyError, UnknownNameError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
 from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
@@ -95,6 +95,35 @@ def load_policy(path: str | Path) -> TrainedPolicy:
 def load_policies(path: str | Path) -> list[TrainedPolicy]:
     """Load the policies of all seeds of a run, sorted by seed; see `load_policy`."""
     return [_load(file) for file in _found_files(Path(path))]
+
+
+def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> TrainedPolicy:
+    """Write a trained policy as ONNX, which ONNX Runtime runs without this package.
+
+    Inputs are the parts of the observation by their names in the log; outputs are `action` and
+    `scores`.
+
+    Args:
+        run: Run folder, or folder of one seed.
+        out: ONNX file to write.
+        overwrite: Whether an existing file is replaced.
+
+    Returns:
+        The policy that was exported.
+
+    Raises:
+        OutputExistsError: `out` exists.
+        PolicyError: There is no policy, or it cannot be exported.
+        MissingExtraError: The packages of the `export` extra are not installed.
+    """
+    from mcaprl.offline.export import export_onnx
+
+    out = Path(out)
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
+    policy = load_policy(run)
+    export_onnx(policy, out)
+    return policy
 
 
 def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:

@@ -1,26 +1,52 @@
-"""Replay of logs to Foxglove viewers."""
+"""Replay of logs: in viewers, as images, or in the sim to compare each step."""
 
 from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
 
 from mcaprl.api.data import Paths
-from mcaprl.api.environments import check_episode
+from mcaprl.api.environments import check_episode, sim_of
 from mcaprl.api.policies import as_names
 from mcaprl.api.ranges import check_port, check_positive
+from mcaprl.errors import LogError, UsageError
 from mcaprl.files import write_json
+from mcaprl.progress import Advance, ProgressBar, no_progress
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.display import SCENE
+from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.playback import Player, Track
 from mcaprl.recorder.viewer.player_server import LiveServer
 from mcaprl.recorder.viewer.prefix import prefixes_of, side_by_side
+from mcaprl.recorder.viewer.scene_reader import moments_of_episode
+from mcaprl.recorder.viewer.verify import Verification
+from mcaprl.recorder.viewer.verify import verify as verify_dataset
+from mcaprl.recorder.viewer.video import (
+    VIDEO_KINDS,
+    check_output,
+    evenly_spaced,
+    shown_steps,
+    write_sheet,
+    write_video,
+)
+
+_Images = Iterator[NDArray[np.uint8]]
+_STILLS = 12
 
 
 @dataclass(frozen=True)
@@ -94,8 +120,186 @@ def replay(
         origins=as_names(allow_origin),
     )
     with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder, closing(server):
-        layout_path = Path(folder) / "foxglove-layout.json"
+        layout_path = Path(folder) / LAYOUT_NAME
         write_json(layout_path, layout)
         on_open(LiveAddress(server.app_url, server.url, layout_path))
         with suppress(KeyboardInterrupt):
             server.run(stop or threading.Event())
+
+
+def verify(
+    file: str | Path,
+    *,
+    episode: int | None = None,
+    sim: str | None = None,
+    trust_env: bool = False,
+    progress: ProgressBar = no_progress,
+) -> Verification:
+    """Repeat the logged actions in the sim, and compare each step until one differs.
+
+    Args:
+        file: Path of the log.
+        episode: Index of the only episode to compare; None for all.
+        sim: Short name or Gymnasium id to use instead of the logged one.
+        trust_env: Whether to import the module that the logged id names, and to pass the logged
+            arguments to any environment.
+        progress: Function that opens a progress bar.
+
+    Raises:
+        UsageError: The log has no such episode, or no environment id.
+        LogError: The log cannot be read, or the sim fails on a logged action.
+        SpaceError: The spaces of the sim and the log differ.
+    """
+    path = Path(file)
+    dataset = open_logs(path)
+    check_episode(dataset, episode, path)
+    with (
+        closing(sim_of(dataset, path, sim, trust_env=trust_env)) as env,
+        progress("stepping", len(dataset)) as advance,
+    ):
+        return verify_dataset(
+            dataset, env, only=episode, on_frame=lambda _, step: advance(min(step, 1))
+        )
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Result of `render`.
+
+    Attributes:
+        episode: Index of the episode.
+        frames: Number of images of the video; 0 without one.
+        stills: Number of images of the contact sheet; 0 without one.
+    """
+
+    episode: int
+    frames: int
+    stills: int
+
+
+def render(
+    file: str | Path,
+    *,
+    episode: int = 0,
+    speed: float = 1.0,
+    video: str | Path | None = None,
+    contact_sheet: str | Path | None = None,
+    overwrite: bool = False,
+    sim: str | None = None,
+    trust_env: bool = False,
+    progress: ProgressBar = no_progress,
+) -> Rendering:
+    """Render one episode of a log from its scene or, without one, with the sim.
+
+    Args:
+        file: Path of the log.
+        episode: Index of the episode.
+        speed: Simulated seconds per second of the video.
+        video: Video to write: .mp4 or .gif.
+        contact_sheet: Image to write, .png, with evenly spaced steps.
+        overwrite: Whether existing files are replaced.
+        sim: Short name or Gymnasium id to use instead of the logged one.
+        trust_env: Whether to import the module that the logged id names, and to pass the logged
+            arguments to any environment.
+        progress: Function that opens a progress bar.
+
+    Raises:
+        UsageError: There is no output, the log has no such episode, `speed` is not positive, or the
+            sim renders no images.
+        LogError: The log has no scene, and the sim does not reproduce the episode.
+        OutputExistsError: An output exists.
+        MissingExtraError: The packages of the `video` extra are not installed.
+    """
+    check_positive(speed=speed)
+    if video is None and contact_sheet is None:
+        raise UsageError("render needs a video, a contact sheet, or both")
+    path = Path(file)
+    check_episode(open_logs(path, columns=[]), episode, path)
+    movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
+    for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):
+        if out is not None:
+            check_output(out, kinds, overwrite=overwrite)
+    dataset = open_logs(path)
+    one = dataset.episodes[episode]
+    reader = McapReader(path)
+    if reader.channel_of(SCENE) is not None:
+        draw = partial(_of_scene, reader, dataset, one)
+    else:
+        make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")
+        draw = partial(_of_sim, path, dataset, one, make)
+    frames, stills = 0, list[int]()
+    if movie is not None:
+        step_ns = float(np.median(np.diff(one.log_time_ns)))
+        shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
+        with progress(f"drawing {movie}", len(shown)) as advance:
+            frames = write_video(movie, _counted(draw(shown), advance), images_per_s)
+    if sheet is not None:
+        stills = evenly_spaced(one.length, _STILLS)
+        write_sheet(sheet, list(draw(stills)))
+    return Rendering(episode, frames, len(stills))
+
+
+def _of_scene(
+    reader: McapReader, dataset: Dataset, episode: Episode, steps: Collection[int]
+) -> _Images:
+    from mcaprl.sims.drawing.chase_view import ChaseView
+    from mcaprl.sims.drawing.scene import Frame, Shape
+
+    static, last = [], None
+    with closing(ChaseView()) as view:
+        for moment in moments_of_episode(reader, episode):
+            if moment.step not in steps:
+                continue
+            if moment.static is not last:
+                static, last = [Shape(**vars(seen)) for seen in moment.static], moment.static
+            yield view.draw(
+                static,
+                [Shape(**vars(seen)) for seen in moment.moving],
+                [Frame(**vars(seen)) for seen in moment.frames],
+                moment.follow,
+                _caption(dataset, episode, moment.step),
+            )
+
+
+def _of_sim(
+    path: Path,
+    dataset: Dataset,
+    episode: Episode,
+    make: Callable[[], gym.Env[Any, Any]],
+    steps: Collection[int],
+) -> _Images:
+    """Yield the images that the sim renders while it repeats the logged actions."""
+    found: list[NDArray[np.uint8]] = []
+    with closing(make()) as env:
+
+        def draw(now: Episode, step: int) -> None:
+            if now.index == episode.index and step in steps:
+                image = env.render()
+                if not isinstance(image, np.ndarray):
+                    raise UsageError(f"{path} has no scene, and {dataset.env_id} renders no images")
+                found.append(np.ascontiguousarray(image, np.uint8))
+
+        result = verify_dataset(dataset, env, only=episode.index, on_frame=draw)
+    if result.difference is not None:
+        raise LogError(f"{path} has no scene, and the sim has changed: {result.difference}")
+    if not found:
+        raise LogError(f"{path} has no scene, and episode {episode.index} has no seed")
+    yield from found
+
+
+def _caption(dataset: Dataset, episode: Episode, step: int) -> list[str]:
+    """Return the lines in the corner of an image."""
+    since_s = (episode.log_time_ns[step] - episode.log_time_ns[0]) / 1e9
+    first = f"episode {episode.index}   {since_s:.2f} s   step {step} of {episode.length}"
+    total = float(episode.rewards[:step].sum())
+    if step == episode.length:
+        return [first, f"return {total:.2f}   {episode.reason}"]
+    action = episode.actions[step]
+    name = dataset.action_names.get(int(action), "") if action.ndim == 0 else ""
+    return [first, f"return {total:.2f}   {name}"]
+
+
+def _counted(images: _Images, advance: Advance) -> _Images:
+    for image in images:
+        advance(1)
+        yield image

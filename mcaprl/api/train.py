@@ -1,22 +1,29 @@
-"""Offline training of policies from logs."""
+"""Training of policies: offline from logs, and online in a sim."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mcaprl.api.data import Data
-from mcaprl.api.ranges import check_least
+from mcaprl.api.environments import all_options
+from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
+from mcaprl.api.ranges import check_least, check_port
+from mcaprl.api.replay import LiveAddress
 from mcaprl.errors import MissingExtraError, UsageError
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.record.layout import LAYOUT_NAME
+from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.runs import run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 
 if TYPE_CHECKING:
     from mcaprl.offline.training.metrics import OfflineSummary
+    from mcaprl.online.train import OnlineSummary
 
 
 def train(
@@ -88,17 +95,17 @@ def train(
     _, defaults = choose_algorithm(algo)
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
-    with torch_threads(threads):
+    with _torch_threads(threads):
         growing, weights = None, None
         if isinstance(data, Dataset):
             if follow:
                 raise UsageError("follow needs the paths of logs, not a dataset")
             dataset = data
         elif follow:
-            growing = GrowingLogs(_names(data))
+            growing = GrowingLogs(as_names(data))
             dataset = growing.dataset
         else:
-            dataset, weights = open_weighted(_names(data), threads=threads)
+            dataset, weights = open_weighted(as_names(data), threads=threads)
         on_data(algo, dataset)
         summaries = train_dataset(
             dataset,
@@ -119,8 +126,111 @@ def train(
     return summaries
 
 
+def train_online(
+    sim: str | None,
+    out: str | Path,
+    *,
+    algo: str | None = None,
+    preset: str | None = None,
+    seeds: int = 1,
+    seed: int = 0,
+    threads: int = 1,
+    record: str | Path | None = None,
+    sources: str | Path | Sequence[str | Path] = (),
+    resume: bool = False,
+    live: bool = False,
+    port: int = DEFAULT_PORT,
+    allow_origin: str | Sequence[str] = (),
+    observation: str | None = None,
+    rules: str | None = None,
+    sim_options: Mapping[str, Any] | None = None,
+    on_live: Callable[[LiveAddress], None] = lambda address: None,
+    progress: ProgressCallback = lambda now: None,
+    **settings: Any,
+) -> list[OnlineSummary]:
+    """Train a policy in a sim; the same seed and machine produce the same curve.
+
+    Args:
+        sim: Short name of a sim, or a Gymnasium id; None for that of the preset or of the resumed
+            run.
+        out: Run folder to create.
+        algo: `dqn`, `double-dqn`, `ppo` or `a2c`; None for the default of the preset, run or sim.
+        preset: Name of published settings.
+        seeds: Number of agents, which are trained one after the other.
+        seed: Seed of the first agent; agent k uses seed + k.
+        threads: Number of threads of PyTorch.
+        record: Output log of all transitions; with several seeds, a folder.
+        sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
+            the agents.
+        resume: Whether training continues from the checkpoints in `out`.
+        live: Whether viewers can connect during training; slow viewers miss frames.
+        port: Port on 127.0.0.1 for viewers; 0 for any free port.
+        allow_origin: Origin, or several, of web pages that may connect, besides pages on this
+            machine, Foxglove and Lichtblick.
+        observation: Observation that the sim returns, such as `depth`.
+        rules: Rules of the sim, such as `classic`.
+        sim_options: Other arguments of the environment.
+        on_live: Function called with the address once viewers can connect.
+        progress: Function called repeatedly during training.
+        **settings: Settings of the algorithm; their defaults are the preset's or the sim's, or
+            with `resume` the run's.
+
+    Returns:
+        One summary for each seed.
+
+    Raises:
+        UnknownNameError: There is no such sim, algorithm or preset.
+        UsageError: No sim is given, the arguments contradict the preset, or a number is out of
+            range.
+        OutputExistsError: `out` or `record` exists.
+        SpaceError: The algorithm does not support the observations or actions.
+        PolicyError: The policy's network in `sources` differs from the agent's.
+        TrainingError: `out` cannot be written, or contains a run of another task.
+        MissingExtraError: The packages of the `online` extra are not installed.
+    """
+    from mcaprl.online.live import LiveTraining
+    from mcaprl.online.task import choose_task
+    from mcaprl.online.train import train as train_agents
+
+    check_least(1, seeds=seeds, threads=threads)
+    check_least(0, seed=seed)
+    check_port(port)
+    out = Path(out)
+    options = all_options(observation, rules, sim_options)
+    task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
+    data, policy = _experience(as_names(sources))
+    with ExitStack() as stack:
+        stack.enter_context(_torch_threads(threads))
+        viewers = None
+        if live:
+            viewers = LiveTraining(task, port=port, origins=as_names(allow_origin))
+            stream = stack.enter_context(closing(viewers)).stream
+            on_live(LiveAddress(stream.app_url, stream.url, out / LAYOUT_NAME))
+        return train_agents(
+            task,
+            out,
+            seeds=seeds,
+            seed=seed,
+            record=record,
+            data=data,
+            policy=policy,
+            resume=resume,
+            live=viewers,
+            progress=progress,
+        )
+
+
+def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
+    """Return the dataset and the policies, one per seed, among the sources."""
+    policies = [source for source in sources if is_policy(Path(source))]
+    if len(policies) > 1:
+        raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")
+    logs = [source for source in sources if source not in policies]
+    return open_logs(logs) if logs else None, load_policies(policies[0]) if policies else None
+
+
 @contextmanager
-def torch_threads(threads: int) -> Iterator[None]:
+def _torch_threads(threads: int) -> Iterator[None]:
     """Set the number of threads of PyTorch, and restore it afterward."""
     import torch
 
@@ -130,7 +240,3 @@ def torch_threads(threads: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _names(data: str | Path | Sequence[str | Path]) -> list[str]:
-    return [str(data)] if isinstance(data, str | Path) else list(map(str, data))

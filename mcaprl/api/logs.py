@@ -1,22 +1,32 @@
-"""Contents of logs: facts, problems and notable steps."""
+"""Functions on logs: contents and problems, validation, recovery, and layouts."""
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mcaprl.api.data import Paths
-from mcaprl.errors import ReportError, import_extra
+from mcaprl.api.ranges import check_least
+from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
 from mcaprl.files import write_json
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
 from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.scene import DepthSource
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.recorder.repair.check import check_log
+from mcaprl.recorder.repair.recover import Recovery, recover_log
+from mcaprl.recorder.viewer.log_layout import attached_layout
 from mcaprl.recorder.viewer.surprises import Surprise, moments_of
+from mcaprl.sims import SIMS, make_sim
 from mcaprl.texts import size
 
 _LONGEST_SPACE = 90
@@ -128,7 +138,12 @@ def info(data: Paths, *, report: str | Path | None = None, threads: int = 1) -> 
         dataset = open_logs(paths, threads=threads)
     found = _describe(dataset, paths, [str(warning.message) for warning in caught])
     if report is not None:
-        _write_report(Path(report), dataset, found)
+        from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
+
+        folder = Path(report)
+        write_json(folder / "dataset.json", found.to_json(), ReportError)
+        dataset_figure(folder / "dataset.png", dataset, found.title)
+        dataset_page(folder / "index.html", dataset, found.title, found.rows(), found.findings)
     return found
 
 
@@ -160,14 +175,6 @@ def _describe(dataset: Dataset, paths: Sequence[Path], warned: Sequence[str]) ->
     )
 
 
-def _write_report(folder: Path, dataset: Dataset, found: LogInfo) -> None:
-    from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
-
-    write_json(folder / "dataset.json", found.to_json(), ReportError)
-    dataset_figure(folder / "dataset.png", dataset, found.title)
-    dataset_page(folder / "index.html", dataset, found.title, found.rows(), found.findings)
-
-
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
@@ -176,3 +183,122 @@ def _short(text: str) -> str:
     """Return the text of a space on one line, shortened for a large Box."""
     line = " ".join(text.split())
     return line if len(line) <= _LONGEST_SPACE else f"{line[:40]} ... {line[-40:]}"
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """Result of `check`.
+
+    Attributes:
+        files: Files that were read.
+        missing: Problems with paths that contain no logs.
+        problems: All problems, in the order of the paths.
+    """
+
+    files: tuple[Path, ...]
+    missing: tuple[Problem, ...]
+    problems: tuple[Problem, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no problems."""
+        return not self.problems
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `check --json` prints."""
+        return {"ok": self.ok, "problems": [problem.to_json() for problem in self.problems]}
+
+
+def check(data: Paths, *, threads: int = 1) -> CheckResult:
+    """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
+
+    Args:
+        data: File, folder or glob of logs, or several of them. A path without logs is
+            reported as a problem.
+        threads: Number of threads that decompress chunks.
+
+    Raises:
+        UsageError: `data` is empty, or `threads` is below 1.
+    """
+    check_least(1, threads=threads)
+    names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
+    if not names:
+        raise UsageError("no data: the list of files is empty")
+    files: list[Path] = []
+    missing: list[Problem] = []
+    problems: list[Problem] = []
+    for name in names:
+        try:
+            found = find_logs(name)
+        except LogError as error:
+            missing.append(
+                Problem(str(error), "searching for logs", next="check the path", file=str(name))
+            )
+            problems.append(missing[-1])
+            continue
+        files += found
+        problems += [problem for path in found for problem in check_log(path, threads=threads)]
+    return CheckResult(tuple(files), tuple(missing), tuple(problems))
+
+
+def recover(
+    file: str | Path, out: str | Path, *, keep_unfinished: bool = False, overwrite: bool = False
+) -> Recovery:
+    """Write the valid part of a log that was cut off or damaged to a new log.
+
+    Args:
+        file: MCAP file, damaged or not; it is not changed.
+        out: Path of the new log.
+        keep_unfinished: Whether unfinished episodes are kept up to their last complete
+            transition, marked truncated.
+        overwrite: Whether an existing file is replaced.
+
+    Returns:
+        Summary of kept and lost data.
+
+    Raises:
+        OutputExistsError: `out` exists.
+        UsageError: `file` and `out` are the same file.
+        LogError: Nothing can be kept, or `out` cannot be written.
+    """
+    return recover_log(file, out, keep_unfinished=keep_unfinished, overwrite=overwrite)
+
+
+def layout(
+    source: str | Path, out: str | Path | None = None, *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Return the Foxglove layout of a log, or of the logs of a sim.
+
+    Args:
+        source: Path of a log, short name of a sim, or Gymnasium id.
+        out: JSON file to write; None to write nothing.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: `out` has the suffix of a log.
+        UnknownNameError: There is no such sim.
+        OutputExistsError: `out` exists.
+        LogError: The log cannot be read.
+        ReportError: `out` cannot be written.
+    """
+    path = None if out is None else Path(out)
+    if path is not None and path.suffix == ".mcap":
+        raise UsageError(f"{path}: a layout is a JSON file and must not replace a log")
+    if path is not None and path.exists() and not overwrite:
+        raise OutputExistsError(f"{path} exists: choose another path, or pass --overwrite")
+    name = str(source)
+    is_file = name not in SIMS and (Path(name).is_file() or name.endswith(".mcap"))
+    found = attached_layout(McapReader(Path(name))) if is_file else _layout_of_sim(name)
+    if path is not None:
+        write_json(path, found, ReportError)
+    return found
+
+
+def _layout_of_sim(sim: str) -> dict[str, Any]:
+    """Return the layout of a temporary recording of a sim."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "reset.mcap"
+        env = make_sim(sim)
+        with closing(RecordMcap(env, path, camera=isinstance(env.unwrapped, DepthSource))) as log:
+            log.reset(seed=0)
+        return attached_layout(McapReader(path))
