@@ -25,7 +25,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
-from mcaprl.sims.evaluation.statistics import bootstrap_interval
+from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"
 
@@ -220,7 +220,7 @@ def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedR
     if not same_env(dataset.env_id, env_id):
         raise UsageError(f"--behavior {data} is of {dataset.env_id or 'unknown'}, not of {env_id}")
     returns = dataset.statistics.returns
-    interval = bootstrap_interval(returns[None])
+    interval = mean_interval(returns[None])
     return LoggedReturns(data, len(returns), float(returns.mean()), interval)
 
 

@@ -12,14 +12,14 @@ from torch.utils.tensorboard import SummaryWriter
 
 from mcaprl.files import write_atomically
 from mcaprl.runs import METRICS_NAME, RunSummary
-from mcaprl.sims.evaluation.statistics import bootstrap_interval
+from mcaprl.sims.evaluation.statistics import mean_interval
 
 
 class MetricsWriter:
-    """A writer of one row per call.
+    """Writer of metrics to CSV and TensorBoard, one row per call.
 
     The CSV has columns `update`, `learning_rate` and the algorithm's terms. Values are those of one
-    batch, not averages, so the same seed writes the same file.
+    batch, not running averages, so the same seed writes the same file.
     """
 
     def __init__(self, folder: Path, first_update: int) -> None:
@@ -27,8 +27,8 @@ class MetricsWriter:
 
         Args:
             folder: Existing folder.
-            first_update: First update of this session, from 1; rows of later updates, which an
-                earlier session wrote, are dropped.
+            first_update: First update of this session, starting at 1; rows that an earlier session
+                wrote for this or later updates are dropped.
         """
         path = folder / METRICS_NAME
         kept = _rows_before(path, first_update)
@@ -57,10 +57,10 @@ class MetricsWriter:
 
 @dataclass(frozen=True)
 class OfflineSummary(RunSummary):
-    """The outcome of training one seed offline.
+    """Outcome of training one seed offline.
 
     Attributes:
-        terms: Loss terms of the last update; empty if no update was left to do.
+        terms: Loss terms of the last update; empty if no updates remained.
     """
 
     terms: dict[str, float]
@@ -79,14 +79,14 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
         means = []
         for name in finished[0]:
             values = np.array([[terms[name]] for terms in finished])
-            low, high = bootstrap_interval(values)
+            low, high = mean_interval(values)
             means.append(f"{name} {values.mean():.4g} [{low:.4g}, {high:.4g}]")
         lines.append(f"mean of {len(finished)} seeds [95 % interval]: {', '.join(means)}")
     return lines
 
 
 def _rows_before(path: Path, update: int) -> list[str]:
-    """Return the header and the rows of earlier updates, without a row cut short by a kill."""
+    """Return the header and the rows of earlier updates, except incomplete rows of a killed run."""
     if update == 1 or not path.exists():
         return []
     header, *rows = path.read_text().splitlines(keepends=True)

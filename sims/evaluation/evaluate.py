@@ -25,6 +25,7 @@ from mcaprl.sims.evaluation.statistics import (
     improvement_interval,
     improvement_probability,
     interquartile_mean,
+    mean_interval,
     median,
 )
 
@@ -37,7 +38,7 @@ class PolicyScore:
         policy: Name of the policy.
         results: Episodes of each training seed; a scripted policy counts as one seed.
         mean_return: Mean over seeds and episodes.
-        interval: 95 % bootstrap interval of the mean, over seeds and episodes.
+        interval: 95 % interval of the mean, over seeds and episodes.
         normalized_score: Score on the scale random = 0, pilot = 1; None without a pilot.
         normalized_interval: Interval on the same scale.
         successes: Reasons that count as success; None if the environment does not define them.
@@ -132,7 +133,7 @@ def evaluate(
         name,
         tuple(results),
         float(returns.mean()),
-        bootstrap_interval(returns),
+        mean_interval(returns),
         successes=getattr(env.unwrapped, "success_reasons", None),
     )
 

@@ -1,16 +1,27 @@
-"""Statistics of returns: robust means, comparisons of policies, and bootstrap intervals.
+"""Statistics of returns: robust means, comparisons of policies, and intervals.
 
-Returns have the shape (S, E): S training seeds, E episodes of each. Bootstrap samples draw seeds
-with replacement, then episodes within each, so that an interval covers the variation between
-training runs and between episodes.
+Returns have the shape (S, E): S training seeds, E episodes of each, which have the same starts for
+all seeds.
 
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
     https://arxiv.org/abs/2108.13264
+
+The interval of a mean is a bootstrap-t interval over episodes, combined with Student's t over the
+means of the seeds:
+
+    Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
+    Zou and Donner, "Construction of confidence limits about effect measures: a general approach",
+    Statistics in Medicine 27, 2008
+
+Intervals of other statistics are percentiles of bootstrap samples, which draw seeds with
+replacement, and then episodes within each.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -20,13 +31,23 @@ Floats = NDArray[np.float64]
 
 RESAMPLES: Final = 2000
 CONFIDENCE: Final = 0.95
-_PAIRS_AT_ONCE = 1 << 22
-
-
-def mean(returns: Floats) -> Floats:
-    """Return the means (...) of returns (..., S, E)."""
-    means: Floats = returns.mean(axis=(-2, -1))
-    return means
+_PAIRS_AT_ONCE = _VALUES_AT_ONCE = 1 << 22
+_STUDENT: Final = {
+    1: 12.7062,
+    2: 4.30265,
+    3: 3.18245,
+    4: 2.77645,
+    5: 2.57058,
+    6: 2.44691,
+    7: 2.36462,
+    8: 2.30600,
+    10: 2.22814,
+    14: 2.14479,
+    20: 2.08596,
+    40: 2.02108,
+    math.inf: 1.95996,
+}
+"""The 97.5 % quantile of Student's t by the degrees of freedom."""
 
 
 def median(returns: Floats) -> Floats:
@@ -48,14 +69,37 @@ def interquartile_mean(returns: Floats) -> Floats:
     return means
 
 
+def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % interval of the mean.
+
+    With several seeds, the deviations of two limits from the mean are added in squares: Student's t
+    over the means of the seeds, and bootstrap-t over the means of the starts. Neither contains the
+    other: all seeds have the same starts.
+
+    Args:
+        returns: (S, E) returns.
+        seed: Seed of the resampling.
+    """
+    mean = float(returns.mean())
+    down, up = 0.0, 0.0
+    for means, interval in (
+        (returns.mean(axis=1), _student_interval),
+        (returns.mean(axis=0), partial(_bootstrap_t_interval, seed=seed)),
+    ):
+        if len(means) > 1:
+            low, high = interval(means)
+            down, up = math.hypot(down, mean - low), math.hypot(up, high - mean)
+    return mean - down, mean + up
+
+
 def bootstrap_interval(
-    returns: Floats, statistic: Callable[[Floats], Floats] = mean, *, seed: int = 0
+    returns: Floats, statistic: Callable[[Floats], Floats], *, seed: int = 0
 ) -> tuple[float, float]:
     """Return the 95 % percentile bootstrap interval of a statistic.
 
     Args:
         returns: (S, E) returns.
-        statistic: Function of (..., S, E), such as `mean`, `median` or `interquartile_mean`.
+        statistic: Function of (..., S, E), such as `median` or `interquartile_mean`.
         seed: Seed of the resampling.
     """
     return _interval(statistic(_resampled(returns, np.random.default_rng(seed))))
@@ -93,6 +137,50 @@ def _improvement(firsts: Floats, seconds: Floats) -> Floats:
         wins = (one > other).sum((1, 2)) + 0.5 * (one == other).sum((1, 2))
         parts.append(wins / pairs)
     return np.concatenate(parts)
+
+
+def _student_interval(values: Floats) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of values (N,), N > 1, if these are normal."""
+    half = student_quantile(len(values) - 1) * _standard_errors(values)
+    return float(values.mean() - half), float(values.mean() + half)
+
+
+def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
+    """Return the 95 % bootstrap-t interval of the mean of values (N,), N > 1.
+
+    Each limit is at least as far from the mean as that of Student's t, because few or equal values
+    have few different bootstrap samples. Samples without a standard error are excluded.
+    """
+    random = np.random.default_rng(seed)
+    count, mean, error = len(values), values.mean(), _standard_errors(values)
+    studentized = []
+    step = max(1, _VALUES_AT_ONCE // count)
+    for start in range(0, RESAMPLES, step):
+        samples = values[random.integers(count, size=(min(step, RESAMPLES - start), count))]
+        errors = _standard_errors(samples)
+        known = errors > 1e-9 * error
+        studentized.append((samples.mean(axis=-1)[known] - mean) / errors[known])
+    quantile = student_quantile(count - 1)
+    low, high = -quantile, quantile
+    if len(found := np.concatenate(studentized)):
+        low, high = min(low, _interval(found)[0]), max(high, _interval(found)[1])
+    return float(mean - high * error), float(mean - low * error)
+
+
+def _standard_errors(values: Floats) -> Floats:
+    """Return the standard errors (...) of the means of values (..., N)."""
+    errors: Floats = values.std(axis=-1, ddof=1) / math.sqrt(values.shape[-1])
+    return errors
+
+
+def student_quantile(degrees_of_freedom: int) -> float:
+    """Return the 97.5 % quantile of Student's t, within 0.1 %.
+
+    Between the degrees of the table, it is linear in their inverse. SciPy is not a requirement.
+    """
+    degrees = np.array(list(_STUDENT))
+    quantiles = np.array(list(_STUDENT.values()))
+    return float(np.interp(-1 / degrees_of_freedom, -1 / degrees, quantiles))
 
 
 def _resampled(returns: Floats, random: np.random.Generator) -> Floats:

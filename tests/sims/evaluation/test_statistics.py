@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from mcaprl.sims.evaluation.statistics import (
     improvement_interval,
     improvement_probability,
     interquartile_mean,
-    mean,
+    mean_interval,
     median,
+    student_quantile,
 )
+from tests.support.sampled_returns import Returns, coverage
 
 returns = arrays(
     np.float64,
@@ -30,7 +33,6 @@ returns = arrays(
 
 def test_means_by_hand() -> None:
     numbers = np.array([[100.0, 1.0, 2.0, 3.0], [4.0, 5.0, 6.0, -100.0]])
-    assert mean(numbers) == pytest.approx(21 / 8)
     assert median(numbers) == 3.5
     # Two of eight are dropped at each end: 2, 3, 4, 5 remain.
     assert interquartile_mean(numbers) == 3.5
@@ -68,20 +70,82 @@ def test_the_interval_of_an_improvement_holds_it() -> None:
     assert low < improvement_probability(first, second) < high
 
 
-def test_bootstrap_interval_covers_as_often_as_it_says() -> None:
-    """Of 95 % intervals of the mean of 30 normal numbers, about 93 % contain the true mean."""
-    random = np.random.default_rng(0)
-    hits = 0
-    for trial in range(200):
-        low, high = bootstrap_interval(random.normal(size=(1, 30)), seed=trial)
-        hits += low < 0 < high
-    assert 0.88 <= hits / 200 <= 0.99
+@pytest.mark.parametrize(
+    ("of", "least", "most"),
+    [
+        (Returns(1, 30), 0.94, 0.97),
+        (Returns(1, 30, skewed=True), 0.93, 0.97),
+        (Returns(1, 100, skewed=True), 0.93, 0.97),
+        (Returns(2, 30), 0.94, 0.98),
+        (Returns(4, 30), 0.94, 0.98),
+        (Returns(4, 30, skewed=True), 0.94, 0.98),
+        (Returns(4, 30, spread=0), 0.94, 1.0),
+        (Returns(10, 30), 0.94, 0.98),
+        # A few skewed seeds do not show their skewness.
+        (Returns(4, 30, skewed_seeds=True), 0.86, 0.97),
+    ],
+)
+def test_intervals_of_the_mean_cover_as_often_as_documented(
+    of: Returns, least: float, most: float
+) -> None:
+    trials = 300
+    margin = 2 * np.sqrt(0.95 * 0.05 / trials)
+    assert least - margin <= coverage(of, mean_interval, trials) <= most + margin
+
+
+def test_interval_of_the_mean_by_hand() -> None:
+    # Means 1 and 3: standard error 1, and Student's t with one degree is 12.706.
+    assert mean_interval(np.array([[1.0], [3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
+    # One episode of each of two seeds, or two equal ones: the starts add nothing.
+    twice = np.array([[1.0, 1.0], [3.0, 3.0]])
+    assert mean_interval(twice) == pytest.approx((2 - 12.7062, 2 + 12.7062))
+    # Two episodes have only bootstrap samples whose mean is theirs: Student's t remains.
+    assert mean_interval(twice.T) == pytest.approx((2 - 12.7062, 2 + 12.7062))
+    assert mean_interval(np.array([[1.0, 3.0]])) == pytest.approx((2 - 12.7062, 2 + 12.7062))
+    # Deviations from both add in squares.
+    both = np.array([[0.0, 2.0], [2.0, 4.0]])
+    assert mean_interval(both) == pytest.approx((2 - 12.7062 * 2**0.5, 2 + 12.7062 * 2**0.5))
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (3, 4), (1, 1), (4, 1)])
+def test_equal_returns_have_an_interval_of_no_width(shape: tuple[int, int]) -> None:
+    assert mean_interval(np.full(shape, 2.0)) == (2.0, 2.0)
+
+
+@given(returns, st.integers(-3, 3))
+def test_an_interval_of_the_mean_holds_it_and_shifts_and_scales(
+    numbers: NDArray[Any], seed: int
+) -> None:
+    low, high = mean_interval(numbers, seed=abs(seed))
+    assert low <= numbers.mean() + 1e-9
+    assert numbers.mean() - 1e-9 <= high
+    moved = mean_interval(3 * numbers + 5, seed=abs(seed))
+    assert moved == pytest.approx((3 * low + 5, 3 * high + 5), rel=1e-6, abs=1e-6)
+
+
+def test_a_skewed_interval_is_longer_on_the_side_of_the_tail() -> None:
+    numbers = np.random.default_rng(0).lognormal(size=(1, 30))
+    low, high = mean_interval(numbers)
+    assert high - numbers.mean() > 1.2 * (numbers.mean() - low)
+
+
+def test_many_episodes_are_resampled_in_parts() -> None:
+    numbers = np.random.default_rng(0).normal(size=(1, 5_000))
+    low, high = mean_interval(numbers)
+    half = 1.96 * numbers.std() / np.sqrt(numbers.size)
+    assert high - low == pytest.approx(2 * half, rel=0.1)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 9, 12, 29, 99, 999, 10**6])
+def test_the_quantile_of_students_t_is_scipys(degrees: int) -> None:
+    assert student_quantile(degrees) == pytest.approx(scipy.stats.t.ppf(0.975, degrees), rel=1e-3)
 
 
 def test_interval_grows_with_differences_between_seeds() -> None:
     alike = np.tile(np.arange(10.0), (4, 1))
     apart = alike + np.array([[0.0], [10], [20], [30]])
-    low, high = bootstrap_interval(alike)
-    wide_low, wide_high = bootstrap_interval(apart)
-    assert wide_high - wide_low > 3 * (high - low)
-    assert bootstrap_interval(np.full((1, 5), 2.0)) == (2.0, 2.0)
+    for interval in (mean_interval, partial(bootstrap_interval, statistic=median)):
+        low, high = interval(alike)
+        wide_low, wide_high = interval(apart)
+        assert wide_high - wide_low > 3 * (high - low)
+    assert bootstrap_interval(np.full((1, 5), 2.0), median) == (2.0, 2.0)
