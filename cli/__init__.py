@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -16,14 +17,12 @@ from typing import Any
 import click
 
 from mcaprl._version import __version__
-from mcaprl.cli.annotate import annotate
 from mcaprl.cli.evaluate import evaluate
-from mcaprl.cli.export import export
-from mcaprl.cli.logs import check, info, layout, recover
+from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
 from mcaprl.cli.show import echo
-from mcaprl.cli.train_offline import train_offline
+from mcaprl.cli.train_offline import export, train_offline
 from mcaprl.cli.train_online import train_online
 from mcaprl.errors import McaprlError
 
@@ -63,6 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     warnings.showwarning = _print_warning
+    threading.excepthook = _on_thread_error
     sys.exit(run(arguments))
 
 
@@ -96,3 +96,10 @@ def _fail(message: str, code: int) -> int:
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Print a warning on one line, without its source location."""
     echo(f"mcaprl: warning: {' '.join(str(message).split())}", err=True)
+
+
+def _on_thread_error(arguments: threading.ExceptHookArgs) -> None:
+    """Print the error of a thread, unless it is that of a write."""
+    # TensorBoard raises the OSError of its thread again in the thread that trains.
+    if not issubclass(arguments.exc_type, OSError):
+        threading.__excepthook__(arguments)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import sim_options
+from mcaprl.cli.options import integer_option, json_option, sim_options
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
@@ -19,7 +19,6 @@ from mcaprl.texts import counted
 if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
-    from mcaprl.sims.evaluation.evaluate import Improvement
 
 _OF_DATA = ("gamma", "epsilon", "updates", "threads")
 
@@ -28,19 +27,14 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
 @click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
 @click.option("--data", help="Logs to estimate from, without a sim.")
-@click.option(
-    "--episodes",
-    default=30,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of episodes for each policy and training seed.",
+@integer_option(
+    "--episodes", "Number of episodes for each policy and training seed.", least=1, default=30
 )
-@click.option(
+@integer_option(
     "--seed",
+    "Seed of the episodes; with --data, of the model and the resampling.",
+    least=0,
     default=1_000_000,
-    show_default=True,
-    type=click.IntRange(0),
-    help="Seed of the episodes; with --data, of the model and the resampling.",
 )
 @sim_options
 @click.option("--gamma", type=click.FloatRange(0, 1), help="With --data: discount. [default: 0.97]")
@@ -63,7 +57,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing log.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 def evaluate(
     policies: tuple[str, ...],
     sim: str | None,
@@ -130,27 +124,15 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
     ]
     print_table(
         f"{found.sim}: {counted(episodes, 'episode')} for each policy and training seed",
-        [
-            "policy",
-            "mean return",
-            "95 % interval",
-            "IQM",
-            "random 0, pilot 1",
-            "success",
-            "ends",
-        ],
+        ["policy", "mean return", "95 % interval", "IQM", "random 0, pilot 1", "success", "ends"],
         rows,
     )
-    _print_improvements(found.improvements)
-
-
-def _print_improvements(compared: Sequence[Improvement]) -> None:
     print_table(
         "probability that an episode of one policy has a higher return than one of the other",
         ["policy", "than", "probability", "95 % interval"],
         [
             [one.better, one.than, f"{one.probability:.2f}", _interval(one.interval)]
-            for one in compared
+            for one in found.improvements
         ],
     )
 

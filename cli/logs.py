@@ -1,13 +1,16 @@
-"""`mcaprl info`, `check`, `recover` and `layout`: commands on logs."""
+"""`mcaprl info`, `check`, `recover`, `layout` and `annotate`: commands on logs."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 import mcaprl
+from mcaprl.cli.options import integer_option, json_option, trust_option
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
+from mcaprl.progress import terminal_bar
 from mcaprl.texts import counted
 
 # Exit code of `recover` if data is lost.
@@ -18,13 +21,9 @@ _WITH_LOSSES = 3
 @click.argument("data", nargs=-1, required=True)
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--strict", is_flag=True, help="Exit with 1 if there are problems.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option(
-    "--threads",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Number of threads that decompress chunks; useful for large logs.",
+@json_option
+@integer_option(
+    "--threads", "Number of threads that decompress chunks; useful for large logs.", least=1
 )
 def info(
     data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
@@ -45,14 +44,8 @@ def info(
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option(
-    "--threads",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Number of threads that decompress chunks.",
-)
+@json_option
+@integer_option("--threads", "Number of threads that decompress chunks.", least=1)
 def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
     """Read FILE... completely and list all problems. Exits with 1 if there are any."""
     found = mcaprl.check(files, threads=threads)
@@ -76,7 +69,7 @@ def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
     help="Keep unfinished episodes up to their last complete transition, marked truncated.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_json: bool) -> int:
     """Write the valid part of a damaged or cut-off FILE to the new log OUT.
 
@@ -101,3 +94,23 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
     """Write the Foxglove layout of a log, or of the logs of a sim."""
     mcaprl.layout(source, out, overwrite=overwrite)
     echo(f"{out}: in Foxglove, open the layout menu and import this file")
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
+@click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
+@click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
+@click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
+@click.option("--sim", help="With --scene: sim to step instead of the logged one.")
+@trust_option
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+def annotate(file: Path, out: Path, **request: Any) -> None:
+    """Copy FILE and add a policy's values or the scene of the sim to each step."""
+    found = mcaprl.annotate(file, out, progress=terminal_bar, **request)
+    for name, topic in found.topics.items():
+        echo(f"{out}: {topic} has the values of {name} for {found.steps} steps")
+    if found.scene is not None:
+        episodes, steps = found.scene.episodes, found.scene.steps
+        echo(f"{out}: the scene of {counted(episodes, 'episode')}, {counted(steps, 'step')}")

@@ -3,35 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
+F = TypeVar("F", bound=Callable[..., Any])
 
-def sim_options(command: Callable[..., Any]) -> Callable[..., Any]:
+trust_option = click.option(
+    "--trust-env",
+    is_flag=True,
+    help="Trust in FILE: import the module in its environment's id, and pass on all arguments.",
+)
+origin_option = click.option(
+    "--allow-origin",
+    multiple=True,
+    metavar="ORIGIN",
+    help="Another web page that may connect, such as https://viewer.example; may be given"
+    " repeatedly.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+def sim_options(command: F) -> F:
     """Add the options that select the variant of a sim."""
-    observation = click.option(
-        "--observation", help="Observation that the sim returns: state, depth, ..."
-    )
+    text = "Observation that the sim returns: state, depth, ..."
     rules = click.option("--rules", help="Rules of the sim: default, classic, ...")
-    return observation(rules(command))
+    return click.option("--observation", help=text)(rules(command))
 
 
-def trust_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the option that trusts the environment of a log."""
-    return click.option(
-        "--trust-env",
-        is_flag=True,
-        help="Trust in FILE: import the module in its environment's id, and pass on all arguments.",
-    )(command)
-
-
-def origin_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the option that lets a web page connect to the live server."""
-    return click.option(
-        "--allow-origin",
-        multiple=True,
-        metavar="ORIGIN",
-        help="Another web page that may connect, such as https://viewer.example; may be given"
-        " repeatedly.",
-    )(command)
+def integer_option(
+    name: str, help: str, *, least: int, most: int | None = None, default: int | None = None
+) -> Callable[[F], F]:
+    """Return an option of an integer from `least` to `most`, which is `least` by default."""
+    default, kind = least if default is None else default, click.IntRange(least, most)
+    return click.option(name, default=default, show_default=True, type=kind, help=help)

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import sim_options
+from mcaprl.cli.options import integer_option, sim_options
 from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_bar
 from mcaprl.recorder.format.writing import COMPRESSIONS
@@ -28,15 +28,11 @@ from mcaprl.texts import counted, size
 )
 @click.option("--episodes", type=click.IntRange(1), help="Number of episodes to record.")
 @click.option("--steps", type=click.IntRange(1), help="Number of steps to record instead.")
-@click.option(
-    "--seed", default=0, show_default=True, type=click.IntRange(0), help="Seed of the recording."
-)
-@click.option(
+@integer_option("--seed", "Seed of the recording.", least=0)
+@integer_option(
     "--envs",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of processes; with more than one, OUT is a folder with one file per process.",
+    "Number of processes; with more than one, OUT is a folder with one file per process.",
+    least=1,
 )
 @sim_options
 @click.option("--no-scene", is_flag=True, help="Omit the topics that only viewers use.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 import mcaprl
-from mcaprl.cli.options import origin_option, trust_option
+from mcaprl.cli.options import integer_option, origin_option, trust_option
 from mcaprl.cli.show import echo, print_address, print_problems
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
@@ -30,12 +30,8 @@ if TYPE_CHECKING:
     help="Simulated seconds per second.",
 )
 @click.option("--loop", is_flag=True, help="Restart at the end.")
-@click.option(
-    "--port",
-    default=8765,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="Port on 127.0.0.1; 0 for any free port.",
+@integer_option(
+    "--port", "Port on 127.0.0.1; 0 for any free port.", least=0, most=65535, default=8765
 )
 @origin_option
 @click.option("--verify", "verifies", is_flag=True, help="Compare each step with the sim.")

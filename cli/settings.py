@@ -16,13 +16,7 @@ class SettingsCommand(click.Command):
     def __init__(
         self, *arguments: Any, configs: Callable[[], Iterable[Settings]], **others: Any
     ) -> None:
-        """Create the command.
-
-        Args:
-            *arguments: Arguments of `click.Command`.
-            configs: Function that loads the algorithms and returns their default settings.
-            **others: Arguments of `click.Command`.
-        """
+        """Create the command; `configs` loads the algorithms and returns their settings."""
         super().__init__(*arguments, **others)
         self._configs = configs
 
@@ -49,11 +43,10 @@ def _option(name: str, line: str, default: Any) -> click.Option:
     if isinstance(default, bool):
         both = f"{flag(name)}/--no-{name.replace('_', '-')}"
         return click.Option([both, name], default=None, help=line)
-    return click.Option(
-        [flag(name), name],
-        type=_Widths() if isinstance(default, tuple) else type(default),
-        help=f"{line}  [default: {_shown(default)}]",
-    )
+    is_tuple = isinstance(default, tuple)
+    shown = ",".join(map(str, default)) if is_tuple else default
+    kind = _Widths() if is_tuple else type(default)
+    return click.Option([flag(name), name], type=kind, help=f"{line}  [default: {shown}]")
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):
@@ -68,7 +61,3 @@ class _Widths(click.ParamType[tuple[int, ...]]):
             return tuple(int(part) for part in str(value).split(","))
         except ValueError:
             self.fail(f"{value!r} is not a list of widths such as 256,256", param, ctx)
-
-
-def _shown(default: Any) -> str:
-    return ",".join(map(str, default)) if isinstance(default, tuple) else f"{default}"

@@ -47,27 +47,24 @@ def print_address(address: LiveAddress) -> None:
 
 def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     """Print a table to stdout: the first column left-aligned, the others right-aligned."""
-    table = Table(title=Text(printable(title)), title_justify="left", title_style="bold")
+    table = Table()
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
-    _print(table)
+    _print(table, title, rows)
 
 
 def print_facts(title: str, facts: list[tuple[str, str]]) -> None:
     """Print names and values to stdout, one pair per line."""
-    table = Table(
-        title=Text(printable(title)), title_justify="left", title_style="bold", show_header=False
-    )
+    table = Table(show_header=False)
     table.add_column(style="dim")
     table.add_column(overflow="fold")
-    for fact in facts:
-        table.add_row(*(Text(printable(cell)) for cell in fact))
-    _print(table)
+    _print(table, title, facts)
 
 
-def _print(table: Table) -> None:
+def _print(table: Table, title: str, rows: Iterable[Iterable[str]]) -> None:
+    table.title, table.title_style, table.title_justify = Text(printable(title)), "bold", "left"
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
     # A file or a pipe has no width, and rich's default of 80 would break lines.
     is_terminal = sys.stdout is not None and sys.stdout.isatty()
     Console(width=None if is_terminal else _PIPE_WIDTH).print(table)

@@ -1,4 +1,4 @@
-"""`mcaprl train-offline`: training of policies from logs."""
+"""`mcaprl train-offline` and `export`: policies from logs, and as one file for a robot."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 import mcaprl
+from mcaprl.cli.options import integer_option
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_progress
@@ -28,27 +29,12 @@ def _configs() -> list[Settings]:
     "--algo",
     help="dqn, double-dqn, cql, bc, bcq, iql, or one of an installed package.  [default: cql]",
 )
-@click.option(
-    "--seeds",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of networks to train.",
-)
-@click.option(
-    "--seed",
-    default=0,
-    show_default=True,
-    type=click.IntRange(0),
-    help="Seed of the first network; network k uses seed + k.",
-)
-@click.option(
+@integer_option("--seeds", "Number of networks to train.", least=1)
+@integer_option("--seed", "Seed of the first network; network k uses seed + k.", least=0)
+@integer_option(
     "--threads",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of threads of PyTorch and of the reader; useful for large batches on an idle"
-    " machine.",
+    "Number of threads of PyTorch and of the reader; useful for large batches on an idle machine.",
+    least=1,
 )
 @click.option(
     "--device",
@@ -89,3 +75,17 @@ def _print_data(algo: str, dataset: mcaprl.Dataset) -> None:
         f"{algo} learns from {counted(len(dataset.episodes), 'episode')},"
         f" {counted(len(dataset), 'transition')}, mean return {dataset.statistics.mean_return:.2f}"
     )
+
+
+@click.command()
+@click.argument("run", metavar="RUN")
+@click.option("--out", required=True, type=click.Path(path_type=Path), help="ONNX file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+def export(run: str, out: Path, overwrite: bool) -> None:
+    """Write the policy of RUN, or of RUN/seed-K, as ONNX: observations in, actions out.
+
+    Inputs are the parts of the observation by their names in the log; outputs are action and
+    scores. ONNX Runtime runs the file without this package.
+    """
+    policy = mcaprl.export(run, out, overwrite=overwrite)
+    echo(f"{out}: {policy.algo} policy {policy.name}, {out.stat().st_size / 1000:.0f} kB")

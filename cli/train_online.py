@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import origin_option, sim_options
+from mcaprl.cli.options import integer_option, origin_option, sim_options
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo, print_address, print_table
 from mcaprl.progress import terminal_progress
@@ -30,26 +30,10 @@ def _configs() -> list[Settings]:
 @click.option(
     "--preset", help="Published settings: autonomysim-car, autonomysim-drone, ddqn-racer."
 )
-@click.option(
-    "--seeds",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of agents to train.",
-)
-@click.option(
-    "--seed",
-    default=0,
-    show_default=True,
-    type=click.IntRange(0),
-    help="Seed of the first agent; agent k uses seed + k.",
-)
-@click.option(
-    "--threads",
-    default=1,
-    show_default=True,
-    type=click.IntRange(1),
-    help="Number of threads of PyTorch; useful only for images on an idle machine.",
+@integer_option("--seeds", "Number of agents to train.", least=1)
+@integer_option("--seed", "Seed of the first agent; agent k uses seed + k.", least=0)
+@integer_option(
+    "--threads", "Number of threads of PyTorch; useful only for images on an idle machine.", least=1
 )
 @click.option(
     "--record",
@@ -66,12 +50,12 @@ def _configs() -> list[Settings]:
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
-@click.option(
+@integer_option(
     "--port",
+    "With --live: port on 127.0.0.1; 0 for any free port.",
+    least=0,
+    most=65535,
     default=8765,
-    show_default=True,
-    type=click.IntRange(0, 65535),
-    help="With --live: port on 127.0.0.1; 0 for any free port.",
 )
 @origin_option
 @sim_options
