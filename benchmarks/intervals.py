@@ -1,4 +1,6 @@
-"""Coverage of the 95 % intervals of mean returns, by simulation; `docs/evaluation.md` has the table.
+"""Coverage of the 95 % intervals of mean returns, by simulation.
+
+The table is in `docs/evaluation.md`.
 
 python -m benchmarks.intervals
 """

@@ -158,7 +158,7 @@ def closed_form(learner: Learner, alpha: float) -> Update:
         rows = learner.buffer.sample_rows(config.batch_size, learner.samplers[0])
         batch = learner.buffer.batch(rows)
         actions = batch.actions.unsqueeze(1)
-        target = learner.targets(batch)
+        target = learner.targets(batch, learner.target_outputs(batch))
         activations = [batch.observations.vector]
         for matrix, bias in zip(matrices[:-1], biases[:-1], strict=True):
             activations.append(functional.linear(activations[-1], matrix, bias).relu_())

@@ -66,7 +66,8 @@ class BCQ(DQN):
         """Return the temporal-difference loss plus the clone's cross entropy and penalty."""
         q_tm1 = self.outputs("q", batch.observations)
         logits_tm1 = self.outputs("logits", batch.observations)
-        td_loss = temporal_difference_loss(q_tm1, batch.actions, self.targets(batch))
+        target_tm1 = self.targets(batch, self.target_outputs(batch))
+        td_loss = temporal_difference_loss(q_tm1, batch.actions, target_tm1)
         cloning_loss = cross_entropy(logits_tm1, batch.actions)
         penalty = self.config.logits_penalty * square_penalty(logits_tm1)
         return {
@@ -77,10 +78,9 @@ class BCQ(DQN):
         }
 
     @torch.no_grad()
-    def targets(self, batch: Batch) -> Tensor:
-        """Return the targets; the learning network selects likely actions, Q' evaluates them."""
-        q_t = self.outputs("q", batch.next_observations)
+    def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
+        """Return the targets; the learning network selects likely actions, `q_t` evaluates them."""
+        own_q_t = self.outputs("q", batch.next_observations)
         logits_t = self.outputs("logits", batch.next_observations)
-        q_t_selector = allowed_only(q_t, likely_actions(logits_t, self.config.threshold))
-        q_t_value = self.target_outputs(batch)
-        return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)
+        q_t_selector = allowed_only(own_q_t, likely_actions(logits_t, self.config.threshold))
+        return double_q_learning_target(batch.rewards, batch.discounts, q_t, q_t_selector)

@@ -51,7 +51,8 @@ class CQL(DoubleDQN):
         """Return the loss of Double DQN plus alpha times the penalty."""
         q_tm1 = self.outputs("q", batch.observations)
         mean_q_tm1 = mean_values(q_tm1)
-        td_loss = temporal_difference_loss(q_tm1, batch.actions, self.targets(batch))
+        target_tm1 = self.targets(batch, self.target_outputs(batch))
+        td_loss = temporal_difference_loss(q_tm1, batch.actions, target_tm1)
         penalty = cross_entropy(mean_q_tm1, batch.actions)
         return {
             "mean_q": chosen(mean_q_tm1, batch.actions),

@@ -82,20 +82,31 @@ class DQN(Learner):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return the temporal-difference loss."""
         q_tm1 = self.outputs("q", batch.observations)
-        td_loss = temporal_difference_loss(q_tm1, batch.actions, self.targets(batch))
+        target_tm1 = self.targets(batch, self.target_outputs(batch))
+        td_loss = temporal_difference_loss(q_tm1, batch.actions, target_tm1)
         return {"mean_q": chosen(mean_values(q_tm1), batch.actions), "loss": td_loss}
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the values of the logged actions, and their absolute errors."""
+        """Return the values of the logged actions, and their absolute errors.
+
+        The targets are those of the learning network, because the age of the target network differs
+        from one validation to the next.
+        """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
-        target_tm1 = self.targets(batch)
+        target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
         return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
 
     @torch.no_grad()
-    def targets(self, batch: Batch) -> Tensor:
-        """Return the targets (R,) or (R, N); the target network selects and evaluates actions."""
-        return q_learning_target(batch.rewards, batch.discounts, self.target_outputs(batch))
+    def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
+        """Return the targets (R,) or (R, N) for the values of the next states.
+
+        Args:
+            batch: Transitions.
+            q_t: Values (R, A) or quantiles (R, A, N) of the next states, usually those of
+                `target_outputs`; here, they both select and evaluate actions.
+        """
+        return q_learning_target(batch.rewards, batch.discounts, q_t)
 
     def target_outputs(self, batch: Batch) -> Tensor:
         """Return the target network's values (R, A) or quantiles (R, A, N) of the next states."""
@@ -110,8 +121,7 @@ class DoubleDQN(DQN):
     config: DoubleDQNConfig
 
     @torch.no_grad()
-    def targets(self, batch: Batch) -> Tensor:
-        """Return the targets; the learning network selects, the target network evaluates."""
+    def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
+        """Return the targets; the learning network selects actions, and `q_t` evaluates them."""
         q_t_selector = self.outputs("q", batch.next_observations)
-        q_t_value = self.target_outputs(batch)
-        return double_q_learning_target(batch.rewards, batch.discounts, q_t_value, q_t_selector)
+        return double_q_learning_target(batch.rewards, batch.discounts, q_t, q_t_selector)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,31 @@ def test_the_cached_target_equals_the_computed_one(
         target, seen = learner.target_network, batch.next_observations
     with torch.no_grad():
         torch.testing.assert_close(target.outputs(batch), target.model(seen))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        DQNConfig(),
+        DQNConfig(n_quantiles=3),
+        DoubleDQNConfig(),
+        CQLConfig(),
+        BCQConfig(),
+        IQLConfig(),
+    ],
+)
+def test_held_out_errors_do_not_depend_on_the_age_of_the_target_network(config: Any) -> None:
+    learner = learner_of(replace(config, target_interval=1_000, hidden=(16,)), corridor(), 0)
+    for _ in range(20):
+        learner.update()
+    batch = learner.buffer.batch(torch.arange(50))
+    with torch.no_grad():
+        before = learner.validate(batch)["td_error"]
+        loss = learner.losses(batch)["loss"]
+        for name, target in learner.target_networks.items():
+            target.sync(learner.models[name])
+        torch.testing.assert_close(learner.validate(batch)["td_error"], before)
+        assert not torch.allclose(learner.losses(batch)["loss"], loss)
 
 
 def test_the_target_network_is_constant_between_two_syncs() -> None:
