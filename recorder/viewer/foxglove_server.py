@@ -19,9 +19,7 @@ DEFAULT_PORT = 8765
 class ViewerServer:
     """A Foxglove server that listens only on 127.0.0.1.
 
-    Attributes:
-        foxglove: The module `foxglove`.
-        websocket: The module `foxglove.websocket`.
+    Subclasses implement callbacks for viewers' requests; see `foxglove.websocket.ServerListener`.
     """
 
     def __init__(self) -> None:
@@ -30,10 +28,10 @@ class ViewerServer:
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
         """
-        self.foxglove = import_extra("foxglove", "foxglove")
-        self.websocket = import_extra("foxglove.websocket", "foxglove")
-        self._context = self.foxglove.Context()
-        self._channels: list[Any] = []
+        self._foxglove = import_extra("foxglove", "foxglove")
+        self._ws = import_extra("foxglove.websocket", "foxglove")
+        self._context = self._foxglove.Context()
+        self._advertised: list[Any] = []
         self._server: Any = None
         self._inner = ""
         self._filter: OriginFilter | None = None
@@ -48,27 +46,21 @@ class ViewerServer:
         schema_encoding: str = "ros2msg",
     ) -> Any:
         """Advertise a topic and return its `foxglove.Channel`."""
-        schema = self.foxglove.Schema(name=type_name, encoding=schema_encoding, data=definition)
-        channel = self.foxglove.Channel(
+        schema = self._foxglove.Schema(name=type_name, encoding=schema_encoding, data=definition)
+        channel = self._foxglove.Channel(
             topic, message_encoding=encoding, schema=schema, context=self._context
         )
-        self._channels.append(channel)
+        self._advertised.append(channel)
         return channel
 
-    def start(
-        self, name: str, port: int, listener: Any, *, origins: Sequence[str] = (), **options: Any
-    ) -> Any:
+    def start(self, name: str, port: int, origins: Sequence[str], **options: Any) -> None:
         """Start the server.
 
         Args:
             name: Name of the server, as viewers display it.
             port: Port to listen on; 0 selects a free port.
-            listener: Callbacks for viewers' requests; see `foxglove.websocket.ServerListener`.
             origins: Additional origins of web pages that may connect.
             **options: Further arguments of `foxglove.start_server`.
-
-        Returns:
-            Handle of the server, such as for `broadcast_time`.
 
         Raises:
             UsageError: The port is in use.
@@ -78,10 +70,10 @@ class ViewerServer:
         except OSError as error:
             raise UsageError(f"cannot listen on {HOST}:{port}: {error}; pass --port") from error
         start = partial(
-            self.foxglove.start_server,
+            self._foxglove.start_server,
             name=name,
             port=0,
-            server_listener=listener,
+            server_listener=self,
             supported_encodings=["cdr"],
             context=self._context,
             **options,
@@ -96,7 +88,6 @@ class ViewerServer:
         self._inner = f"{host}:{self._server.port}"
         target = (host, self._server.port)
         self._filter = OriginFilter(socket, target, [*VIEWER_ORIGINS, *origins])
-        return self._server
 
     @property
     def url(self) -> str:
@@ -114,13 +105,16 @@ class ViewerServer:
         return f"{HOST}:{self._filter.port}"
 
     def close(self) -> None:
-        """Stop the server and close its channels."""
+        """Disconnect all viewers, stop the server and close its channels."""
         if self._server is not None:
             self._server.stop()
         if self._filter is not None:
             self._filter.close()
-        for channel in self._channels:
+        for channel in self._advertised:
             channel.close()
+
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+        """Do nothing: messages are sent only to subscribers."""
 
 
 def _hidden_host() -> str:

@@ -48,10 +48,6 @@ from mcaprl.recorder.record.scene import (
 from mcaprl.recorder.record.step_rows import as_declared
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 
-_SHARE = 0.025
-"""Largest share of the run time that is spent on frames."""
-_PERIOD_S = 1 / 20
-"""Shortest time between two frames."""
 _STATIC_PERIOD_S = 10.0
 """Time after which the static scene is checked for changes."""
 _ROW = slice(1)
@@ -91,42 +87,44 @@ class LiveStep:
     training: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass
 class Pace:
-    """A limit on the time that is spent on frames."""
+    """A limit on the time that is spent on frames.
 
-    def __init__(
-        self,
-        share: float = _SHARE,
-        period_s: float = _PERIOD_S,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        """Limit frames to `share` of the run time and one per `period_s`; `clock` is in seconds."""
-        self._share, self._period_s, self._clock = share, period_s, clock
-        self._next_s = -math.inf
-        self._began_s = 0.0
-        self._spent_s = 0.0
+    Attributes:
+        share: Largest share of the run time that is spent on frames.
+        period_s: Shortest time between two frames.
+        clock: Function that returns the time in seconds.
+    """
+
+    share: float = 0.025
+    period_s: float = 1 / 20
+    clock: Callable[[], float] = time.perf_counter
+    _next_s: float = field(default=-math.inf, init=False)
+    _began_s: float = field(default=0.0, init=False)
+    _spent_s: float = field(default=0.0, init=False)
 
     def due(self) -> bool:
         """Return whether there is time for a frame now."""
-        return self._clock() >= self._next_s
+        return self.clock() >= self._next_s
 
     def begin(self) -> None:
         """Start or continue the timer of a frame."""
-        self._began_s = self._clock()
+        self._began_s = self.clock()
 
     def pause(self) -> None:
         """Stop the timer of a frame while the environment is stepped."""
-        self._spent_s += self._clock() - self._began_s
+        self._spent_s += self.clock() - self._began_s
 
     def end(self) -> None:
         """End a frame and schedule the next one."""
         self.pause()
-        rest_s = self._spent_s * (1 / self._share - 1)
-        self._next_s = self._clock() + max(rest_s, self._period_s - self._spent_s)
+        rest_s = self._spent_s * (1 / self.share - 1)
+        self._next_s = self.clock() + max(rest_s, self.period_s - self._spent_s)
         self._spent_s = 0.0
 
 
-class LiveStream:
+class LiveStream(ViewerServer):
     """Frames of one environment; call `due`, `look`, `env.step` and `show` in this order."""
 
     def __init__(
@@ -157,12 +155,29 @@ class LiveStream:
             UsageError: The port is in use.
             SpaceError: The log format does not support the spaces.
         """
+        super().__init__()
         self._pace = pace or Pace()
-        self._viewers = ViewerServer()
-        self._sink = _ViewerSink(self._viewers)
-        self._log = LogTopics(metadata, self._sink)
+        self._sink = _ViewerSink(self)
+        self._log = log = LogTopics(metadata, self._sink)
         self._training = tuple(training)
-        self._announce(source)
+        self._shown = ShownTopics(log, source)
+        self._topics = dict(self._shown.channels)
+        type_name, text = telemetry_schema(self._training)
+        self._topics[TRAINING_TOPIC] = log.sink.add_channel(TRAINING_TOPIC, type_name, text)
+        # A row is reserved for each topic of fixed-size messages.
+        self._depth: ImageRows | None = None
+        self._values: TopicRows | None = None
+        if isinstance(source, DepthSource):
+            self._depth = log.image_rows(DEPTH, source.depth_image_m().shape, "16UC1", 1)
+            self._topics[DEPTH] = self._depth.channel_id
+        if isinstance(metadata.action_space, spaces.Discrete):
+            self._values = log.values_rows(VALUES_TOPIC, int(metadata.action_space.n), 1)
+            self._topics[VALUES_TOPIC] = self._values.channel_id
+        self._steps, self._learner = log.step_rows(1), log.learner_rows(1)
+        self._images = {
+            leaf: log.image_rows(leaf.topic, leaf.shape, leaf.encoding, 1)
+            for leaf in log.image_leaves
+        }
         self._newcomers, self._static_at_s = True, -math.inf
         self._static_shapes: Sequence[Any] | None = None
         self._static: list[tuple[str, bytes]] = []
@@ -170,17 +185,7 @@ class LiveStream:
             self._static_messages(source)
         self._time_ns = 0
         self._finished: list[EpisodeSummary] = []
-        self._viewers.start(name, port, self, origins=origins)
-
-    @property
-    def url(self) -> str:
-        """WebSocket URL of the server."""
-        return self._viewers.url
-
-    @property
-    def app_url(self) -> str:
-        """Link that opens Foxglove connected to the server."""
-        return self._viewers.app_url
+        self.start(name, port, origins)
 
     def due(self) -> bool:
         """Return whether there is time for a frame and a viewer is subscribed."""
@@ -240,16 +245,9 @@ class LiveStream:
             self._training,
         )
 
-    def close(self) -> None:
-        """Disconnect all viewers and stop listening."""
-        self._viewers.close()
-
     def on_subscribe(self, client: Any, channel: Any) -> None:
         """Send the static scene with the next frame, for the new viewer."""
         self._newcomers = True
-
-    def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        """Do nothing: messages are sent only to subscribers."""
 
     def _static_messages(self, source: SceneSource) -> list[tuple[str, bytes]]:
         """Return the static scene if there are new viewers or a periodic check finds a change."""
@@ -267,27 +265,6 @@ class LiveStream:
             return []
         self._newcomers = False
         return self._static
-
-    def _announce(self, source: object) -> None:
-        """Announce all topics, and reserve a row for each topic of fixed-size messages."""
-        log = self._log
-        self._shown = ShownTopics(log, source)
-        self._topics = dict(self._shown.channels)
-        name, text = telemetry_schema(self._training)
-        self._topics[TRAINING_TOPIC] = log.sink.add_channel(TRAINING_TOPIC, name, text)
-        self._depth: ImageRows | None = None
-        self._values: TopicRows | None = None
-        if isinstance(source, DepthSource):
-            self._depth = log.image_rows(DEPTH, source.depth_image_m().shape, "16UC1", 1)
-            self._topics[DEPTH] = self._depth.channel_id
-        if isinstance(log.metadata.action_space, spaces.Discrete):
-            self._values = log.values_rows(VALUES_TOPIC, int(log.metadata.action_space.n), 1)
-            self._topics[VALUES_TOPIC] = self._values.channel_id
-        self._steps, self._learner = log.step_rows(1), log.learner_rows(1)
-        self._images = {
-            leaf: log.image_rows(leaf.topic, leaf.shape, leaf.encoding, 1)
-            for leaf in log.image_leaves
-        }
 
     def _send_step(self, step: LiveStep) -> None:
         """Send the transition in the messages of a log."""

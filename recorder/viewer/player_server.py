@@ -21,7 +21,7 @@ _PERIOD_S = 1 / 30
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
 
 
-class LiveServer:
+class LiveServer(ViewerServer):
     """Server that plays logs to all connected viewers, starting with the first subscriber.
 
     Viewers can set two parameters: `episode`, which seeks to the episode's start, and `loop`.
@@ -51,8 +51,7 @@ class LiveServer:
             MissingExtraError: foxglove-sdk is not installed.
             UsageError: The port is in use.
         """
-        self._viewers = ViewerServer()
-        self._foxglove, self._ws = self._viewers.foxglove, self._viewers.websocket
+        super().__init__()
         self._player, self._prefixes = player, prefixes
         self._starts_ns = tuple(episode_starts_ns)
         self._lock = threading.Lock()
@@ -62,24 +61,13 @@ class LiveServer:
             pair for number in range(len(prefixes)) for pair in self._announced(number)
         )
         can = self._ws.Capability
-        self._server = self._viewers.start(
+        self.start(
             name,
             port,
-            self,
-            origins=origins,
+            origins,
             capabilities=[can.Time, can.Parameters, can.PlaybackControl],
             playback_time_range=(player.start_ns, player.end_ns),
         )
-
-    @property
-    def url(self) -> str:
-        """WebSocket URL of the server."""
-        return self._viewers.url
-
-    @property
-    def app_url(self) -> str:
-        """Link that opens Foxglove connected to the server."""
-        return self._viewers.app_url
 
     def run(self, stop: threading.Event) -> None:
         """Play until `stop` is set."""
@@ -110,10 +98,6 @@ class LiveServer:
             if restarts or stopped:
                 self._server.broadcast_playback_state(state)
 
-    def close(self) -> None:
-        """Stop the server."""
-        self._viewers.close()
-
     def on_playback_control_request(self, request: Any) -> Any:
         """Play, pause, change the speed, or seek."""
         with self._lock:
@@ -135,9 +119,6 @@ class LiveServer:
             if not self._looked_at:
                 self._looked_at = self._player.playing = True
             self._newly_subscribed = True
-
-    def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        """Do nothing: messages are sent to subscribers only."""
 
     def on_get_parameters(self, client: Any, names: list[str], request_id: Any = None) -> list[Any]:
         """Return the requested parameters, or all if no name is given."""
@@ -193,7 +174,7 @@ class LiveServer:
         found = []
         for channel in reader.channels.values():
             schema = reader.schema_of(channel)
-            announced = self._viewers.add_channel(
+            announced = self.add_channel(
                 f"/{prefix}{channel.topic}" if prefix else channel.topic,
                 schema.name,
                 schema.data,
