@@ -152,7 +152,7 @@ class Agent:
             report: Callback for progress, called every `LOG_INTERVAL` steps.
 
         Raises:
-            TrainingError: The checkpoint is of another task, or broken.
+            TrainingError: The checkpoint belongs to another task, or is broken.
         """
         config = self._task.config
         evaluation = Evaluation(
@@ -203,7 +203,7 @@ class Agent:
     def _load(self, evaluation: Evaluation) -> None:
         extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
         if best:
-            # The file may be of an evaluation after the checkpoint, which is repeated.
+            # An evaluation after the checkpoint is repeated; its file may exist.
             write_atomically(self._folder / BEST_NAME, best, TrainingError)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:

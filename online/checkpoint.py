@@ -82,7 +82,7 @@ def load_checkpoint(path: Path, model: BaseAlgorithm, task: Task) -> tuple[dict[
         The arguments `extra` and `best` of `save_checkpoint`.
 
     Raises:
-        TrainingError: The checkpoint is of another task, or broken.
+        TrainingError: The checkpoint belongs to another task, or is broken.
     """
     try:
         tensors, description = read_tensors(path)

@@ -155,7 +155,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._free.pop()
 
     def _get_samples(self, batch_inds: NDArray[Any], env: VecNormalize | None = None) -> Any:
-        """Return transitions of rows, each of a random environment drawn as in SB3."""
+        """Return one transition per row index; SB3's generator draws the environment of each."""
         assert env is None
         envs = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         rows, returns, discounts = self._look_ahead(batch_inds, envs)

@@ -1,8 +1,8 @@
-"""Settings by name of a preset or a sim.
+"""Settings of each preset and of each sim.
 
 Presets are published settings, unchanged, for the sims with their published rules: images or rays,
-one environment, classic rules. docs/online.md lists the faults of the published programs that they
-reproduce.
+one environment, classic rules. The presets also reproduce
+faults of the published programs; docs/online.md lists these faults.
 
     autonomysim-car, autonomysim-drone      https://github.com/nervosys/AutonomySim
     ddqn-racer                              Double DQN on a ray-cast track
@@ -14,7 +14,8 @@ has the command and the scores of four seeds. Important settings are:
   oscillates until the end.
 - `n_steps` 3 for powerline and racer, whose rewards are sparse or late, and an update of the target
   network only every 4,000 steps, or 2,000 with a shorter horizon.
-- Scores still drop during training, so the best checkpoint is stored, chosen on separate episodes.
+- Checkpoints are compared on separate episodes and the best one is stored, because scores can still
+  drop during training.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Task:
             )
         except (KeyError, TypeError) as error:
             raise TrainingError(
-                f"{folder / CONFIG_NAME} is not of an online run: {error}"
+                f"{folder / CONFIG_NAME} does not belong to an online run: {error}"
             ) from error
 
     @classmethod

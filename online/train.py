@@ -47,7 +47,7 @@ class OnlineSummary(RunSummary):
         best_step: Number of environment steps before the best checkpoint.
         mean_return: Mean return of the best checkpoint on new episodes.
         score: Mean return on the scale random = 0, pilot = 1; NaN without a pilot.
-        ends: Numbers of these episodes by the reason for their end.
+        ends: Number of these episodes for each reason of their end.
     """
 
     best_step: int
@@ -93,7 +93,7 @@ def train(
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
         TrainingError: `out` cannot be written, is being written by another training, or has a run
-            of another task; or there is no run to resume.
+            of another task; or it has no run to resume.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")
@@ -130,7 +130,7 @@ class _Run:
     first_seed: int
 
     def open(self, resume: bool) -> None:
-        """Create the run folder, or check that it is of this run; create the log folders."""
+        """Create the run folder, or check that it belongs to this run; create the log folders."""
         open_run(self.folder, self.task.identity, resume)
         for path in self.logs.values():
             with writing(path.parent):

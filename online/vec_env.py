@@ -49,7 +49,7 @@ class BatchedVecEnv(VecEnv):
         self._began_s = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset of environment i as `rollout` seeds its episode i."""
+        """Set the seed of environment i for its next reset: the seed of episode i in `rollout`."""
         if seed is not None:
             self._seeds = [episode_seed(seed, i) for i in range(self.num_envs)]
         return self._seeds

@@ -77,7 +77,7 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
 
     Args:
         model: Fresh model.
-        policy: Policy with `name`, `q_values`, and its network as an attribute.
+        policy: Policy with the attributes `name` and `q_values`, and one that is its network.
         space: Space of a single observation, sampled to verify that both networks produce the
             same values.
 
@@ -90,7 +90,7 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
     frames = getattr(policy, "frame_stack", 1)
     if stacked_space(channels_first(space), frames) != model.observation_space:
         raise PolicyError(
-            f"{policy.name} stacks {frames} observations, the agent another number: pass"
+            f"{policy.name} stacks {frames} observations, but the agent stacks another number: pass"
             " --frame-stack"
         )
     stacks = _sample_stacks(space, frames)
@@ -100,7 +100,7 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
     own = [tuple(layer.weight.shape) for layer in ours]
     if shapes != own:
         raise PolicyError(
-            f"{policy.name} has layers {_chain(shapes)}, the agent {_chain(own)}: pass --hidden"
+            f"{policy.name} has layers {_chain(shapes)}, the agent has {_chain(own)}: pass --hidden"
         )
     for source, target in zip(theirs, ours, strict=True):
         target.load_state_dict(source.state_dict())
@@ -131,7 +131,7 @@ def _first_frames(frames: Any) -> Any:
 def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> None:
     own = getattr(model, role)
     if space != own:
-        raise SpaceError(f"the logs have {role} {space}, the environment {own}")
+        raise SpaceError(f"the logs have {role} {space}, but the environment has {own}")
 
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:

@@ -38,7 +38,7 @@ _MERGED_BYTES = 2**20
 _MIN_CHUNKS_SAVED = 8
 # Copying more bytes than this per saved chunk costs more time than readers gain.
 _MAX_BYTES_PER_CHUNK = 2**20
-# Records that lie between listed chunks only if the summary does not list all chunks.
+# Records that are between listed chunks only where the summary omits a chunk.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 

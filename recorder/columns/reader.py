@@ -15,22 +15,18 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.chunks import (
-    Scratch,
-    chunk_header,
-    chunk_records,
-    parse_chunk_index,
-)
+from mcaprl.recorder.columns.chunks import Scratch, chunk_header, chunk_records, parse_chunk_index
 from mcaprl.recorder.columns.message_rows import (
     INDEX_ENTRY,
     MESSAGE_HEADER,
@@ -43,9 +39,9 @@ from mcaprl.recorder.columns.records import (
     RECORD_HEADER,
     ChunkContents,
     UnindexedMessages,
-    attachment_of,
     contents_of,
     footer_of,
+    is_intact_attachment,
     map_unchanged,
     parse_record,
     records_of,
@@ -54,6 +50,7 @@ from mcaprl.recorder.columns.records import (
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 # The fields of a MessageIndex record before its entries.
 _INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
+_START_OF = attrgetter("chunk_start_offset")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
 
 
@@ -177,8 +174,8 @@ class McapReader:
             found = sum(map(len, ranges))
             if count not in (None, found):
                 raise CorruptLogError(
-                    f"{self.path}: the summary counts {count} messages of {channel.topic}, the"
-                    f" message indexes {found}"
+                    f"{self.path}: the summary counts {count} messages of {channel.topic}, but"
+                    f" the message indexes have {found}"
                 )
             self._ranges[channel.id] = ranges
         return self._ranges[channel.id]
@@ -277,8 +274,20 @@ class McapReader:
             CorruptLogError: The attachment is damaged.
         """
         self.check_unchanged()
+        found = None
         with self._named():
-            return attachment_of(self.view, name)
+            for offset, opcode, content in self.records(len(MCAP0_MAGIC)):
+                if opcode == Opcode.DATA_END:
+                    break
+                if opcode == Opcode.ATTACHMENT:
+                    attachment: Attachment = parse_record(opcode, content)
+                    if attachment.name == name:
+                        if not is_intact_attachment(content):
+                            raise CorruptLogError(
+                                f"the attachment {name} at byte {offset} is damaged"
+                            )
+                        found = bytes(attachment.data)
+        return found
 
     def records(self, start: int) -> Iterator[tuple[int, int, memoryview]]:
         """Yield offset, opcode and content of each record from `start` on.
@@ -302,10 +311,8 @@ class McapReader:
         start = chunk.chunk_start_offset
         if start not in self._contents:
             records = self.chunk_records(chunk)
-            try:
+            with self._named(f" (chunk at byte {start})"):
                 self._contents[start] = contents_of(records)
-            except CorruptLogError as error:
-                raise CorruptLogError(f"{self.path}: {error} (chunk at byte {start})") from error
         return self._contents[start]
 
     def _read_summary(self) -> None:
@@ -314,8 +321,8 @@ class McapReader:
                 with self._named():
                     self.chunks.append(parse_chunk_index(content))
             elif opcode in _SUMMARY:
-                self._keep(self._parse(opcode, content, offset))
-        self.chunks.sort(key=_start_of)
+                self._parse(opcode, content, offset)
+        self.chunks.sort(key=_START_OF)
 
     def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
         """Read the records that the summary does not list; all records if there is no summary."""
@@ -332,7 +339,7 @@ class McapReader:
                 )
         found += self._read_records(start, None, before, unchunked)
         if found:
-            self.chunks = sorted([*self.chunks, *found], key=_start_of)
+            self.chunks = sorted([*self.chunks, *found], key=_START_OF)
 
     def _read_records(
         self,
@@ -356,8 +363,7 @@ class McapReader:
         for offset, opcode, content in records_of(self.view, start, stop):
             if opcode == Opcode.CHUNK:
                 with self._named():
-                    header = chunk_header(self.view, offset)
-                chunk = header.to_index(offset, len(content))
+                    chunk = chunk_header(self.view, offset).to_index(offset, len(content))
                 found.append(chunk)
             elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 (channel_id,) = struct.unpack_from("<H", content)
@@ -367,7 +373,7 @@ class McapReader:
             elif opcode == Opcode.DATA_END:
                 return found
             elif opcode in _TOP_LEVEL and not self._is_listed(opcode, content):
-                self._keep(self._parse(opcode, content, offset))
+                self._parse(opcode, content, offset)
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
             raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
@@ -375,34 +381,32 @@ class McapReader:
 
     def _check_data_crc(self) -> None:
         """Check the CRC of the data section, the only one that covers unchunked messages."""
-        for offset, opcode, content in records_of(self.view, self.data_end):
-            if opcode == Opcode.DATA_END:
-                (crc,) = struct.unpack_from("<I", content)
-                if crc and crc32(self.view[:offset]) != crc:
-                    raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
-            break
+        offset, opcode, content = next(self.records(self.data_end), (0, 0, memoryview(b"")))
+        if opcode == Opcode.DATA_END:
+            (crc,) = struct.unpack_from("<I", content)
+            if crc and crc32(self.view[:offset]) != crc:
+                raise CorruptLogError(f"{self.path}: the data section does not match its CRC")
 
     def _find_topics_in_chunks(self) -> None:
         """Search chunks for schemas and channels that are stored nowhere else."""
         for chunk in self.chunks:
-            ids = chunk.message_index_offsets
-            if not (all(map(self._is_known, ids)) if ids else self._summary_has_topics):
+            found = list(map(self.channels.get, chunk.message_index_offsets))
+            is_known = all(channel and channel.schema_id in self.schemas for channel in found)
+            if not (is_known if found else self._summary_has_topics):
                 for topic in self._contents_of(chunk).topics:
                     self._keep(topic)
 
-    def _is_known(self, channel_id: int) -> bool:
-        channel = self.channels.get(channel_id)
-        return channel is not None and channel.schema_id in self.schemas
-
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
         """Return whether the summary has this schema or channel; both records begin with an id."""
-        number = int.from_bytes(content[:2], "little")
-        return (opcode == Opcode.SCHEMA and number in self.schemas) or (
-            opcode == Opcode.CHANNEL and number in self.channels
-        )
+        listed = {Opcode.SCHEMA: self.schemas, Opcode.CHANNEL: self.channels}.get(opcode, {})
+        return int.from_bytes(content[:2], "little") in listed
+
+    def _parse(self, opcode: int, content: memoryview, offset: int) -> None:
+        with self._named(f" (byte {offset})"):
+            self._keep(parse_record(opcode, content))
 
     def _keep(self, record: McapRecord) -> None:
-        """Store a record unless one with its id or name is stored; summary records come first."""
+        """Store a record, unless one with its id or name was read before (from the summary)."""
         match record:
             case Schema():
                 self.schemas.setdefault(record.id, record)
@@ -414,26 +418,16 @@ class McapReader:
                 self._counts = record.channel_message_counts
 
     @contextmanager
-    def _named(self) -> Iterator[None]:
-        """Add the path of the file to the message of a CorruptLogError."""
+    def _named(self, where: str = "") -> Iterator[None]:
+        """Add the path of the file, and `where`, to the message of a CorruptLogError."""
         try:
             yield
         except CorruptLogError as error:
             if str(error).startswith(f"{self.path}: "):
                 raise
-            raise CorruptLogError(f"{self.path}: {error}") from error
-
-    def _parse(self, opcode: int, content: memoryview, offset: int) -> Any:
-        try:
-            return parse_record(opcode, content)
-        except CorruptLogError as error:
-            raise CorruptLogError(f"{self.path}: {error} (byte {offset})") from error
+            raise CorruptLogError(f"{self.path}: {error}{where}") from error
 
 
 def end_of(chunk: ChunkIndex) -> int:
     """Return the first byte after a chunk and its message indexes."""
     return chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
-
-
-def _start_of(chunk: ChunkIndex) -> int:
-    return chunk.chunk_start_offset

@@ -212,7 +212,7 @@ class McapWriter(OutputFile):
         """Write a chunk of complete records.
 
         Args:
-            records: Message records with sequence numbers, of channels of the file.
+            records: Message records with sequence numbers; the file has their channels.
             indexes: Arrays of `message_rows.INDEX_ENTRY` by channel id.
         """
         for channel_id, index in indexes.items():

@@ -78,7 +78,7 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose the pursuit action if pursuit survives; else search two actions before pursuit.
+    """Choose the pursuit action if following it is safe; else search for two actions before it.
 
     Args:
         car: State of the car.

@@ -98,7 +98,7 @@ def asphalt(track: Track) -> Floats:
 
 
 def _progress(path: Path, corners_px: Floats) -> list[float]:
-    """Return the distances along the path of the wall corners of one side.
+    """Return how far along the path each wall corner of one side is.
 
     The last item is the first corner again, a lap later.
     """
