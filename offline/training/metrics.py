@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 
+from mcaprl.errors import TrainingError
 from mcaprl.files import write_atomically
-from mcaprl.runs import METRICS_NAME, RunSummary
+from mcaprl.runs import METRICS_NAME, RunSummary, writing
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 
@@ -29,30 +30,46 @@ class MetricsWriter:
             folder: Existing folder.
             first_update: First update of this session, starting at 1; rows that an earlier session
                 wrote for this or later updates are dropped.
+
+        Raises:
+            TrainingError: A file cannot be written.
         """
-        path = folder / METRICS_NAME
+        self._path = path = folder / METRICS_NAME
         kept = _rows_before(path, first_update)
-        write_atomically(path, "".join(kept).encode())
-        self._file = path.open("a", newline="")
+        write_atomically(path, "".join(kept).encode(), TrainingError)
+        with writing(path):
+            self._file = path.open("a", newline="")
+            self._board = SummaryWriter(str(folder), purge_step=first_update)
         self._rows = csv.writer(self._file, lineterminator="\n")
         self._has_header = bool(kept)
-        self._board = SummaryWriter(str(folder), purge_step=first_update)
 
     def write(self, update: int, learning_rate: float, terms: Mapping[str, float]) -> None:
-        """Append the values of one update."""
+        """Append the values of one update.
+
+        Raises:
+            TrainingError: A file cannot be written.
+        """
         scalars = {"learning_rate": learning_rate, **terms}
-        if not self._has_header:
-            self._rows.writerow(["update", *scalars])
-            self._has_header = True
-        self._rows.writerow([update, *scalars.values()])
-        self._file.flush()
-        for name, value in scalars.items():
-            self._board.add_scalar(f"train/{name}", value, update)
+        with writing(self._path):
+            if not self._has_header:
+                self._rows.writerow(["update", *scalars])
+                self._has_header = True
+            self._rows.writerow([update, *scalars.values()])
+            self._file.flush()
+            for name, value in scalars.items():
+                self._board.add_scalar(f"train/{name}", value, update)
 
     def close(self) -> None:
-        """Close both files."""
-        self._file.close()
-        self._board.close()
+        """Close both files.
+
+        Raises:
+            TrainingError: A file cannot be written.
+        """
+        with writing(self._path):
+            try:
+                self._file.close()
+            finally:
+                self._board.close()
 
 
 @dataclass(frozen=True)

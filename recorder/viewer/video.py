@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
@@ -78,11 +79,14 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
     count = 0
     # The temporary file's name has no format suffix.
     options = {"extension": kind, "plugin": "pyav", "container": kind.removeprefix(".")}
-    with imageio.imopen(path, "w", **options) as video:
+    # The encoder cannot end after an error of a write, such as a full disk.
+    content = BytesIO()
+    with imageio.imopen(content, "w", **options) as video:
         video.init_video_stream("libx264", fps=float(fps))
         for image in images:
             video.write_frame(image)
             count += 1
+    path.write_bytes(content.getvalue())
     return count
 
 

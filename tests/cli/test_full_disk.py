@@ -1,0 +1,78 @@
+"""Commands whose output does not fit on the disk: one line, and whatever was finished is kept."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+
+resource = pytest.importorskip("resource", reason="needs limits on the size of files")
+
+# Files cannot grow beyond a limit, as on a full disk; Python ignores the signal.
+SCRIPT = """
+import resource, sys
+from mcaprl.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+main(sys.argv[2:])
+"""
+LOG, POLICY = "cartpole.mcap", "bc"
+SMALL = ["--hidden", "8", "--checkpoint-interval", "50"]
+ONLINE = ["train-online", "CartPole-v1", "--algo", "dqn", "--steps", "300", "--out", "run", *SMALL]
+
+
+@pytest.fixture
+def _inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    record = ["record", "CartPole-v1", "--policy", "random", "--episodes", "100", "--out", LOG]
+    assert run(record) == 0
+    train = ["train-offline", LOG, "--algo", "bc", "--updates", "5", "--out", POLICY, *SMALL]
+    assert run(train) == 0
+
+
+@pytest.mark.usefixtures("_inputs")
+@pytest.mark.parametrize(
+    ("limit", "command", "path"),
+    [
+        (20_000, ["record", "CartPole-v1", "--steps", "9999", "--policy", "random"], "x.mcap"),
+        (100_000, ["record", "lane", "--steps", "9999", "--policy", "random"], "x.mcap"),
+        (100_000, ["record", "lane", "--steps", "9999", "--envs", "2"], "x/shard-0"),
+        (20_000, ["annotate", LOG, "--policy", POLICY], "x.mcap"),
+        (2_000, ["export", POLICY], "x.npz"),
+        (2_000, ["recover", LOG], "x.mcap"),
+        (10, ["layout", LOG], "x.json"),
+        (2_000, ["info", LOG, "--report"], "x"),
+        (2_000, ["train-offline", LOG, *SMALL], "x/seed-0/"),
+        (700, ["train-offline", LOG, "--log-interval", "1", *SMALL], "x/seed-0/metrics.csv"),
+        (2_000, ONLINE, "run/seed-0/"),
+        (5_000, [*ONLINE, "--record", "x.mcap"], "x.mcap"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else None,
+)
+def test_a_full_disk_is_one_line(limit: int, command: list[str], path: str) -> None:
+    out = path.split("/")[0]
+    if command[0] in ("recover", "info"):
+        command = [*command, out]
+    elif "run" not in command:
+        command = [*command, "--out", out]
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(limit), *command],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    lines = [line for line in done.stderr.splitlines() if "warning:" not in line and line]
+    assert done.returncode == 1, done
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("mcaprl: cannot write "), lines
+    assert path in lines[0]
+    assert "File too large" in lines[0]
+    if command[0] == "record":
+        found = sorted(Path().glob("x*/*.mcap")) or [Path("x.mcap")]
+        with pytest.warns(UserWarning, match="cut off"):
+            assert sum(len(mcaprl.open(part).episodes) for part in found[:1]) > 0
