@@ -54,7 +54,10 @@ class Table:
     def kinds(self) -> list[str]:
         """Kind of each column: `number` (right-aligned) or `text`."""
         cells = [[row[k] for row in self.rows if row[k]] for k in range(len(self.columns))]
-        return ["number" if column and all(map(_is_number, column)) else "text" for column in cells]
+        return [
+            "number" if column and all(map(_NUMBER.fullmatch, column)) else "text"
+            for column in cells
+        ]
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,3 @@ def write_page(path: Path, title: str, lead: str, sections: Sequence[Section]) -
     template = environment.from_string(files("mcaprl").joinpath("page.html").read_text())
     text = template.render(title=title, lead=lead, sections=sections)
     write_atomically(path, encodable(text).encode(), ReportError)
-
-
-def _is_number(text: str) -> bool:
-    return _NUMBER.fullmatch(text) is not None

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from typing import Final
 
 from rich.console import Console
 from rich.progress import (
@@ -24,6 +26,10 @@ Advance = Callable[[int], None]
 """Function called with the amount of completed work."""
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
 """Function of a description and a total that opens a progress bar and yields an `Advance`."""
+FIRST_LINE_S: Final = 5.0
+"""Time until the first line of progress if stderr is not a terminal."""
+LINE_INTERVAL_S: Final = 30.0
+"""Time between two of these lines."""
 
 
 @contextmanager
@@ -34,10 +40,10 @@ def no_progress(description: str, total: int | None) -> Iterator[Advance]:
 
 @contextmanager
 def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
-    """Show a progress bar if stderr is a terminal."""
+    """Show a progress bar if stderr is a terminal; otherwise, print a line at long intervals."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield lambda amount: None
+        yield _ProgressLines(printable(description), total).advance
         return
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -48,6 +54,27 @@ def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(printable(description), total=total)
         yield lambda amount: bar.advance(task, amount)
+
+
+class _ProgressLines:
+    """Progress as lines on stderr; short operations print none."""
+
+    def __init__(self, description: str, total: int | None) -> None:
+        self._description, self._total = description, total
+        self._began = time.monotonic()
+        self._next_s, self._done = FIRST_LINE_S, 0
+
+    def advance(self, amount: int) -> None:
+        self._done += amount
+        elapsed_s = time.monotonic() - self._began
+        if elapsed_s < self._next_s:
+            return
+        self._next_s = elapsed_s + LINE_INTERVAL_S
+        text = f"{self._description}: {self._done}"
+        if self._total is not None:
+            left_s = elapsed_s * (self._total / max(self._done, 1) - 1)
+            text += f" of {self._total}, about {max(left_s, 0):.0f} s left"
+        print(text, file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True)
@@ -90,30 +117,17 @@ def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
         TextColumn(f"{term} {{task.fields[shown]:.4g}}"),
         TimeRemainingColumn(),
     )
+    # Bar of each seed, and the time and progress at the seed's first report.
+    started: dict[int, tuple[TaskID, float, int]] = {}
     with Progress(*columns, console=console) as bars:
-        yield _SeedBars(bars, term).show
 
+        def show(now: TrainingProgress) -> None:
+            if now.seed not in started:
+                bar = bars.add_task("", total=now.total, seed=now.seed, rate=0.0, shown=math.nan)
+                started[now.seed] = bar, time.perf_counter(), now.done
+            bar, began, first = started[now.seed]
+            rate = (now.done - first) / max(time.perf_counter() - began, 1e-9)
+            shown = now.terms.get(term, math.nan)
+            bars.update(bar, completed=now.done, rate=rate, shown=shown)
 
-class _SeedBars:
-    """Progress bars, one per seed, created at the first report of the seed."""
-
-    def __init__(self, bars: Progress, term: str) -> None:
-        self._bars = bars
-        self._term = term
-        self._tasks: dict[int, TaskID] = {}
-        self._started: dict[int, tuple[float, int]] = {}
-
-    def show(self, now: TrainingProgress) -> None:
-        if now.seed not in self._tasks:
-            self._tasks[now.seed] = self._bars.add_task(
-                "", total=now.total, seed=now.seed, rate=0.0, shown=math.nan
-            )
-            self._started[now.seed] = (time.perf_counter(), now.done)
-        began, first = self._started[now.seed]
-        elapsed_s = max(time.perf_counter() - began, 1e-9)
-        self._bars.update(
-            self._tasks[now.seed],
-            completed=now.done,
-            rate=(now.done - first) / elapsed_s,
-            shown=now.terms.get(self._term, math.nan),
-        )
+        yield show

@@ -50,11 +50,6 @@ class Settings:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
     def _require(self, name: str, holds: bool, allowed: str) -> None:
-        """Validate a setting.
-
-        Raises:
-            UsageError: The condition does not hold.
-        """
         if not holds:
             raise UsageError(f"{name} must be {allowed}, got {getattr(self, name)}")
 
@@ -101,14 +96,7 @@ def flag(name: str) -> str:
 
 
 def field_help(config_type: type) -> dict[str, str]:
-    """Return the help of each field of a config dataclass, inherited fields first.
-
-    Args:
-        config_type: Dataclass whose source can be read.
-
-    Returns:
-        Help text of each field by name.
-    """
+    """Return the help of each field of a dataclass by name, inherited fields first."""
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
     for base in reversed(config_type.__mro__):

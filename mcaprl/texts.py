@@ -19,7 +19,7 @@ def printable(text: object) -> str:
     >>> print(printable(f"a{chr(27)}[2J"))
     a\x1b[2J
     """
-    return _UNPRINTABLE.sub(lambda found: _escaped(found[0]), str(text))
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), str(text))
 
 
 def encodable(text: str) -> str:
@@ -34,10 +34,6 @@ def shortened(text: str, most: int) -> str:
     'a lo...'
     """
     return text if len(text) <= most else f"{text[: most - 3]}..."
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode()
 
 
 def counted(number: int, noun: str) -> str:

@@ -59,11 +59,7 @@ def sim_of(
 
 
 def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None:
-    """Check that a log makes nobody import a module or call a constructor with its arguments.
-
-    Raises:
-        UsageError: It would.
-    """
+    """Check that a log makes nobody import a module or call a constructor with its arguments."""
     if sim is None and ":" in dataset.env_id:
         module = dataset.env_id.partition(":")[0]
         raise UsageError(
@@ -73,15 +69,11 @@ def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None
         )
     name = sim or dataset.env_id
     if dataset.env_kwargs and SIMS.find(SIMS.get(name, name), loads=":" not in name) is None:
+        arguments = ", ".join(f"{key}={value!r}" for key, value in dataset.env_kwargs.items())
         raise UsageError(
-            f"{path} names arguments of {name}: {_shown(dataset.env_kwargs)}; if you trust the log,"
-            " pass --trust-env (trust_env=True in Python)"
+            f"{path} names arguments of {name}: {shortened(arguments, _MAX_SHOWN)}; if you trust"
+            " the log, pass --trust-env (trust_env=True in Python)"
         )
-
-
-def _shown(arguments: Mapping[str, Any]) -> str:
-    text = ", ".join(f"{name}={value!r}" for name, value in arguments.items())
-    return shortened(text, _MAX_SHOWN)
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:

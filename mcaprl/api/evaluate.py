@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
+from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
 
 RESULT_NAME = "evaluation.json"
@@ -138,60 +139,46 @@ def evaluate(
         envs = None
         if env.spec is not None and env.spec.vector_entry_point and log is None:
             envs = make_sims(sim, episodes, **options)
-        runs = _Runs(env, envs, names, episodes, seed)
-        scores = runs.scores(log, overwrite, progress)
-    if logged is not None:
-        logged = replace(logged, normalized_score=_normalized(logged.mean_return, scores))
-    result = Evaluation(sim, seed, logged, tuple(scores), tuple(improvements(scores)))
-    if folder is not None:
-        recorded = None if log is None else (log, len(set(names)))
-        _write_report(folder, result, world, recorded, names)
-    return result
-
-
-@dataclass(frozen=True)
-class _Runs:
-    """Policies to run in one environment or in a vector environment."""
-
-    env: gym.Env[Any, Any]
-    envs: gym.vector.VectorEnv[Any, Any, Any] | None
-    names: Sequence[str]
-    episodes: int
-    seed: int
-
-    def scores(
-        self, record: Path | None, overwrite: bool, progress: ProgressBar
-    ) -> list[PolicyScore]:
-        """Evaluate the policies, and random and the pilot; record only the named ones."""
-        found = {name: policies_of(name, self.env) for name in dict.fromkeys(self.names)}
-        for name in SCRIPTED:
-            if name not in found and (scripted := _scripted(name, self.env)) is not None:
-                found[name] = scripted
-        shown = policy_names(list(found))
-        scores = {}
+        found = _policies(names, env)
+        shown, scores = policy_names(list(found)), {}
         with ExitStack() as stack:
-            total = sum(map(len, found.values())) * self.episodes
+            total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
             recorder = None
-            if record is not None:
-                recorder = RecordMcap(
-                    self.env, record, seed=self.seed, overwrite=overwrite, epsilon=0.0
-                )
+            if log is not None:
+                recorder = RecordMcap(env, log, seed=seed, overwrite=overwrite, epsilon=0.0)
                 stack.enter_context(closing(recorder))
-            for name, policies in found.items():
-                recorded = recorder if name in self.names else None
+            for name, candidates in found.items():
+                recorded = recorder if name in names else None
                 scores[name] = evaluate_policy(
-                    recorded or self.env,
-                    policies,
+                    recorded or env,
+                    candidates,
                     name=shown[name],
-                    episodes=self.episodes,
-                    seed=self.seed,
-                    envs=None if name in SCRIPTED else self.envs,
+                    episodes=episodes,
+                    seed=seed,
+                    envs=None if name in SCRIPTED else envs,
                     on_policy=partial(_set_policy, recorded),
                     on_episode=lambda result: advance(1),
                 )
-        pilot = scores.get("pilot")
-        return [normalize(score, scores["random"], pilot) for score in scores.values()]
+    random, pilot = scores["random"], scores.get("pilot")
+    normalized = [normalize(score, random, pilot) for score in scores.values()]
+    if logged is not None:
+        logged = replace(logged, normalized_score=_normalized(logged.mean_return, normalized))
+    result = Evaluation(sim, seed, logged, tuple(normalized), tuple(improvements(normalized)))
+    if folder is not None:
+        _write_report(folder, result, world, log, names)
+    return result
+
+
+def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
+    """Return the named policies, and random and the pilot."""
+    found = {name: policies_of(name, env) for name in dict.fromkeys(names)}
+    for name in SCRIPTED:
+        if name not in found:
+            # Some sims have no pilot.
+            with suppress(UsageError):
+                found[name] = policies_of(name, env)
+    return found
 
 
 def _set_policy(recorder: RecordMcap | None, name: str) -> None:
@@ -199,20 +186,8 @@ def _set_policy(recorder: RecordMcap | None, name: str) -> None:
         recorder.policy = name
 
 
-def _scripted(name: str, env: gym.Env[Any, Any]) -> Any:
-    """Return a scripted policy; None if the sim has none."""
-    try:
-        return policies_of(name, env)
-    except UsageError:
-        return None
-
-
 def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
-    """Return the returns of the episodes in logs.
-
-    Raises:
-        UsageError: The logs are of another environment, or would be overwritten.
-    """
+    """Return the returns of logs, which are of this environment and are not overwritten."""
     if record is not None and record.resolve() in [path.resolve() for path in find_logs(data)]:
         raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")
     dataset = open_logs(data)
@@ -233,18 +208,13 @@ def _normalized(mean_return: float, scores: Sequence[PolicyScore]) -> float | No
 
 
 def _write_report(
-    folder: Path,
-    result: Evaluation,
-    world: list[Any],
-    recorded: tuple[Path, int] | None,
-    names: Sequence[str],
+    folder: Path, result: Evaluation, world: list[Any], log: Path | None, names: Sequence[str]
 ) -> None:
     from mcaprl.sims.evaluation.report import evaluation_page
 
     write_json(folder / RESULT_NAME, result.to_json(), ReportError)
     logged = result.behavior
     band = None if logged is None else (logged.mean_return, *logged.interval)
-    curves = learning_curves([name for name in names if name not in SCRIPTED])
     evaluation_page(
         folder,
         result.sim,
@@ -252,19 +222,17 @@ def _write_report(
         list(result.improvements),
         world,
         band,
-        recorded,
-        curves,
+        None if log is None else (log, len(set(names))),
+        learning_curves([name for name in names if name not in SCRIPTED]),
     )
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return learning curves of the policies that are run or seed folders.
+    """Return the learning curves of the names that refer to a run folder or a seed folder.
 
     Online runs are compared in one figure; an offline run has one figure for each term of its loss.
     """
-    folders = dict.fromkeys(
-        found for name in names if (found := _run_folder(Path(name))) is not None
-    )
+    folders = dict.fromkeys(filter(None, (_run_folder(Path(name)) for name in names)))
     online = [folder for folder in folders if any(folder.glob("seed-*/curve.csv"))]
     figures = []
     if online:

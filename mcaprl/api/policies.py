@@ -150,11 +150,10 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
             raise UsageError(
                 f"{sim} has no pilot: pass --policy random, or the path of a trained run"
             ) from error
-    loaded: list[Policy | None] = []
-    for policy in load_policies(_existing(name, SCRIPTED)):
+    policies = load_policies(_existing(name, SCRIPTED))
+    for policy in policies:
         check_fit(policy, env)
-        loaded.append(policy)
-    return loaded
+    return list(policies)
 
 
 def trained_policies(name: str, dataset: Dataset) -> list[TrainedPolicy]:

@@ -95,7 +95,7 @@ def train(
     _, defaults = choose_algorithm(algo)
     check_settings(algo, defaults, settings)
     config = type(defaults)(**settings)
-    with _torch_threads(threads):
+    with torch_threads(threads):
         growing, weights = None, None
         if isinstance(data, Dataset):
             if follow:
@@ -200,7 +200,7 @@ def train_online(
     task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
     data, policy = _experience(as_names(sources))
     with ExitStack() as stack:
-        stack.enter_context(_torch_threads(threads))
+        stack.enter_context(torch_threads(threads))
         viewers = None
         if live:
             viewers = LiveTraining(task, port=port, origins=as_names(allow_origin))
@@ -230,7 +230,7 @@ def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy]
 
 
 @contextmanager
-def _torch_threads(threads: int) -> Iterator[None]:
+def torch_threads(threads: int) -> Iterator[None]:
     """Set the number of threads of PyTorch, and restore it afterward."""
     import torch
 

@@ -109,12 +109,7 @@ class Display:
         return (*self.shown.channels, *((DEPTH,) if self._depth_images else ()))
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Begin an episode after the environment's reset.
-
-        Args:
-            start_ns: log_time of the first observation.
-            step_ns: Time between two observations.
-        """
+        """Begin an episode, after the environment's reset, at the log_time `start_ns`."""
         self._start_ns, self._step_ns = start_ns, step_ns
         self._return_so_far = 0.0
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
@@ -130,12 +125,7 @@ class Display:
             self._depth_images.begin(start_ns, step_ns)
 
     def observe(self, step: int, reward: float) -> None:
-        """Add the environment's display messages after `step` steps.
-
-        Args:
-            step: Number of steps since the episode's start.
-            reward: Reward of the last step; 0 at the start.
-        """
+        """Add the display messages after `step` steps, the last of which had this reward."""
         self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:

@@ -108,7 +108,10 @@ def _plots(
     tabs = {
         **{name: {name: path} for name, path in learning.items()},
         **_value_series(metadata, topics),
-        **_telemetry_series(telemetry_names),
+        **{
+            title: {name: f"/telemetry.{name}" for name in telemetry_names if name.endswith(ending)}
+            for title, ending in PLOTTED_ENDINGS.items()
+        },
         "observations": _observation_series(metadata),
         "actions": _action_series(metadata),
     }
@@ -124,20 +127,10 @@ def _plots(
     return [*(f"Plot!{title}" for title in always), "Tab!numbers"]
 
 
-def _telemetry_series(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the series of each plot in `PLOTTED_ENDINGS`."""
-    return {
-        title: {name: f"/telemetry.{name}" for name in names if name.endswith(ending)}
-        for title, ending in PLOTTED_ENDINGS.items()
-    }
-
-
 def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return each annotating policy's action values, TD error, advantage and entropy."""
     series = {}
-    for topic in topics:
-        if not is_values_topic(topic):
-            continue
+    for topic in filter(is_values_topic, topics):
         title = topic.removeprefix("/rl/")
         q_values = enumerate(metadata.action_names().values())
         series[title] = {f"Q {name}": f"{topic}.q[{index}]" for index, name in q_values}
@@ -255,12 +248,7 @@ def _three_d(follow_frame: str) -> dict[str, Any]:
 
 
 def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
-    return {
-        "first": first,
-        "second": second,
-        "direction": direction,
-        "splitPercentage": percent,
-    }
+    return {"first": first, "second": second, "direction": direction, "splitPercentage": percent}
 
 
 def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:

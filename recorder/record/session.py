@@ -26,15 +26,7 @@ from mcaprl.texts import encodable
 
 @dataclass
 class OpenEpisode:
-    """An episode that is being recorded.
-
-    Attributes:
-        policy: Name of the policy.
-        epsilon: Exploration rate of the policy.
-        seed: Seed given to reset().
-        options: Options given to reset().
-        steps: Number of complete transitions.
-    """
+    """An episode that is being recorded: its policy, arguments of `reset`, and transitions."""
 
     policy: str
     epsilon: float

@@ -170,13 +170,7 @@ class StepColumns:
         self._drop(count)
 
     def end(self, steps: int, terminated: bool, truncated: bool) -> None:
-        """Mark the last transition and the final row, and write the rows.
-
-        Args:
-            steps: Number of transitions in the episode, 1 or more.
-            terminated: Whether the last transition reached a terminal state.
-            truncated: Whether the episode was truncated.
-        """
+        """Mark the last of `steps` transitions, 1 or more, and the final row; write the rows."""
         final = steps - self._first_step
         assert final >= 1, "the last transition stays in memory"
         self._fill(final, final + 1)
@@ -240,7 +234,7 @@ class ImageColumn:
 
     @property
     def full_at(self) -> int:
-        """The first step whose image has no row."""
+        """First step for whose image no row is left."""
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:

@@ -25,12 +25,7 @@ class OpenRows(Generic[Rows]):
     """Message records of one topic for all open episodes."""
 
     def __init__(self, chunk: Rows, environments: int) -> None:
-        """Allocate the block.
-
-        Args:
-            chunk: Preallocated rows of one chunk, with the constant fields set.
-            environments: Number of environments.
-        """
+        """Allocate the block; `chunk` is preallocated rows with the constant fields set."""
         self._per_chunk = len(chunk)
         first = max(1, min(_FIRST_CAPACITY, _FIRST_BYTES // chunk.itemsize))
         self._rows = chunk.blank(environments, first)
@@ -57,14 +52,7 @@ class OpenRows(Generic[Rows]):
         self._rows.put(field, (environments, steps), values)
 
     def write(self, environment: int, count: int, start_ns: int, step_ns: int) -> None:
-        """Write the first `count` rows of an environment, in chunks.
-
-        Args:
-            environment: Index of the environment.
-            count: Number of rows.
-            start_ns: log_time of the first row.
-            step_ns: Time between two rows.
-        """
+        """Write the first `count` rows of an environment in chunks, from log_time `start_ns`."""
         times = start_ns + np.arange(count) * step_ns
         for first in range(0, count, self._per_chunk):
             chunk = slice(first, min(first + self._per_chunk, count))

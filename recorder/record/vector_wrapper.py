@@ -65,25 +65,10 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
-        """Wrap `env` and create the file.
+        """Wrap `env` and create the file; for the other arguments, see `RecordMcap`.
 
-        Args:
-            env: Vector environment with spaces that `RecordMcap` supports and an autoreset mode in
-                its metadata.
-            path: File to write.
-            policy: Name of the policy.
-            epsilon: Probability of a random action; NaN if unknown.
-            policy_version: Number of updates of the policy so far; None omits `/rl/learner`.
-            seed: Seed to store in the log's metadata.
-            compression: Compression of chunks: `zstd`, `lz4` or `none`.
-            overwrite: Whether to replace an existing file.
-            append: Whether to append episodes to an existing file, which must have been recorded
-                from an environment of the same id, arguments and spaces.
-            max_file_bytes: File size after which the next episode begins a new file. `lane.mcap`
-                becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
-                episodes; `mcaprl.open` reads their folder as one dataset.
-            step_duration_s: Simulated seconds between two observations; default: as `RecordMcap`.
-            start_time_ns: log_time of the first message, since the Unix epoch; default: now.
+        `env` has spaces that `RecordMcap` supports, and an autoreset mode in its metadata. If
+        `policy_version` is None, the log has no `/rl/learner`.
 
         Raises:
             SpaceError: The log format does not support the environments' spaces.
@@ -124,7 +109,13 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._learner: OpenRows[TopicRows] | None = None
         if policy_version is not None:
             self._learner = OpenRows(log.learner_rows(), count)
-        self._take_spaces()
+        self._places = [
+            (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
+            for leaf in observation_leaves(self.single_observation_space)
+        ]
+        self._converters = converters(self.observation_space)
+        self._converters_of_one = converters(self.single_observation_space)
+        self._action_leaf = action_leaf(self.action_space)
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
         # Number of transitions in each environment's open episode, and whether one is open.
@@ -194,7 +185,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
-                    self._begin_due(values)
+                    for number in np.flatnonzero(self._due).tolist():
+                        self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
                     self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
             else:
                 self._observe(values)
@@ -213,17 +205,6 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
                     self._recording.close()
         finally:
             super().close(**kwargs)
-
-    def _take_spaces(self) -> None:
-        """Set the functions that read observations and actions, and the buffers of the values."""
-        leaves = observation_leaves(self.single_observation_space)
-        self._places = [
-            (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
-            for leaf in leaves
-        ]
-        self._converters = converters(self.observation_space)
-        self._converters_of_one = converters(self.single_observation_space)
-        self._action_leaf = action_leaf(self.action_space)
 
     def _act(self, actions: Any) -> None:
         """Store the actions before the environments can change them."""
@@ -258,10 +239,6 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     def _put(self, environments: Any, steps: Any, values: list[NDArray[Any]]) -> None:
         for (table, field), value in zip(self._places, values, strict=True):
             table.put(field, environments, steps, value)
-
-    def _begin_due(self, values: list[NDArray[Any]]) -> None:
-        for number in np.flatnonzero(self._due).tolist():
-            self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
 
     def _begin(self, number: int, values: list[NDArray[Any]], episode: OpenEpisode) -> None:
         """Begin an episode of one environment with its observation."""

@@ -6,7 +6,7 @@ decompressed chunks are cached, so memory use does not grow with the log.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mcaprl.recorder.format.reading import McapReader, MessageRange
 
 _CHUNKS_KEPT = 24
+_Messages = Iterator[tuple[int, Channel, bytes]]
 
 
 class Played(NamedTuple):
@@ -75,14 +76,14 @@ class Track:
         )
         self._records = lru_cache(_CHUNKS_KEPT)(self._inflated)
 
-    def between(self, start_ns: int, stop_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
+    def between(self, start_ns: int, stop_ns: int) -> _Messages:
         """Yield time, channel and bytes of the messages in [start_ns, stop_ns), by time."""
         start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns + 1)
         found = [place for topic in self._topics for place in topic.between(start_ns, stop_ns)]
         for place in sorted(found, key=lambda place: place.time_ns):
             yield place.time_ns, place.channel, self._message(place)
 
-    def latest(self, time_ns: int) -> Iterator[tuple[int, Channel, bytes]]:
+    def latest(self, time_ns: int) -> _Messages:
         """Yield the latest message of each topic up to a time, which defines the display.
 
         Messages before the window are included.
@@ -193,11 +194,7 @@ class Player:
 
     def current_messages(self) -> list[Played]:
         """Return the latest message of each topic, as needed by a new viewer."""
-        return [
-            Played(number, channel.id, time_ns + shift, data)
-            for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
-            for time_ns, channel, data in track.latest(self.time_ns - shift)
-        ]
+        return self._played(lambda track, shift: track.latest(self.time_ns - shift))
 
     def advance(self, elapsed_s: float) -> list[Played]:
         """Advance the clock and return the messages that are due, by time."""
@@ -205,11 +202,15 @@ class Player:
             return []
         self.time_ns = min(self.time_ns + round(elapsed_s * self.speed * 1e9), self.end_ns)
         first_ns, self._next_ns = self._next_ns, self.time_ns + 1
-        due = [
-            Played(number, channel.id, time_ns + shift, data)
-            for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
-            for time_ns, channel, data in track.between(first_ns - shift, self._next_ns - shift)
-        ]
+        due = self._played(lambda log, shift: log.between(first_ns - shift, self._next_ns - shift))
         if self.ended and not self.loops:
             self.playing = False
         return sorted(due, key=lambda message: message.time_ns)
+
+    def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
+        """Return the messages that a function finds in each shifted log."""
+        return [
+            Played(number, channel.id, time_ns + shift, data)
+            for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))
+            for time_ns, channel, data in found(track, shift)
+        ]
