@@ -51,7 +51,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
 @click.option(
     "--threads",
     type=click.IntRange(1),
-    help="With --data: number of threads that read chunks.  [default: 1]",
+    help="With --data: number of threads of PyTorch and of the reader.  [default: 1]",
 )
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")

@@ -1,4 +1,4 @@
-"""Off-policy evaluation: values of policies, estimated from logs alone."""
+"""Off-policy evaluation: estimates of the values of policies from logs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 from mcaprl.api.data import Data, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
+from mcaprl.api.train import torch_threads
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
+from mcaprl.texts import counted
 
 if TYPE_CHECKING:
     from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates, StochasticPolicy
@@ -71,34 +73,37 @@ def estimate(
     """Estimate the discounted returns of policies from logs, with each estimator.
 
     Args:
-        policies: `random` or the path of a trained run, or several of them; each seed of a run is
-            one policy.
+        policies: `random` or the path of a trained run, or a list; each seed of a run is one
+            policy.
         data: Dataset, file, folder or glob of logs, or several of them.
         gamma: Discount of the returns.
         epsilon: Probability of a random action instead of the policy's.
         updates: Number of gradient steps of the model that FQE, DR and WDR use.
         seed: Seed of the model and of the resampling.
-        threads: Number of threads that read the logs.
-        progress: Opens the progress bar.
+        threads: Number of threads of PyTorch and of the reader.
+        progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: A policy has no action probabilities, or a number is out of its range.
+        UsageError: A policy has no action probabilities, or a number is out of range.
         UnknownNameError: There is no such policy.
-        PolicyError: A policy was trained on other spaces than the logs'.
+        PolicyError: A policy was trained on spaces other than the logs'.
         LogError: The logs cannot be read.
     """
     from mcaprl.offline.estimate.fqe import FQEConfig
-    from mcaprl.offline.estimate.off_policy import OffPolicyEvaluator, ranking
+    from mcaprl.offline.estimate.off_policy import FOLDS, OffPolicyEvaluator, ranking
 
     check_fraction(gamma=gamma, epsilon=epsilon)
-    check_least(1, updates=updates)
+    check_least(1, updates=updates, threads=threads)
     check_least(0, seed=seed)
     dataset = opened(data, threads=threads)
     found = _policies(as_names(policies), dataset)
     config = replace(FQEConfig(), gamma=gamma, updates=updates)
     evaluator = OffPolicyEvaluator(dataset, config, seed)
     results: list[PolicyEstimates] = []
-    with progress("learning values", len(found) * evaluator.updates_of_model) as advance:
+    fits = counted(len(found) * FOLDS, "network")
+    text = f"fitting {fits} with {counted(updates, 'update')} each"
+    total = len(found) * evaluator.updates_of_model
+    with torch_threads(threads), progress(text, total) as advance:
         for name, policy in found.items():
             results.append(
                 evaluator.evaluate(policy, name, epsilon=epsilon, on_update=lambda: advance(1))
@@ -119,7 +124,7 @@ def estimate(
 
 
 def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Return the policies by the names that tables show; each fits the log."""
+    """Return the policies by their names in tables."""
     shown = policy_names(names)
     found: dict[str, StochasticPolicy | None] = {}
     for name in dict.fromkeys(names):

@@ -1,13 +1,20 @@
-"""Returns of training seeds and episodes with a true mean of 0, and the coverage of intervals."""
+"""Returns of training seeds and episodes with a true mean of 0, and the coverage of intervals.
+
+`python -m tests.support.sampled_returns` prints the table of `docs/evaluation.md`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mcaprl.sims.evaluation.statistics import bootstrap_interval, mean_interval
 
 Floats = NDArray[np.float64]
 
@@ -40,6 +47,22 @@ class Returns:
         return self.spread * of_seeds + math.sqrt(0.5) * (of_starts + of_both)
 
 
+CASES: Final = {
+    "1 seed, 30 episodes, normal": Returns(1, 30),
+    "1 seed, 30 episodes, lognormal": Returns(1, 30, skewed=True),
+    "1 seed, 100 episodes, normal": Returns(1, 100),
+    "1 seed, 100 episodes, lognormal": Returns(1, 100, skewed=True),
+    "2 seeds, 30 episodes, normal": Returns(2, 30),
+    "4 seeds, 30 episodes, normal": Returns(4, 30),
+    "4 seeds, 30 episodes, lognormal": Returns(4, 30, skewed=True),
+    "4 equal seeds, 30 episodes, normal": Returns(4, 30, spread=0),
+    "4 seeds, 100 episodes, normal": Returns(4, 100),
+    "4 lognormal seeds, 30 episodes, normal": Returns(4, 30, skewed_seeds=True),
+    "10 seeds, 30 episodes, normal": Returns(10, 30),
+    "10 lognormal seeds, 30 episodes, normal": Returns(10, 30, skewed_seeds=True),
+}
+
+
 def coverage(
     returns: Returns, interval: Callable[[Floats], tuple[float, float]], trials: int
 ) -> float:
@@ -52,8 +75,21 @@ def coverage(
     return hits / trials
 
 
+def main() -> None:
+    """Print the table as Markdown."""
+    percentiles = partial(bootstrap_interval, statistic=lambda r: np.mean(r, axis=(-2, -1)))
+    print("| returns | ours | percentiles |\n|---|---|---|")
+    for name, returns in CASES.items():
+        ours, theirs = (coverage(returns, each, 2000) for each in (mean_interval, percentiles))
+        print(f"| {name} | {100 * ours:.1f} % | {100 * theirs:.1f} % |", flush=True)
+
+
 def _effects(random: np.random.Generator, shape: tuple[int, ...], *, skewed: bool) -> Floats:
     """Draw numbers with mean 0 and variance 1."""
     if not skewed:
         return random.normal(size=shape)
     return (random.lognormal(size=shape) - math.exp(0.5)) / math.sqrt(math.e * (math.e - 1))
+
+
+if __name__ == "__main__":
+    main()
