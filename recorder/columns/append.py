@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -36,7 +36,7 @@ class WrittenState:
     summary: Summary
     end: int
     crc: int
-    top_level: list[TopLevelRecord] = field(default_factory=list)
+    top_level: list[TopLevelRecord]
 
 
 def written_state(path: Path) -> WrittenState:
@@ -52,35 +52,25 @@ def written_state(path: Path) -> WrittenState:
             raise CorruptLogError("the file is not finished")
         (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
         summary = Summary(chunks=list(reader.chunks))
-        written = WrittenState(summary, end, crc or crc32(reader.view[:end]))
-        _add_topics(reader, written)
-        _add_other_records(reader, written)
+        top_level: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
+        for topic in top_level:
+            summary.add(topic, 0, 0)
+        for channel in reader.channels.values():
+            ranges = reader.message_ranges(channel)
+            if any(messages.chunk is None for messages in ranges):
+                raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
+            summary.counts[channel.id] = sum(map(len, ranges))
+        for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
+            if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                record: TopLevelRecord = parse_record(opcode, content)
+                summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
+                top_level.append(record)
+            elif opcode == Opcode.DATA_END:
+                break
     except CorruptLogError as error:
         what = str(error).removeprefix(f"{path}: ")
         raise LogError(
             f"{path} cannot be appended to: {what}; run `mcaprl recover {path} OUT` and"
             " append to OUT"
         ) from error
-    return written
-
-
-def _add_topics(reader: McapReader, written: WrittenState) -> None:
-    topics: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
-    for topic in topics:
-        written.summary.add(topic, 0, 0)
-        written.top_level.append(topic)
-    for channel in reader.channels.values():
-        ranges = reader.message_ranges(channel)
-        if any(messages.chunk is None for messages in ranges):
-            raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
-        written.summary.counts[channel.id] = sum(map(len, ranges))
-
-
-def _add_other_records(reader: McapReader, written: WrittenState) -> None:
-    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
-        if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-            record: TopLevelRecord = parse_record(opcode, content)
-            written.summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
-            written.top_level.append(record)
-        elif opcode == Opcode.DATA_END:
-            return
+    return WrittenState(summary, end, crc or crc32(reader.view[:end]), top_level)

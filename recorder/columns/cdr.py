@@ -236,9 +236,7 @@ def message_type(schema: Schema) -> MessageType:
     return _parsed(schema.name, schema.data.decode(errors="replace"))
 
 
-@lru_cache(maxsize=64)
-def _parsed(name: str, text: str) -> MessageType:
-    return MessageType(name, text)
+_parsed = lru_cache(maxsize=64)(MessageType)
 
 
 def _dtype_of(description: Any) -> np.dtype[Any]:

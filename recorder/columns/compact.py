@@ -145,11 +145,7 @@ class _CompactedFile(OutputFile):
         self._finish()
 
     def replace(self, target: Path, mode: int) -> None:
-        """Replace the original with the finished copy.
-
-        Raises:
-            OSError: The copy cannot be flushed to disk or moved.
-        """
+        """Replace the original with the finished copy."""
         self._file.flush()
         os.fsync(self._file.fileno())
         os.chmod(self.path, mode)
@@ -163,16 +159,12 @@ class _CompactedFile(OutputFile):
         if any(op in _CHUNK_RECORDS for _, op, _ in records_of(view, first_record, part.stop)):
             raise CorruptLogError("the summary does not list all chunks and indexes")
         shift = self.position - part.start
-        self._summary.metadata += [
-            replace(index, offset=index.offset + shift)
-            for index in summary.metadata
-            if part.start <= index.offset < part.stop
-        ]
-        self._summary.attachments += [
-            replace(index, offset=index.offset + shift)
-            for index in summary.attachments
-            if part.start <= index.offset < part.stop
-        ]
+        for kind in ("metadata", "attachments"):
+            getattr(self._summary, kind).extend(
+                replace(index, offset=index.offset + shift)
+                for index in getattr(summary, kind)
+                if part.start <= index.offset < part.stop
+            )
         self._write(view[part])
 
     def _copy_chunk(self, view: memoryview, chunk: ChunkIndex) -> None:

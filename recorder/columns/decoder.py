@@ -10,7 +10,7 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.cdr import Layout, MessageType, message_type
+from mcaprl.recorder.columns.cdr import Layout, message_type
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.message_rows import (
     MESSAGE_HEADER,
@@ -45,8 +45,16 @@ class Decoder:
         Raises:
             LogError: The encoding of the messages is not supported.
         """
-        self.channel, self.type = channel, _type_of(reader, channel)
-        self._reader = reader
+        if channel.message_encoding != "cdr":
+            raise LogError(
+                f"{reader.path}: messages of {channel.topic} have encoding"
+                f" {channel.message_encoding!r}, not 'cdr'"
+            )
+        self._reader, self.channel, schema = reader, channel, reader.schema_of(channel)
+        try:
+            self.type = message_type(schema)
+        except LogError as error:
+            raise LogError(f"{reader.path}: {channel.topic}: {error}") from error
 
     def empty_columns(
         self,
@@ -71,9 +79,15 @@ class Decoder:
         index, rows = self._put_by_length(columns, records, index, rows)
         for entry, row in zip(index, rows.tolist(), strict=True):
             for name, value in self._values(records, entry, columns).items():
-                self._check_shape(name, value, columns[name], entry)
+                column = columns[name]
+                if value.shape != column.shape[1:]:
+                    raise LogError(
+                        f"{self._reader.path}: {name} of {self.channel.topic} has shape"
+                        f" {value.shape} at log_time {entry['log_time']} and {column.shape[1:]}"
+                        " elsewhere; all must be equal"
+                    )
                 # `[()]` turns a 0-d array into its element.
-                columns[name][row] = value[()]
+                column[row] = value[()]
 
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
@@ -170,15 +184,6 @@ class Decoder:
                 f"{self._reader.path}: {self.channel.topic} has a string that is not UTF-8"
             ) from error
 
-    def _check_shape(
-        self, name: str, value: NDArray[Any], column: NDArray[Any], entry: Any
-    ) -> None:
-        if value.shape != column.shape[1:]:
-            raise LogError(
-                f"{self._reader.path}: {name} of {self.channel.topic} has shape {value.shape} at"
-                f" log_time {entry['log_time']} and {column.shape[1:]} elsewhere; all must be equal"
-            )
-
 
 def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
     """Set rows of a column; copy each vector as one item, not number by number."""
@@ -186,16 +191,3 @@ def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:
         row = np.dtype((np.void, values.shape[1] * values.itemsize))
         column, values = column.view(row)[:, 0], values.view(row)[:, 0]
     column[rows] = values
-
-
-def _type_of(reader: McapReader, channel: Channel) -> MessageType:
-    if channel.message_encoding != "cdr":
-        raise LogError(
-            f"{reader.path}: messages of {channel.topic} have encoding"
-            f" {channel.message_encoding!r}, not 'cdr'"
-        )
-    schema = reader.schema_of(channel)
-    try:
-        return message_type(schema)
-    except LogError as error:
-        raise LogError(f"{reader.path}: {channel.topic}: {error}") from error

@@ -398,8 +398,10 @@ class McapReader:
 
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
         """Return whether the summary has this schema or channel; both records begin with an id."""
-        listed = {Opcode.SCHEMA: self.schemas, Opcode.CHANNEL: self.channels}.get(opcode, {})
-        return int.from_bytes(content[:2], "little") in listed
+        number = int.from_bytes(content[:2], "little")
+        return (opcode == Opcode.SCHEMA and number in self.schemas) or (
+            opcode == Opcode.CHANNEL and number in self.channels
+        )
 
     def _parse(self, opcode: int, content: memoryview, offset: int) -> None:
         with self._named(f" (byte {offset})"):

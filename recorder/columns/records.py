@@ -32,11 +32,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError, NotMcapError
 from mcaprl.files import open_at_once
 from mcaprl.recorder.columns.checksum import crc32
-from mcaprl.recorder.columns.message_rows import (
-    INDEX_ENTRY,
-    MESSAGE_HEADER,
-    RECORD_HEADER_BYTES,
-)
+from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
 
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
@@ -113,25 +109,6 @@ def parse_record(opcode: int, content: memoryview) -> Any:
     # The library raises errors of many types when a record is damaged.
     except Exception as error:
         raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
-
-
-def attachment_of(view: memoryview, name: str) -> bytes | None:
-    """Return the data of the last attachment with this name; None if there is none.
-
-    Raises:
-        CorruptLogError: The attachment is damaged.
-    """
-    found = None
-    for offset, opcode, content in records_of(view, len(MCAP0_MAGIC)):
-        if opcode == Opcode.DATA_END:
-            break
-        if opcode == Opcode.ATTACHMENT:
-            attachment: Attachment = parse_record(opcode, content)
-            if attachment.name == name:
-                if not is_intact_attachment(content):
-                    raise CorruptLogError(f"the attachment {name} at byte {offset} is damaged")
-                found = bytes(attachment.data)
-    return found
 
 
 def is_intact_attachment(content: memoryview) -> bool:

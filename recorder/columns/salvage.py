@@ -17,13 +17,12 @@ import numpy as np
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import parse_chunk_index
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RECORD_HEADER_BYTES
-from mcaprl.recorder.columns.records import RECORD_HEADER, parse_record, records_of
+from mcaprl.recorder.columns.records import RECORD_HEADER, footer_of, parse_record, records_of
 
 ValidRecord = tuple[int, int, memoryview]
 """Offset, opcode and content."""
@@ -173,39 +172,30 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
     """Return the offset of the first valid chunk from `start` on; `stop` if there is none."""
     bytes_ = np.frombuffer(view, np.uint8)
     for block in range(start, stop, _BLOCK_BYTES):
-        for offset in _may_be_chunks(bytes_, block, min(block + _BLOCK_BYTES, stop)):
+        part = bytes_[block : min(block + _BLOCK_BYTES, stop)]
+        found = block + np.flatnonzero(part == int(Opcode.CHUNK))
+        found = found[found + RECORD_HEADER_BYTES <= len(bytes_)]
+        # The lengths of chunks are below 2**40.
+        for high in (6, 7, 8):
+            found = found[bytes_[found + high] == 0]
+        for offset in found.tolist():
             if _valid_record(view, offset) is not None:
-                return offset
+                return int(offset)
     return stop
-
-
-def _may_be_chunks(bytes_: NDArray[Any], start: int, stop: int) -> list[int]:
-    """Return offsets of bytes with a chunk's opcode and a length below 2**40."""
-    found = start + np.flatnonzero(bytes_[start:stop] == int(Opcode.CHUNK))
-    found = found[found + RECORD_HEADER_BYTES <= len(bytes_)]
-    for high in (6, 7, 8):
-        found = found[bytes_[found + high] == 0]
-    chosen: list[int] = found.tolist()
-    return chosen
 
 
 def intact_summary(view: memoryview) -> list[Any]:
     """Return the schemas, channels and chunk indexes of an intact summary; else []."""
-    end = len(view) - len(MCAP0_MAGIC)
-    start = end - RECORD_HEADER_BYTES - 20
-    if start < len(MCAP0_MAGIC) or bytes(view[end:]) != MCAP0_MAGIC:
+    try:
+        footer = footer_of(view)
+    except CorruptLogError:
         return []
-    if RECORD_HEADER.unpack_from(view, start) != (Opcode.FOOTER, 20):
-        return []
-    summary_start, _, crc = struct.unpack_from("<QQI", view, start + RECORD_HEADER_BYTES)
-    if not len(MCAP0_MAGIC) <= summary_start <= start:
-        return []
-    if not crc or crc32(view[summary_start : end - 4]) != crc:
+    if footer is None or not footer.summary_start or not footer.summary_crc:
         return []
     return [
         parse_chunk_index(content)
         if opcode == Opcode.CHUNK_INDEX
         else parse_record(opcode, content)
-        for _, opcode, content in records_of(view, summary_start, start)
+        for _, opcode, content in records_of(view, footer.summary_start)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX)
     ]

@@ -57,23 +57,30 @@ class Summary:
             case Metadata():
                 self.metadata.append(MetadataIndex(offset, length, record.name))
             case Attachment():
-                self.attachments.append(
-                    AttachmentIndex(
-                        offset=offset,
-                        length=length,
-                        log_time=record.log_time,
-                        create_time=record.create_time,
-                        data_size=len(record.data),
-                        name=record.name,
-                        media_type=record.media_type,
-                    )
+                index = AttachmentIndex(
+                    offset=offset,
+                    length=length,
+                    log_time=record.log_time,
+                    create_time=record.create_time,
+                    data_size=len(record.data),
+                    name=record.name,
+                    media_type=record.media_type,
                 )
+                self.attachments.append(index)
 
     def to_bytes(self, start: int) -> bytes:
         """Serialize the summary section and footer, which will be written at `start`."""
         builder = RecordBuilder()
         groups: list[SummaryOffset] = []
-        for opcode, records in self._groups():
+        every: list[tuple[Opcode, Iterable[McapRecord]]] = [
+            (Opcode.SCHEMA, self.schemas.values()),
+            (Opcode.CHANNEL, self.channels.values()),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self.chunks),
+            (Opcode.ATTACHMENT_INDEX, self.attachments),
+            (Opcode.METADATA_INDEX, self.metadata),
+        ]
+        for opcode, records in every:
             group_start = builder.count
             for record in records:
                 # The chunk indexes are the most numerous records.
@@ -81,13 +88,9 @@ class Summary:
                     builder.write(chunk_index_record(record))
                 else:
                     record.write(builder)
-            if builder.count > group_start:
-                length = builder.count - group_start
-                groups.append(
-                    SummaryOffset(
-                        group_opcode=opcode, group_start=start + group_start, group_length=length
-                    )
-                )
+            length = builder.count - group_start
+            if length:
+                groups.append(SummaryOffset(opcode, start + group_start, length))
         offsets_start = start + builder.count
         for group in groups:
             group.write(builder)
@@ -96,16 +99,6 @@ class Summary:
         footer = builder.end()
         crc = crc32(footer[:-4], crc32(summary))
         return bytes(summary + footer[:-4] + crc.to_bytes(4, "little") + MCAP0_MAGIC)
-
-    def _groups(self) -> list[tuple[Opcode, Iterable[McapRecord]]]:
-        return [
-            (Opcode.SCHEMA, self.schemas.values()),
-            (Opcode.CHANNEL, self.channels.values()),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self.chunks),
-            (Opcode.ATTACHMENT_INDEX, self.attachments),
-            (Opcode.METADATA_INDEX, self.metadata),
-        ]
 
     def _statistics(self) -> Statistics:
         chunks = self.chunks

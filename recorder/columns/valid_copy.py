@@ -56,7 +56,9 @@ def recover_file(
         for offset, opcode, content in records:
             copy.take(offset, opcode, content)
         copy.flush()
-        topics.announce_rest(writer)
+        # Channels without messages.
+        for channel_id in topics.channels:
+            topics.announce(channel_id, writer)
 
 
 @contextmanager
@@ -130,10 +132,7 @@ class _Topics:
     """Schemas, channels and metadata of the damaged file, each from its most reliable copy."""
 
     def __init__(
-        self,
-        view: memoryview,
-        records: Sequence[ValidRecord],
-        damages: list[Damage],
+        self, view: memoryview, records: Sequence[ValidRecord], damages: list[Damage]
     ) -> None:
         self._damages = damages
         self.schemas: dict[int, Schema] = {}
@@ -166,11 +165,6 @@ class _Topics:
                 writer.announce(self.schemas[channel.schema_id])
             writer.announce(channel)
         return True
-
-    def announce_rest(self, writer: McapWriter) -> None:
-        """Write the channels without messages."""
-        for channel_id in self.channels:
-            self.announce(channel_id, writer)
 
 
 class _Copy:
@@ -215,15 +209,13 @@ class _Copy:
             self._damages.append(Damage(offset, size, str(error)))
             return
         earlier = self._seen.setdefault((crc32(records), len(records)), [])
-        if offset not in self._listed and any(self._is_equal(one, records) for one in earlier):
+        if offset not in self._listed and any(
+            bytes(chunk_records(self._view, one)) == records for one in earlier
+        ):
             self._damages.append(Damage(offset, size, "a repeated chunk"))
             return
         earlier.append(offset)
         self._write(records, offset, size)
-
-    def _is_equal(self, offset: int, records: memoryview) -> bool:
-        """Return whether an earlier chunk has the same records."""
-        return bytes(chunk_records(self._view, offset)) == records
 
     def _write(self, records: memoryview, offset: int, size: int) -> None:
         try:

@@ -26,11 +26,7 @@ from mcaprl.recorder.columns.append import TopLevelRecord, WrittenState, written
 from mcaprl.recorder.columns.chunks import LONG_MESSAGE_BYTES, Compressors
 from mcaprl.recorder.columns.compact import compact
 from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
-from mcaprl.recorder.columns.message_rows import (
-    INDEX_ENTRY,
-    adjacent_offsets,
-    message_record,
-)
+from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
 from mcaprl.recorder.columns.output import OutputFile
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.summary import Summary
@@ -114,8 +110,7 @@ class McapWriter(OutputFile):
         schemas, channels = self._summary.schemas, self._summary.channels
         wanted = ("ros2msg", schema_name, schema_text.encode())
         schema_id = next(
-            (s.id for s in schemas.values() if (s.encoding, s.name, s.data) == wanted),
-            None,
+            (s.id for s in schemas.values() if (s.encoding, s.name, s.data) == wanted), None
         )
         for channel in channels.values():
             if channel.topic == topic and channel.schema_id == schema_id:
@@ -174,7 +169,9 @@ class McapWriter(OutputFile):
             return
         channel_id, size = int(rows["channel_id"][0]), rows.itemsize
         times = rows["log_time"].copy()
-        rows["sequence"] = self._next_sequences(channel_id, len(rows))
+        first = self._summary.counts[channel_id]
+        self._summary.counts[channel_id] += len(rows)
+        rows["sequence"] = np.arange(first, first + len(rows)).astype(np.uint32)
         rows["publish_time"] = times
         index = np.empty(len(rows), INDEX_ENTRY)
         index["log_time"] = times
@@ -196,9 +193,11 @@ class McapWriter(OutputFile):
             return
         records = bytearray()
         entries: dict[int, list[int]] = {}
+        counts = self._summary.counts
         for channel_id, time_ns, data in messages:
             entries.setdefault(channel_id, []).extend((time_ns, len(records)))
-            records += message_record(channel_id, self._next_sequence(channel_id), time_ns, data)
+            records += message_record(channel_id, counts[channel_id] % 2**32, time_ns, data)
+            counts[channel_id] += 1
         times = [time_ns for _, time_ns, _ in messages]
         self._store(
             memoryview(records),
@@ -290,16 +289,6 @@ class McapWriter(OutputFile):
         compress: Callable[[Any], bytes],
     ) -> None:
         self._write_chunk(records, indexes, times, compress(records), self._compressors.chunk_name)
-
-    def _next_sequence(self, channel_id: int) -> int:
-        number = self._summary.counts[channel_id]
-        self._summary.counts[channel_id] += 1
-        return number % 2**32
-
-    def _next_sequences(self, channel_id: int, count: int) -> NDArray[np.uint32]:
-        first = self._summary.counts[channel_id]
-        self._summary.counts[channel_id] += count
-        return np.arange(first, first + count).astype(np.uint32)
 
     def _write_top_level(self, record: TopLevelRecord) -> None:
         offset = self.position
