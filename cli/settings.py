@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import click
@@ -14,39 +14,63 @@ class SettingsCommand(click.Command):
     """Command with an option for each setting of the algorithms, which are loaded when needed."""
 
     def __init__(
-        self, *arguments: Any, configs: Callable[[], Iterable[Settings]], **others: Any
+        self,
+        *arguments: Any,
+        configs: Callable[[], Iterable[Settings]],
+        tuned: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
+        **others: Any,
     ) -> None:
-        """Create the command; `configs` loads the algorithms and returns their settings."""
+        """Create the command.
+
+        Args:
+            *arguments: Arguments of `click.Command`.
+            configs: Function that loads the algorithms and returns their default settings.
+            tuned: Function that returns, by sim, the settings that differ from the defaults.
+            **others: Arguments of `click.Command`.
+        """
         super().__init__(*arguments, **others)
-        self._configs = configs
+        self._configs, self._tuned = configs, tuned
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return the options of the command and of the algorithms."""
-        return [*super().get_params(ctx), *setting_options(self._configs())]
+        return [*super().get_params(ctx), *setting_options(self._configs(), self._tuned())]
 
 
-def setting_options(configs: Iterable[Settings]) -> list[click.Option]:
+def setting_options(
+    configs: Iterable[Settings], tuned: Mapping[str, Mapping[str, Any]]
+) -> list[click.Option]:
     """Return an option for each field of several algorithms' settings.
 
     Help and default come from the first algorithm that has the field. An omitted option is None,
-    so that the algorithm's default is used.
+    so that the default of the algorithm, or of the sim, is used.
     """
     options: dict[str, click.Option] = {}
     for config in configs:
         for name, line in field_help(type(config)).items():
             if name not in options:
-                options[name] = _option(name, line, getattr(config, name))
+                options[name] = _option(name, line, getattr(config, name), tuned)
     return list(options.values())
 
 
-def _option(name: str, line: str, default: Any) -> click.Option:
+def _option(
+    name: str, line: str, default: Any, tuned: Mapping[str, Mapping[str, Any]]
+) -> click.Option:
     if isinstance(default, bool):
         both = f"{flag(name)}/--no-{name.replace('_', '-')}"
         return click.Option([both, name], default=None, help=line)
-    is_tuple = isinstance(default, tuple)
-    shown = ",".join(map(str, default)) if is_tuple else default
-    kind = _Widths() if is_tuple else type(default)
-    return click.Option([flag(name), name], type=kind, help=f"{line}  [default: {shown}]")
+    kind = _Widths() if isinstance(default, tuple) else type(default)
+    sims: dict[Any, list[str]] = {}
+    for sim, settings in tuned.items():
+        if settings.get(name, default) != default:
+            sims.setdefault(settings[name], []).append(sim)
+    shown = [_shown(default), *(f"{', '.join(sims[value])}: {_shown(value)}" for value in sims)]
+    return click.Option(
+        [flag(name), name], type=kind, help=f"{line}  [default: {'; '.join(shown)}]"
+    )
+
+
+def _shown(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):

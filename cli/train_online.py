@@ -15,6 +15,7 @@ from mcaprl.cli.show import echo, print_address, print_table
 from mcaprl.progress import terminal_progress
 from mcaprl.runs import read_config
 from mcaprl.settings import Settings
+from mcaprl.sims import SIMS
 
 
 def _configs() -> list[Settings]:
@@ -23,7 +24,13 @@ def _configs() -> list[Settings]:
     return [algorithm.config_type() for algorithm in ALGORITHMS.values()]
 
 
-@click.command(cls=SettingsCommand, configs=_configs)
+def _tuned() -> dict[str, dict[str, Any]]:
+    from mcaprl.online.presets import SIM_SETTINGS
+
+    return {name: SIM_SETTINGS[sim] for name, sim in SIMS.items() if sim in SIM_SETTINGS}
+
+
+@click.command(cls=SettingsCommand, configs=_configs, tuned=_tuned)
 @click.argument("sim", required=False)
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option("--algo", help="dqn, double-dqn, ppo or a2c.  [default: double-dqn]")
@@ -63,7 +70,8 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
     Omitted settings default to those of the preset, else those tuned for SIM, else those of
-    Stable-Baselines3; with --resume, to those of the run. The best checkpoint is kept; it is
+    Stable-Baselines3; with --resume, to those of the run. The defaults of sims are those of dqn and
+    double-dqn with default rules and without images. The best checkpoint is kept; it is
     selected on some episodes and scored on others.
     """
     given = {name: value for name, value in request.items() if value is not None}

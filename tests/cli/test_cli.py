@@ -442,6 +442,18 @@ def test_stopped_recording_is_readable(number: signal.Signals) -> None:
     assert len(mcaprl.open(path).episodes) >= 1
 
 
+def test_help_has_the_defaults_of_each_sim(capsys: pytest.CaptureFixture[str]) -> None:
+    from mcaprl.online.task import Task
+
+    assert run(["train-online", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for name in ("lane", "racer", "powerline"):
+        steps = Task.for_sim(name).config.steps
+        shown = text.partition("over all environments [default: ")[2].partition("]")[0]
+        assert f"{name}: {steps}" in shown or shown.startswith(f"{steps};")
+    assert "[default: 0.99; lane, highway-lane: 0.97; racer: 0.98; powerline: 0.95]" in text
+
+
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["--help"]) == 0
     listed = capsys.readouterr().out
