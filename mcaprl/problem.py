@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeVar
 Severity = Literal["problem", "note"]
 LISTED = 10
 """Number of findings of one kind that are listed; the others are counted."""
-# Kinds are told apart by texts from the file, so their number is limited, too.
+# Kinds are distinguished by texts from the file, so their number is limited, too.
 _MAX_KINDS = 100
 _OTHERS = "other findings"
 _NUMBER = re.compile(r"-?\d[\d.,]*")

@@ -1,4 +1,4 @@
-"""Fitted Q evaluation: learn what a policy is worth from another's log.
+"""Fitted Q evaluation: learn the value of a policy from the log of another.
 
     Le, Voloshin and Yue, "Batch policy learning under constraints", https://arxiv.org/abs/1903.08738
 
@@ -7,8 +7,8 @@ target network, synced every `target_interval` updates. A truncated episode woul
 only `terminated` ends the return.
 
 Departures from the paper: gradient steps on random batches between two syncs, not a fit to
-convergence; targets are clipped to the returns that the logged rewards can add up to, because the
-network's values of actions that the log never shows are arbitrary.
+convergence; targets are clipped to the range of possible returns, because the network's values of
+actions that are not in the log are arbitrary.
 """
 
 from __future__ import annotations
@@ -34,35 +34,35 @@ class FQEConfig(TrainingConfig):
     """Settings of fitted Q evaluation."""
 
     updates: int = 10_000
-    """gradient steps in all"""
+    """number of gradient updates"""
     gamma: float = 0.97
-    """discount of the reward one step later"""
+    """discount per step"""
     target_interval: int = 50
     """updates between two syncs of the target network"""
 
     def __post_init__(self) -> None:
-        """Refuse invalid settings."""
+        """Validate the settings."""
         super().__post_init__()
         self._require("gamma", 0 <= self.gamma <= 1, "within [0, 1]")
         self._require("target_interval", self.target_interval >= 1, "at least 1")
 
     @property
     def packing(self) -> Packing:
-        """Single steps, because n-step rewards would be those of the behavior policy."""
+        """Settings for single steps; n-step rewards would be those of the behavior policy."""
         return Packing(gamma=self.gamma)
 
     @property
     def enough_syncs(self) -> bool:
         """Whether rewards can have propagated through the effective horizon.
 
-        After k syncs, Q can be (1 - gamma^k) / (1 - gamma) of the largest reward at most.
+        After k syncs, Q is at most (1 - gamma^k) / (1 - gamma) times the largest reward.
         """
         syncs = self.updates / self.target_interval
         return syncs * (1 - self.gamma) >= SYNCS_PER_HORIZON
 
 
 class FQE(Learner):
-    """A Q-network of a given policy."""
+    """Learner of the Q-values of a given policy."""
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
@@ -89,7 +89,7 @@ class FQE(Learner):
         self.low, self.high = return_bounds(drawn, config.gamma)
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return one value per action."""
+        """Return the shape of the values of all actions."""
         return {"q": (self.n_actions,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -102,13 +102,13 @@ class FQE(Learner):
         return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 
     def values(self, *, next_states: bool) -> Tensor:
-        """Return the first seed's values (N, A) of the states, or next states, clipped."""
+        """Return the values (N, A) that the first seed's network predicts, clipped."""
         outputs = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
         return outputs[: len(self.buffer)].clamp(self.low, self.high)
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """Return the bounds of the discounted sum of such rewards, over one step or more."""
+    """Return the bounds of a discounted sum of one or more of these rewards."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

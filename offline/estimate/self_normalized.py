@@ -3,15 +3,15 @@
 Every off-policy estimate by importance sampling is sum_k w_k mean(a_k) / mean(b_k) over episodes:
 b is 1 for the unbiased estimators and the mean weight for the weighted (self-normalized) ones.
 
-Weights that are products over many steps are skewed: most logs lack the rare episodes of large
-weight, and for the same reason show little variance. Percentiles of a bootstrap share this fault:
-their 95 % intervals contain the true value in 85 to 93 of 100 logs of 50 episodes. The bootstrap-t
-resamples the error in units of the resampling's standard error instead:
+Weights that are products over many steps are skewed: most logs lack the rare episodes with large
+weights, so their variance is too small and percentile bootstrap intervals are too narrow: at 95 %,
+they contain the true value in 85 to 93 of 100 logs of 50 episodes. The bootstrap-t instead
+resamples the error divided by the standard error of each resampling:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
 
-That standard error is itself an estimate, with few degrees of freedom where few episodes contribute
-most of it. The interval is therefore wider by the ratio of the quantiles of Student's t and of the
+That standard error is itself an estimate, with few degrees of freedom if a few episodes contribute
+most of it. The interval is therefore widened by the ratio of the quantiles of Student's t and the
 normal distribution; the degrees of freedom follow from how unequal the episodes' contributions are:
 
     Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
@@ -35,7 +35,7 @@ _RESAMPLES_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class RatioEstimate:
-    """sum_k w_k (mean a_k / mean b_k + ...) over E episodes.
+    """Estimate sum_k w_k (mean a_k / mean b_k + ...) over E episodes.
 
     Attributes:
         weights: w (K,).
@@ -63,7 +63,7 @@ class RatioEstimate:
         """Return the standard errors (B,) of `values(counts)`, by the delta method.
 
         An episode changes the estimate by sum_k w_k (a_k - q_k b_k) / mean b_k, divided by the
-        number of episodes, where q is the ratio.
+        number of episodes, where q_k is the ratio mean a_k / mean b_k.
         """
         parts = [
             self._errors(counts[start : start + _RESAMPLES_AT_ONCE])
@@ -74,8 +74,8 @@ class RatioEstimate:
     def interval(self, counts: Floats) -> tuple[float, float]:
         """Return the 95 % bootstrap-t interval, widened for few degrees of freedom.
 
-        Resamplings of equal episodes have no standard error and are excluded; where most are
-        excluded, the interval consists of percentiles.
+        Resamplings in which all episodes are equal have no standard error and are excluded; if
+        most are excluded, the percentile interval is returned.
 
         Args:
             counts: Number of times (B, E) that each resampling contains each episode.
@@ -84,7 +84,7 @@ class RatioEstimate:
         value, error = float(self.values(once)[0]), float(self.errors(once)[0])
         tails = np.array([50 * (1 - CONFIDENCE), 50 * (1 + CONFIDENCE)])
         resampled, errors = self.values(counts), self.errors(counts)
-        # Rounding errors are not standard errors.
+        # Ignore standard errors that are only rounding errors.
         known = errors > 1e-9 * max(abs(value), error, 1e-300)
         if known.mean() < 0.5:
             low, high = np.percentile(resampled, tails)
@@ -95,7 +95,7 @@ class RatioEstimate:
         return float(low), float(high)
 
     def degrees_of_freedom(self) -> float:
-        """Return those of the standard error: (sum_i m_i^2)^2 / sum_i m_i^4 - 1, at least 1.
+        """Return (sum_i m_i^2)^2 / sum_i m_i^4 - 1, at least 1, for the standard error.
 
         m_i is the change of the estimate due to episode i. Equal changes result in E - 1.
         """

@@ -41,7 +41,7 @@ class ValuePolicy(Protocol):
 def value_columns(
     policy: ValuePolicy, episode: Episode, action_space: spaces.Space[Any], gamma: float
 ) -> Columns:
-    """Return the fields of `recorder.format.schema.values_schema` for an episode, of length T.
+    """Return the fields (T, ...) of `recorder.format.schema.values_schema` for an episode.
 
     Args:
         policy: Policy to evaluate; if it has no Q-values, fields computed from them are NaN.
@@ -54,7 +54,7 @@ def value_columns(
         PolicyError: The observations do not fit the policy.
     """
     if not isinstance(action_space, spaces.Discrete):
-        raise UsageError(f"values are of discrete actions; the log's are {action_space}")
+        raise UsageError(f"values need discrete actions, got {action_space}")
     frames = _with_last(episode.observations, episode.next_observations)
     observations = _stacked(frames, getattr(policy, "frame_stack", 1))
     taken = episode.actions - int(action_space.start)
@@ -92,7 +92,7 @@ def td_errors(
         q: (T + 1, A) values at each observation, including the last next one.
         actions: (T,) actions taken, counted from 0.
         rewards: (T,) rewards.
-        terminated: (T,) steps after which the return ends.
+        terminated: (T,) whether the episode terminated at each step.
         gamma: Discount per step.
     """
     target = q_learning_target(

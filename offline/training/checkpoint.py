@@ -1,8 +1,8 @@
-"""Checkpoints from which a killed run resumes as if it had never been killed.
+"""Checkpoints; a run resumed from one has the same result as an uninterrupted run.
 
 `checkpoint.safetensors` contains one seed's tensors (weights, target network, optimizer,
-generator) and, in its header, the number of updates and the run's identity. One file holds both,
-because a kill between two writes could separate them.
+generator) and, in its header, the number of updates and the run's identity. Both are in one file,
+because a kill between two writes would leave them inconsistent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mcaprl.tensor_files import read_tensors, write_tensors
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The stored state of one seed.
+    """Stored state of one seed.
 
     Attributes:
         path: Path of the file.
@@ -36,7 +36,7 @@ class Checkpoint:
         """Load this state into a seed of a fresh learner.
 
         Raises:
-            TrainingError: The tensors are not the learner's.
+            TrainingError: The tensors do not match the learner.
         """
         try:
             learner.load_state(seed, self.tensors, self.step)

@@ -1,4 +1,4 @@
-"""Training on logs that grow because another process still records them."""
+"""Training on logs that another process is still recording."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 CHECK_INTERVAL = 500
-"""Updates between two checks of the logs; a larger dataset has to be packed again."""
+"""Number of updates between two checks of the logs; new episodes require packing all data again."""
 _POLL_S = 0.2
 
 
 class GrowingLogs:
-    """A reader of growing logs that reads each episode once, after it is finished.
+    """Reader of growing logs; each episode is read once, when it is finished.
 
     Attributes:
         dataset: Episodes read so far, in the order of reading; their numbers do not change.
@@ -33,10 +33,10 @@ class GrowingLogs:
 
         Args:
             data: Files, folders or globs; files that appear later are read as well.
-            patience_s: Longest time to wait in seconds.
+            patience_s: Maximum time to wait in seconds.
 
         Raises:
-            LogError: No episode was finished in that time, or a log is damaged.
+            LogError: No episode was finished within `patience_s`, or a log is damaged.
         """
         self._data = data
         self._counts: dict[Path, int] = {}
@@ -78,7 +78,7 @@ class GrowingLogs:
 
 
 def _state_of(path: Path) -> tuple[int, int, int]:
-    """Return what changes when a log grows, or when its writer replaces it by a compacted file."""
+    """Return inode, size and mtime, which change when a log grows or is compacted."""
     found = path.stat()
     return found.st_ino, found.st_size, found.st_mtime_ns
 
@@ -86,11 +86,11 @@ def _state_of(path: Path) -> tuple[int, int, int]:
 def with_more_data(
     learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
 ) -> Learner:
-    """Return the same learner at the same step, on a dataset that has grown.
+    """Return a learner with the same state on a dataset that has grown.
 
     Args:
         learner: Learner to continue.
-        dataset: Its dataset with more episodes appended.
+        dataset: Dataset of the learner with more episodes appended.
         held_out_episodes: Numbers of the held-out episodes.
     """
     weights = np.ones(len(dataset.episodes))

@@ -1,6 +1,6 @@
-"""Validation while training: held-out episodes, and warnings about diverging values.
+"""Validation during training: held-out episodes, and warnings about diverging values.
 
-Values are compared with the discounted sum of rewards that followed each transition.
+Values are compared with the Monte Carlo return of each transition.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 MAX_ROWS = 256
 """Number of transitions per validation, spread evenly over the held-out episodes."""
 MIN_HORIZON_FRACTION = 0.3
-"""Below this fraction of an infinite return, values hardly distinguish good from bad actions."""
+"""Fraction of an infinite return below which values hardly distinguish good from bad actions."""
 MAX_EXCESS = 2.0
 """Ratio of a mean value to the largest possible return above which values diverge."""
 _CUT_OFF = 0.05
-"""Largest weight of the rewards missing after a truncated episode."""
+"""Maximum discount of the rewards missing after a truncation."""
 
 
 class HeldOut:
@@ -66,7 +66,7 @@ class HeldOut:
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes: at least one of ten or more, never all.
+    """Choose about `fraction` of the episodes: at least one if there are ten, never all.
 
     The choice depends only on the number of episodes, so it is the same for all seeds.
     """
@@ -107,14 +107,14 @@ def monte_carlo_returns(
 
 
 def largest_return(dataset: Dataset, gamma: float) -> float:
-    """Return an upper bound on the absolute value of a discounted sum of these rewards."""
+    """Return an upper bound on the absolute discounted return of these rewards."""
     longest = float(dataset.episode_lengths.max())
     steps = longest if gamma == 1 else 1 / (1 - gamma)
     return float(np.abs(dataset.rewards).max()) * steps
 
 
 def horizon_warning(config: TrainingConfig) -> str | None:
-    """Return a warning about settings with too few target updates for their horizon, if any."""
+    """Return a warning if the settings have too few target updates for their horizon."""
     if not isinstance(config, BootstrapConfig) or config.horizon_fraction >= MIN_HORIZON_FRACTION:
         return None
     target_updates = config.updates // config.target_interval
@@ -126,10 +126,10 @@ def horizon_warning(config: TrainingConfig) -> str | None:
 
 
 def divergence_warning(before: float, value: float, limit: float) -> str | None:
-    """Return a warning about growing values beyond twice the largest possible return, if any.
+    """Return a warning if values grow beyond twice the largest possible return.
 
     Args:
-        before: Mean value of an earlier batch; fresh networks may start anywhere.
+        before: Mean value of an earlier batch; values of untrained networks can be large.
         value: Mean value of this batch.
         limit: Largest possible return.
     """

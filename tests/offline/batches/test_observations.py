@@ -178,7 +178,7 @@ def test_images_too_small_for_the_convolutions_are_refused(
 
 @pytest.mark.parametrize("shape", [(2,), (3, 3), (3, 1, 2), ()])
 def test_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
-    with pytest.raises(SpaceError, match=r"takes observations \(B, 2\), got"):
+    with pytest.raises(SpaceError, match=r"expects observations \(B, 2\), got"):
         ObservationEncoder(spaces.Box(-1, 1, (2,)), 2).encode(np.zeros(shape, np.float32))
 
 

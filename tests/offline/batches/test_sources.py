@@ -77,7 +77,7 @@ def test_a_missing_path_is_named_in_full() -> None:
 
 def test_other_spaces_are_refused() -> None:
     save(Path("wide.mcap"), 1, width=2)
-    with pytest.raises(SpaceError, match="do not fit together"):
+    with pytest.raises(SpaceError, match="differ in"):
         open_weighted(["logs", "wide.mcap"])
 
 
