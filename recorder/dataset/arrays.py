@@ -18,6 +18,8 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
+_END_FLAGS = ("terminated", "truncated")
+
 
 def columns_of_arrays(
     *,
@@ -62,8 +64,30 @@ def columns_of_arrays(
         "behavior_probs": _scalars("behavior_probs", probs, np.float32, steps),
     }
     lasts = _last_steps(columns["terminated"] | columns["truncated"], here, there)
-    transitions = _assemble(columns, here, there, lasts, description.step_duration_ns)
-    return transitions, description
+    after = lasts + 1
+    frames = tuple(
+        np.insert(observation, after, following[lasts], axis=0)
+        for observation, following in zip(here, there, strict=True)
+    )
+    summaries: list[EpisodeSummary] = []
+    for start, stop in zip([0, *after[:-1].tolist()], after.tolist(), strict=True):
+        terminated, truncated = (bool(columns[name][stop - 1]) for name in _END_FLAGS)
+        summary = EpisodeSummary(
+            episode=len(summaries),
+            length=stop - start,
+            total_reward=add_up(columns["rewards"][start:stop]),
+            terminated=terminated,
+            truncated=truncated,
+            start_time_ns=0,
+            end_time_ns=0,
+            reason="terminated" if terminated else "truncated" if truncated else "",
+        )
+        summaries.append(summary)
+    times = np.empty(steps + len(summaries), np.int64)
+    transitions = Transitions(
+        frames=frames, log_time_ns=times, episodes=tuple(summaries), **columns
+    )
+    return with_fresh_times(transitions, 0, description.step_duration_ns), description
 
 
 def _registered_spaces(
@@ -93,16 +117,10 @@ def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Trans
     return dataclasses.replace(columns, log_time_ns=times, episodes=episodes)
 
 
-def _reason(terminated: bool, truncated: bool) -> str:
-    """Return why an episode ended, according to its flags."""
-    return "terminated" if terminated else "truncated" if truncated else ""
-
-
 def _space_of(observations: Any) -> spaces.Space[Any]:
     if isinstance(observations, Mapping):
         return spaces.Dict([(key, _space_of(part)) for key, part in observations.items()])
-    array = np.asarray(observations)
-    return box_of(array)
+    return box_of(np.asarray(observations))
 
 
 def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
@@ -175,34 +193,3 @@ def _last_steps(
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
     """Return rows as bytes, so that NaN equals NaN."""
     return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)
-
-
-def _assemble(
-    columns: dict[str, NDArray[Any]],
-    here: list[NDArray[Any]],
-    there: list[NDArray[Any]],
-    lasts: NDArray[np.int64],
-    step_ns: int,
-) -> Transitions:
-    after = lasts + 1
-    frames = tuple(
-        np.insert(observation, after, following[lasts], axis=0)
-        for observation, following in zip(here, there, strict=True)
-    )
-    starts = np.concatenate([[0], after[:-1]])
-    episodes = tuple(
-        EpisodeSummary(
-            episode=number,
-            length=int(last - start + 1),
-            total_reward=add_up(columns["rewards"][start : last + 1]),
-            terminated=bool(columns["terminated"][last]),
-            truncated=bool(columns["truncated"][last]),
-            start_time_ns=0,
-            end_time_ns=0,
-            reason=_reason(columns["terminated"][last], columns["truncated"][last]),
-        )
-        for number, (start, last) in enumerate(zip(starts, lasts, strict=True))
-    )
-    times = np.empty(len(columns["rewards"]) + len(episodes), np.int64)
-    transitions = Transitions(frames=frames, log_time_ns=times, episodes=episodes, **columns)
-    return with_fresh_times(transitions, 0, step_ns)

@@ -16,7 +16,7 @@ from mcaprl.errors import LogError, SpaceError, UnknownNameError
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
-from mcaprl.recorder.dataset.transitions import TransitionBatch, Transitions
+from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of, nest, space_to_json
 
@@ -37,11 +37,7 @@ class Dataset:
     """
 
     def __init__(
-        self,
-        transitions: Transitions,
-        description: LogMetadata,
-        *,
-        sources: tuple[Path, ...] = (),
+        self, transitions: Transitions, description: LogMetadata, *, sources: tuple[Path, ...] = ()
     ) -> None:
         """Create a dataset; use `mcaprl.open` or `Dataset.from_arrays` instead."""
         self._transitions = transitions
@@ -142,12 +138,12 @@ class Dataset:
 
         Images on disk are read by indexing the array and by `batch`.
         """
-        return self._frames(self._frame_of_step)
+        return self._frames(self.frame_of_step)
 
     @cached_property
     def next_observations(self) -> Any:
         """Next observation of each transition, in the form of `observations`."""
-        return self._frames(self._frame_of_step + 1)
+        return self._frames(self.frame_of_step + 1)
 
     @property
     def storage(self) -> str:
@@ -165,7 +161,7 @@ class Dataset:
         """
         return nest(self._leaves, list(self._transitions.frames))
 
-    @property
+    @cached_property
     def frame_of_step(self) -> NDArray[np.int64]:
         """(N,) index k of each transition in `frames`: observation k, next observation k + 1."""
         return self._transitions.frame_of_step()
@@ -239,10 +235,20 @@ class Dataset:
     def episodes(self) -> tuple[Episode, ...]:
         """All episodes, in order."""
         columns = self._transitions
+        found: list[Episode] = []
         starts = zip(columns.first_steps.tolist(), columns.first_frames.tolist(), strict=True)
-        return tuple(
-            self._episode(index, step, frame) for index, (step, frame) in enumerate(starts)
-        )
+        for summary, (step, frame) in zip(columns.episodes, starts, strict=True):
+            last = frame + summary.length
+            episode = Episode(
+                index=len(found),
+                observations=self._frames(slice(frame, last)),
+                next_observations=self._frames(slice(frame + 1, last + 1)),
+                log_time_ns=columns.log_time_ns[frame : last + 1],
+                summary=summary,
+                **columns.at(slice(step, step + summary.length)),
+            )
+            found.append(episode)
+        return tuple(found)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -250,8 +256,8 @@ class Dataset:
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())
-        names = ("actions", "rewards", "terminated", "truncated", "behavior_probs", "lengths")
-        for array in (*columns.frames, *(getattr(columns, name) for name in names)):
+        steps = [getattr(columns, name) for name in STEP_COLUMNS]
+        for array in (*columns.frames, *steps, columns.lengths):
             for start in range(0, len(array), _BLOCK_ROWS):
                 digest.update(np.ascontiguousarray(array[start : start + _BLOCK_ROWS]).data)
         return digest.hexdigest()
@@ -274,15 +280,11 @@ class Dataset:
         Raises:
             CorruptLogError: Images on disk are damaged.
         """
-        columns, frames = self._transitions, self._frame_of_step[steps]
+        columns, frames = self._transitions, self.frame_of_step[steps]
         return TransitionBatch(
             observations=nest(self._leaves, [leaf[frames] for leaf in columns.frames]),
-            actions=columns.actions[steps],
-            rewards=columns.rewards[steps],
-            terminated=columns.terminated[steps],
-            truncated=columns.truncated[steps],
             next_observations=nest(self._leaves, [leaf[frames + 1] for leaf in columns.frames]),
-            behavior_probs=columns.behavior_probs[steps],
+            **columns.at(steps),
         )
 
     def split(self, fraction: float, *, seed: int = 0) -> tuple[Dataset, Dataset]:
@@ -361,36 +363,10 @@ class Dataset:
         )
 
     def _take(self, chosen: Sequence[int]) -> Dataset:
-        return Dataset(
-            self._transitions.take(chosen),
-            self._description,
-            sources=self.sources,
-        )
-
-    def _episode(self, index: int, step: int, frame: int) -> Episode:
-        columns = self._transitions
-        summary = columns.episodes[index]
-        steps = slice(step, step + summary.length)
-        frames = slice(frame, frame + summary.length)
-        return Episode(
-            index=index,
-            observations=self._frames(frames),
-            actions=columns.actions[steps],
-            rewards=columns.rewards[steps],
-            terminated=columns.terminated[steps],
-            truncated=columns.truncated[steps],
-            next_observations=self._frames(slice(frames.start + 1, frames.stop + 1)),
-            behavior_probs=columns.behavior_probs[steps],
-            log_time_ns=columns.log_time_ns[frame : frames.stop + 1],
-            summary=summary,
-        )
+        return Dataset(self._transitions.take(chosen), self._description, sources=self.sources)
 
     def _frames(self, rows: Any) -> Any:
         return nest(self._leaves, [rows_of(frames, rows) for frames in self._transitions.frames])
-
-    @cached_property
-    def _frame_of_step(self) -> NDArray[np.int64]:
-        return self._transitions.frame_of_step()
 
     def _name(self) -> str:
         return str(self.sources[0]) if self.sources else repr(self)

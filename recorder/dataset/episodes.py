@@ -51,7 +51,7 @@ def step_order(steps: Topic) -> NDArray[np.int64] | None:
     return order
 
 
-def episode_lengths(columns: Columns, where: str) -> NDArray[np.int64]:
+def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
     """Return the number of transitions of each finished episode.
 
     Args:

@@ -64,20 +64,15 @@ def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
     }
     parts |= {topic.removeprefix(_IMAGE_TOPIC): _image_space(reader, topic) for topic in images}
     metadata = LogMetadata(spaces.Dict(parts), action_space_of(action))
-    _check_names(reader, metadata, columns)
-    return metadata
-
-
-def _check_names(reader: McapReader, metadata: LogMetadata, columns: Columns) -> None:
-    """Check that each leaf of the space maps back to its own field or topic."""
+    # Each leaf of the space must map back to its own field or topic.
     for leaf in observation_leaves(metadata.observation_space):
-        is_there = reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns
-        if not is_there:
+        if not (reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns):
             raise LogError(
                 f"{reader.path}: the observation '{leaf.path[0]}' is not named"
                 f" {leaf.topic if leaf.encoding else leaf.name}; use lower-case letters, digits and"
                 " single underscores"
             )
+    return metadata
 
 
 def _image_space(reader: McapReader, topic: str) -> spaces.Box:

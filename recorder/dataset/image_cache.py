@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError
 from mcaprl.files import replacing
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.reading import McapReader, Topic, chunk_header
-from mcaprl.recorder.format.schema import fill_image_constants, image_dtype
-from mcaprl.recorder.format.spaces import IMAGE_ENCODINGS
-from mcaprl.recorder.format.topics import IMAGE_FRAME
-
-if TYPE_CHECKING:
-    from mcaprl.recorder.format.writing import McapWriter
+from mcaprl.recorder.format.reading import McapReader, chunk_header
+from mcaprl.recorder.format.rows import ImageRows
+from mcaprl.recorder.format.spaces import Leaf
+from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 
 Storage = Literal["auto", "memory", "mapped"]
 """`memory`, `mapped` (on disk), or `auto`: `mapped` above `MEMORY_SHARE` of the free memory."""
@@ -45,21 +42,21 @@ def free_memory_bytes() -> float:
 
 
 def image_cache(
-    reader: McapReader, topic: Topic, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
+    reader: McapReader, leaf: Leaf, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
 ) -> McapReader:
     """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
     Args:
         reader: Reader of the log.
-        topic: Topic of the images.
-        blocks: log_times and (K, height, width) or (K, height, width, channels) images of the whole
-            topic; consumed only if the copy has to be written.
+        leaf: Leaf of the images.
+        blocks: log_times and (K, *shape) images of the whole topic; consumed only if the copy has
+            to be written.
 
     Raises:
         LogError: The copy cannot be written.
     """
-    path = reader.path.with_name(f"{reader.path.name}.{topic.name.rpartition('/')[2]}.images")
-    description = {"fingerprint": fingerprint(reader), "topic": topic.name}
+    path = reader.path.with_name(f"{reader.path.name}.{leaf.name}.images")
+    description = {"fingerprint": fingerprint(reader), "topic": leaf.topic}
     if path.exists():
         try:
             cache = McapReader(path)
@@ -74,7 +71,12 @@ def image_cache(
         writer = McapWriter(unfinished, compression="none", overwrite=True)
         try:
             writer.add_metadata(CACHE_METADATA, description)
-            _write_blocks(writer, topic.name, blocks)
+            channel = writer.add_channel(leaf.topic, IMAGE_TYPE, messages.definition(IMAGE_TYPE))
+            rows = ImageRows.of_shape(
+                leaf.shape, leaf.encoding or "", channel, IMAGES_PER_CHUNK, writer.write_rows
+            )
+            for times, images in blocks:
+                rows.write_columns(times, {"data": images})
             writer.close()
         finally:
             writer.abandon()
@@ -92,26 +94,3 @@ def fingerprint(reader: McapReader) -> str:
     if not has_crcs:
         digest.update(str(reader.path.stat().st_mtime_ns).encode())
     return digest.hexdigest()
-
-
-def _write_blocks(
-    writer: McapWriter, topic: str, blocks: Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]
-) -> None:
-    from mcaprl.recorder.format.writing import message_rows
-
-    rows: NDArray[Any] | None = None
-    for times, images in blocks:
-        height, width, channels = (*images.shape[1:], 1)[:3]
-        if rows is None or len(rows) < len(images):
-            dtype = image_dtype(height, width, channels, IMAGE_ENCODINGS[channels], IMAGE_FRAME)
-            definition = messages.definition(IMAGE_TYPE)
-            channel = writer.add_channel(topic, IMAGE_TYPE, definition)
-            rows = message_rows(len(images), dtype, channel)
-            encoding = IMAGE_ENCODINGS[channels]
-            fill_image_constants(rows["payload"], height, width, encoding, IMAGE_FRAME)
-        chunk = rows[: len(images)]
-        chunk["log_time"] = times
-        sec, nanosec = np.divmod(times, 10**9)
-        chunk["payload"]["sec"], chunk["payload"]["nanosec"] = sec, nanosec
-        chunk["payload"]["data"] = images.reshape(len(chunk), -1)
-        writer.write_rows(chunk)

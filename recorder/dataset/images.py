@@ -43,8 +43,7 @@ def read_images(
     if not is_mapped(storage, len(times) * leaf.size):
         return images.read(images.order_at(times), threads)
     if not images.are_mappable:
-        cache = image_cache(reader, images.topic, images.blocks())
-        images = _Images(cache, leaf)
+        images = _Images(image_cache(reader, leaf, images.blocks()), leaf)
     return images.mapped(images.order_at(times))
 
 

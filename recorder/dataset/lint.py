@@ -36,12 +36,12 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
     counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
     for leaf in _leaves(dataset):
         if counts[leaf.name]:
-            places = _places(dataset, functools.partial(_frames, leaf))
+            places = _places(dataset, functools.partial(_bad_frames, leaf))
             what = f"{counts[leaf.name]} values of {leaf.name} are NaN or infinite"
             yield Problem(what, places, effect)
     bad = int((~np.isfinite(dataset.rewards)).sum())
     if bad:
-        places = _places(dataset, lambda episode: episode.rewards)
+        places = _places(dataset, lambda episode: ~np.isfinite(episode.rewards))
         yield Problem(f"{bad} rewards are NaN or infinite", places, effect)
 
 
@@ -68,10 +68,9 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
 def _impossible_actions(dataset: Dataset) -> Iterator[Problem]:
     wrong = outside(dataset.action_space, dataset.actions)
     if wrong.any():
-        flags = functools.partial(outside, dataset.action_space)
         yield Problem(
             f"{_count(int(wrong.sum()), 'action')} outside of {dataset.action_space}",
-            _places(dataset, lambda episode: np.where(flags(episode.actions), np.nan, 0.0)),
+            _places(dataset, lambda episode: outside(dataset.action_space, episode.actions)),
             "training rejects the dataset",
         )
 
@@ -184,9 +183,7 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
     if unknown:
         yield _note(
             f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
-            _places(
-                dataset, lambda episode: np.where(np.isnan(episode.behavior_probs), np.nan, 0.0)
-            ),
+            _places(dataset, lambda episode: np.isnan(episode.behavior_probs)),
             "off-policy evaluation by importance sampling is not possible",
         )
 
@@ -196,10 +193,7 @@ def _impossible_probabilities(dataset: Dataset) -> Iterator[Problem]:
     if impossible:
         yield Problem(
             f"behavior_prob is not in (0, 1] in {impossible} of {_count(len(dataset), 'step')}",
-            _places(
-                dataset,
-                lambda episode: np.where(is_impossible(episode.behavior_probs), np.nan, 0.0),
-            ),
+            _places(dataset, lambda episode: is_impossible(episode.behavior_probs)),
             "off-policy evaluation by importance sampling is not possible",
         )
 
@@ -234,10 +228,11 @@ def _leaves(dataset: Dataset) -> tuple[Leaf, ...]:
     return observation_leaves(dataset.observation_space)
 
 
-def _frames(leaf: Leaf, episode: Episode) -> NDArray[Any]:
-    """Return all observations of an episode, (T + 1, *shape)."""
+def _bad_frames(leaf: Leaf, episode: Episode) -> NDArray[np.bool_]:
+    """Return which values of an episode's observations (T + 1, *shape) are not finite."""
     last = leaf.of(episode.next_observations)[-1:]
-    return np.concatenate([leaf.of(episode.observations), last])
+    bad: NDArray[np.bool_] = ~np.isfinite(np.concatenate([leaf.of(episode.observations), last]))
+    return bad
 
 
 def _name(dataset: Dataset, leaf: Leaf, index: int) -> str:
@@ -252,13 +247,13 @@ def _arrays(observations: Any) -> list[NDArray[Any]]:
     return [observations]
 
 
-def _places(dataset: Dataset, column: Callable[[Episode], NDArray[Any]]) -> str:
-    """List the first steps whose values in a column are not finite."""
+def _places(dataset: Dataset, flags: Callable[[Episode], NDArray[np.bool_]]) -> str:
+    """List the first steps with a set flag."""
     found: list[str] = []
     for episode in dataset.episodes:
-        values = column(episode)
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
-        found += [f"episode {episode.index} step {step}" for step in np.flatnonzero(bad)[:_SHOWN]]
+        bad = flags(episode)
+        steps = np.flatnonzero(bad.reshape(len(bad), -1).any(1))[:_SHOWN]
+        found += [f"episode {episode.index} step {step}" for step in steps]
         if len(found) >= _SHOWN:
             break
     return ", ".join(found[:_SHOWN])

@@ -75,7 +75,7 @@ class LogReader:
         if self._steps.chunks_rise and int(listed.sum()) + len(listed) == len(self._steps):
             return listed
         self._check_fields(COUNTERS)
-        return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self._name))
+        return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self.path))
 
     def read(self, episodes: NDArray[np.int64] | None = None) -> Dataset:
         """Read whole episodes.
@@ -90,17 +90,13 @@ class LogReader:
         self._check_fields(wanted)
         if episodes is None:
             columns = self._steps.read(wanted, self._order, threads=self._selection.threads)
-            lengths = self._finished(episode_lengths(columns, self._name))
+            lengths = self._finished(episode_lengths(columns, self.path))
             frames = int(lengths.sum()) + len(lengths)
             columns = {name: column[:frames] for name, column in columns.items()}
         else:
             columns, lengths = self._read_some(episodes, wanted)
         metadata = self._metadata or inferred_metadata(self._reader, columns)
         return self._dataset(metadata, columns, lengths)
-
-    @property
-    def _name(self) -> str:
-        return str(self.path)
 
     @cached_property
     def _order(self) -> NDArray[np.int64] | None:
@@ -115,7 +111,7 @@ class LogReader:
         if not self._steps.chunks_rise and self._order is not None:
             rows = self._order[rows]
         columns = self._steps.read(wanted, rows, threads=self._selection.threads)
-        if not np.array_equal(episode_lengths(columns, self._name), lengths[episodes]):
+        if not np.array_equal(episode_lengths(columns, self.path), lengths[episodes]):
             raise CorruptLogError(
                 f"{self.path}: {EPISODE_TOPIC} and {STEP_TOPIC} contain different episodes"
             )

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 
+STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior_probs")
+"""The columns with one row per transition."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Transitions:
@@ -45,7 +48,7 @@ class Transitions:
     def __post_init__(self) -> None:
         """Check that the columns' lengths agree."""
         steps = sum(episode.length for episode in self.episodes)
-        for name in ("actions", "rewards", "terminated", "truncated", "behavior_probs"):
+        for name in STEP_COLUMNS:
             assert len(getattr(self, name)) == steps, f"{name} does not have {steps} rows"
         for frames in (*self.frames, self.log_time_ns):
             assert len(frames) == steps + len(self.episodes), "frames and episodes do not agree"
@@ -70,6 +73,10 @@ class Transitions:
         episode_of_step = np.repeat(np.arange(len(self.episodes)), self.lengths)
         return np.arange(len(self.rewards)) + episode_of_step
 
+    def at(self, steps: Any) -> dict[str, NDArray[Any]]:
+        """Return these rows of the `STEP_COLUMNS`, by name."""
+        return {name: getattr(self, name)[steps] for name in STEP_COLUMNS}
+
     def take(self, chosen: Sequence[int]) -> Transitions:
         """Copy the chosen episodes, in the given order."""
         rows = np.array(chosen, np.int64)
@@ -78,12 +85,8 @@ class Transitions:
         return Transitions(
             frames=tuple(rows_of(leaf, frames) for leaf in self.frames),
             log_time_ns=self.log_time_ns[frames],
-            actions=self.actions[steps],
-            rewards=self.rewards[steps],
-            terminated=self.terminated[steps],
-            truncated=self.truncated[steps],
-            behavior_probs=self.behavior_probs[steps],
             episodes=tuple(self.episodes[k] for k in chosen),
+            **self.at(steps),
         )
 
     @classmethod
@@ -91,7 +94,7 @@ class Transitions:
         """Concatenate the columns of several datasets."""
         if len(parts) == 1:
             return parts[0]
-        names = ("log_time_ns", "actions", "rewards", "terminated", "truncated", "behavior_probs")
+        names = ("log_time_ns", *STEP_COLUMNS)
         leaves = range(len(parts[0].frames))
         return cls(
             frames=tuple(joined([part.frames[leaf] for part in parts]) for leaf in leaves),
