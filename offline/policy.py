@@ -115,9 +115,11 @@ class Policy:
             PolicyError: The shape of the observations is not (B, *shape).
         """
         if self.frame_stack > 1 and not self._is_stack(observations):
-            best = self._greedy(self._stack_onto_stored(self._encode(observations)))
+            inputs = self._stack_onto_stored(self._encode(observations))
         else:
-            best = self._greedy(self._inputs(observations))
+            inputs = self._inputs(observations)
+        with torch.inference_mode():
+            best = cast(NDArray[np.int64], self.scores(inputs).argmax(1).numpy())
         return best + self.action_space.start
 
     def q_values(self, observations: Any) -> NDArray[np.float32]:
@@ -132,9 +134,8 @@ class Policy:
         if "q" not in self.scores.networks:
             raise PolicyError(f"{self.name} ({self.algo}) has no Q-values, only probabilities")
         with torch.inference_mode():
-            return cast(
-                NDArray[np.float32], self.scores.outputs("q", self._inputs(observations)).numpy()
-            )
+            values = self.scores.outputs("q", self._inputs(observations))
+            return cast(NDArray[np.float32], values.numpy())
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
         """Return the probabilities (B, A) of all actions.
@@ -154,13 +155,11 @@ class Policy:
             best = nn.functional.one_hot(scores.argmax(1), scores.shape[1])
             return cast(NDArray[np.float32], best.float().numpy())
 
-    def _greedy(self, observations: Observations) -> NDArray[np.int64]:
-        with torch.inference_mode():
-            return cast(NDArray[np.int64], self.scores(observations).argmax(1).numpy())
-
     def _is_stack(self, observations: Any) -> bool:
+        """Return whether these are stacks of observations (B, frame_stack, *shape)."""
         try:
-            return self.encoder.is_stack(observations, self.frame_stack)
+            shapes = [np.shape(leaf.of(observations))[1:] for leaf in self.encoder.leaves]
+            return shapes == [(self.frame_stack, *leaf.shape) for leaf in self.encoder.leaves]
         except (KeyError, IndexError, TypeError):
             return False
 

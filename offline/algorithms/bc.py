@@ -7,12 +7,11 @@ Pomerleau, "ALVINN: An Autonomous Land Vehicle in a Neural Network", 1988.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner
+from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import cross_entropy
 from mcaprl.offline.batches.buffer import Batch
 
@@ -26,9 +25,9 @@ class BC(Learner):
     """Classifier of actions whose softmax estimates the behavior policy of the log."""
 
     name = "bc"
-    config_type: ClassVar[type[TrainingConfig]] = BCConfig
-    acts_by: ClassVar[ActsBy] = "logits"
-    policy_models: ClassVar[tuple[str, ...]] = ("logits",)
+    config_type = BCConfig
+    acts_by = "logits"
+    policy_models = ("logits",)
     config: BCConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:

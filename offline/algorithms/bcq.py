@@ -12,14 +12,11 @@ synced at intervals instead of averaged; otherwise as in `dqn`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.dqn import DQN, DQNConfig
-from mcaprl.offline.algorithms.learner import ActsBy
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
     chosen,
@@ -53,9 +50,9 @@ class BCQ(DQN):
     """Q-learning that selects next actions only among likely ones."""
 
     name = "bcq"
-    config_type: ClassVar[type[TrainingConfig]] = BCQConfig
-    acts_by: ClassVar[ActsBy] = "filtered_q_values"
-    policy_models: ClassVar[tuple[str, ...]] = ("q", "logits")
+    config_type = BCQConfig
+    acts_by = "filtered_q_values"
+    policy_models = ("q", "logits")
     config: BCQConfig
 
     def output_shapes(self) -> dict[str, tuple[int, ...]]:

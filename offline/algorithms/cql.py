@@ -12,11 +12,9 @@ of Double DQN.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.dqn import DoubleDQN, DoubleDQNConfig
 from mcaprl.offline.algorithms.losses import (
     chosen,
@@ -44,7 +42,7 @@ class CQL(DoubleDQN):
     """Double DQN with a penalty on the values of actions that are not in the data."""
 
     name = "cql"
-    config_type: ClassVar[type[TrainingConfig]] = CQLConfig
+    config_type = CQLConfig
     config: CQLConfig
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
+from mcaprl.offline.algorithms.config import BootstrapConfig
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import (
     allowed_only,
@@ -64,7 +64,7 @@ class DQN(Learner):
     """Q-learning with a target network."""
 
     name = "dqn"
-    config_type: ClassVar[type[TrainingConfig]] = DQNConfig
+    config_type = DQNConfig
     acts_by: ClassVar[ActsBy] = "q_values"
     policy_models: ClassVar[tuple[str, ...]] = ("q",)
     config: DQNConfig
@@ -117,7 +117,7 @@ class DoubleDQN(DQN):
     """DQN in which the learning network selects the next action."""
 
     name = "double-dqn"
-    config_type: ClassVar[type[TrainingConfig]] = DoubleDQNConfig
+    config_type = DoubleDQNConfig
     config: DoubleDQNConfig
 
     @torch.no_grad()

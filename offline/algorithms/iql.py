@@ -16,13 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from mcaprl.offline.algorithms.config import BootstrapConfig, TrainingConfig
-from mcaprl.offline.algorithms.learner import ActsBy, Learner
+from mcaprl.offline.algorithms.config import BootstrapConfig
+from mcaprl.offline.algorithms.learner import Learner
 from mcaprl.offline.algorithms.losses import (
     chosen,
     cross_entropy,
@@ -58,9 +57,9 @@ class IQL(Learner):
     """Implicit Q-learning: expectile values and a policy by advantage-weighted behavior cloning."""
 
     name = "iql"
-    config_type: ClassVar[type[TrainingConfig]] = IQLConfig
-    acts_by: ClassVar[ActsBy] = "logits"
-    policy_models: ClassVar[tuple[str, ...]] = ("logits", "q")
+    config_type = IQLConfig
+    acts_by = "logits"
+    policy_models = ("logits", "q")
     config: IQLConfig
 
     def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:

@@ -131,7 +131,12 @@ class TransitionBuffer:
         counts = lengths + 1
         places, returns = _n_step(dataset, packing)
         frames = encoder.encode(dataset.frames)
-        actions = _counted_from_zero(dataset.actions, action_space)
+        actions = dataset.actions.astype(np.int64) - int(action_space.start)
+        if actions.min() < 0 or actions.max() >= action_space.n:
+            raise SpaceError(
+                f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
+                f" its action space is {action_space}"
+            )
         _check_finite("rewards", torch.from_numpy(returns[0]))
         _check_data(dataset, frames, actions)
         buffer = cls(
@@ -290,13 +295,3 @@ def _check_finite(column: str, values: Tensor) -> None:
     if not finite.all():
         row = int(finite.int().argmin())
         raise TrainingError(f"{column} of row {row} have NaN or infinite numbers")
-
-
-def _counted_from_zero(actions: NDArray[Any], space: spaces.Discrete) -> NDArray[np.int64]:
-    indices = actions.astype(np.int64) - int(space.start)
-    if indices.min() < 0 or indices.max() >= space.n:
-        raise SpaceError(
-            f"the dataset has actions from {actions.min()} to {actions.max()}, "
-            f"its action space is {space}"
-        )
-    return indices

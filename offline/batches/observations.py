@@ -157,7 +157,7 @@ class ObservationEncoder:
         if self.mask is not None and self.mask.shape != (n_actions,):
             shape = self.mask.shape
             raise SpaceError(f"{MASK_KEY} has shape {shape}, there are {n_actions} actions")
-        kinds = [(leaf, _part_of(space, leaf.path)) for leaf in leaves.values()]
+        kinds = [(leaf, leaf.of(space)) for leaf in leaves.values()]
         self.images = [leaf for leaf, part in kinds if _is_image(part)]
         self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]
         if not kinds:
@@ -199,21 +199,11 @@ class ObservationEncoder:
         for leaf in self.leaves:
             _check_shape(leaf, observations)
         images = [
-            torch.from_numpy(np.require(leaf.of(observations), np.uint8, ["C", "W"]))
-            for leaf in self.images
+            _tensor(leaf.of(observations), np.uint8).reshape(-1, *image.shape)
+            for leaf, image in zip(self.images, self.image_inputs, strict=True)
         ]
-        shaped = zip(images, self.image_inputs, strict=True)
-        return Observations(
-            torch.from_numpy(np.require(self._vector(observations), np.float32, ["C", "W"])),
-            tuple(image.reshape(-1, *wanted.shape) for image, wanted in shaped),
-            self._allowed(observations),
-        )
-
-    def is_stack(self, observations: Any, count: int) -> bool:
-        """Return whether these are stacks of observations (B, count, *shape)."""
-        return all(
-            np.shape(leaf.of(observations))[1:] == (count, *leaf.shape) for leaf in self.leaves
-        )
+        vector = _tensor(self._vector(observations), np.float32)
+        return Observations(vector, tuple(images), self._allowed(observations))
 
     @property
     def leaves(self) -> list[Leaf]:
@@ -256,13 +246,6 @@ def _is_image(space: spaces.Space[Any]) -> bool:
     return True
 
 
-def _part_of(space: spaces.Space[Any], path: tuple[str, ...]) -> spaces.Space[Any]:
-    for key in path:
-        assert isinstance(space, spaces.Dict)
-        space = space[key]
-    return space
-
-
 def discrete_sizes(space: spaces.Space[Any]) -> NDArray[np.int64] | None:
     """Return the sizes of a Discrete or MultiDiscrete space; None for other spaces."""
     if isinstance(space, spaces.Discrete):
@@ -289,6 +272,10 @@ def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
         np.eye(n, dtype=np.float32)[column] for n, column in zip(sizes, counted.T, strict=True)
     ]
     return np.concatenate(codes, 1)
+
+
+def _tensor(array: Any, dtype: Any) -> Tensor:
+    return torch.from_numpy(np.require(array, dtype, ["C", "W"]))
 
 
 def _check_shape(leaf: Leaf, observations: Any) -> None:
