@@ -12,6 +12,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex, DataEnd, McapRecord
 
 from mcaprl.errors import LogError
+from mcaprl.files import is_at
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.chunks import MAX_CHUNK_BYTES, ChunkHeader
 from mcaprl.recorder.columns.file_lock import release
@@ -35,6 +36,10 @@ class OutputFile:
         """Start at the beginning of an empty file."""
         self.path, self._file = path, file
         self.position, self._crc, self._summary, self._data_end = 0, 0, Summary(), 0
+
+    def is_at(self, path: Path) -> bool:
+        """Return whether the open file is the one at a path."""
+        return is_at(self._file.fileno(), path)
 
     def abandon(self) -> None:
         """Close the file without a summary; do nothing if it is closed."""
