@@ -9,6 +9,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal, TypeVar
 
@@ -117,13 +118,10 @@ def _work(
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
         if sys.platform != "win32":
             signal.pthread_sigmask(signal.SIG_UNBLOCK, _STOPS)
-        task(request, lambda content: to.send(("message", content)))
+        task(request, partial(_send, to))
         outcome = "done", None
     except KeyboardInterrupt:
         outcome = "interrupted", None
-    except BrokenPipeError:
-        # The parent was killed.
-        return
     except Exception as error:
         if not isinstance(error, McaprlError | OSError):
             error.add_note(f"in a worker process:\n{traceback.format_exc()}")
@@ -131,6 +129,14 @@ def _work(
     _ignore_stops()
     with suppress(BrokenPipeError):
         to.send(outcome)
+
+
+def _send(to: Connection, content: Any) -> None:
+    try:
+        to.send(("message", content))
+    except BrokenPipeError:
+        # The parent was killed.
+        _interrupt_once()
 
 
 def _end_with(parent: Connection) -> None:

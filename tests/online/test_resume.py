@@ -265,7 +265,7 @@ def test_a_broken_checkpoint_is_reported(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_run_is_reported(tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"algo": "cql", "config": {}}))
-    with pytest.raises(TrainingError, match="is not of an online run"):
+    with pytest.raises(TrainingError, match="an online run"):
         Task.of_run(tmp_path)
     (tmp_path / "config.json").write_text("[]")
     with pytest.raises(TrainingError, match="is not a JSON object"):
