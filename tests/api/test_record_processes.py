@@ -110,8 +110,8 @@ def test_a_killed_worker_is_one_line_and_the_other_shard_is_whole(tmp_path: Path
     assert len(killed) == 1
     with pytest.warns(UserWarning, match="not finished|cut off|still being written"):
         episodes = len(mcaprl.open(killed[0]).episodes)
-    told = int(line.partition("; the ")[2].split()[0])
-    assert 10 < told <= episodes
+    reported = int(line.partition("; the ")[2].split()[0])
+    assert 10 < reported <= episodes
 
 
 @needs_proc

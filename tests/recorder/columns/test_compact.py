@@ -18,6 +18,7 @@ from mcap.records import ChunkIndex
 
 import mcaprl
 from mcaprl.errors import LogError
+from mcaprl.files import is_at, try_lock
 from mcaprl.recorder.columns import compact, file_lock
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.repair.check import check_log
@@ -233,7 +234,7 @@ def test_a_writer_that_opened_the_old_file_gets_the_new_one(
 ) -> None:
     """Between its open and its lock, the file may be replaced, and the lock of the old one free."""
     write_log(log_path, 2)
-    locked = file_lock.try_lock
+    locked = try_lock
     copy = log_path.read_bytes()
     once = [True]
 
@@ -247,7 +248,7 @@ def test_a_writer_that_opened_the_old_file_gets_the_new_one(
 
     monkeypatch.setattr(file_lock, "try_lock", replaced)
     file = file_lock.reopen(log_path)
-    assert file_lock.is_at(file.fileno(), log_path)
+    assert is_at(file.fileno(), log_path)
     file_lock.release(file)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -238,7 +239,7 @@ def test_image_table(log_path: Path) -> None:
 
 def test_arrays_of_a_registered_environment_have_its_spaces() -> None:
     env = gym.make("CartPole-v1")
-    arrays = {
+    arrays: dict[str, Any] = {
         "observations": np.zeros((3, 4)),
         "next_observations": np.zeros((3, 4)),
         "actions": np.zeros(3, np.int64),

@@ -94,7 +94,7 @@ def test_a_log_that_is_being_recorded_is_not_replaced(
     tmp_path: Path, write: Callable[[Path], None]
 ) -> None:
     target = tmp_path / "target.mcap"
-    options = {"max_file_bytes": 10**9} if write is rotate_to else {}
+    options: dict[str, Any] = {"max_file_bytes": 10**9} if write is rotate_to else {}
     recorded = tmp_path / "target-00000.mcap" if options else target
     with closing(mcaprl.RecordMcap(KnownEpisodes(), target, **options)) as env:
         play(env)
