@@ -112,12 +112,7 @@ class ChunkHeader(NamedTuple):
         return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
     def to_index(self, offset: int, content_bytes: int) -> ChunkIndex:
-        """Return a ChunkIndex of the chunk that lists no message indexes.
-
-        Args:
-            offset: First byte of the Chunk record.
-            content_bytes: Length of the content of the Chunk record.
-        """
+        """Return a ChunkIndex without message indexes of the Chunk record at `offset`."""
         return ChunkIndex(
             chunk_start_offset=offset,
             chunk_length=RECORD_HEADER_BYTES + content_bytes,
@@ -241,10 +236,7 @@ class Scratch:
 def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None) -> memoryview:
     """Return the records of the chunk at `offset`, decompressed and checked against their CRC.
 
-    Args:
-        file: Bytes of the file.
-        offset: First byte of the Chunk record.
-        scratch: Memory for the records, which are valid until its next use. Default: new memory.
+    They are valid until the next use of `scratch`, by default new memory.
 
     Raises:
         CorruptLogError: The chunk is damaged, or its decompressed size does not match its header.

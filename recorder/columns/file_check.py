@@ -34,12 +34,7 @@ def place(reader: McapReader, chunk: ChunkIndex) -> str:
 
 
 def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> list[Problem]:
-    """Compare a chunk with its header, its message indexes, and its entry in the summary.
-
-    Args:
-        reader: File of the chunk.
-        chunk: Element of `reader.chunks`.
-        records: Decompressed records of the chunk.
+    """Compare the records of a chunk with its header, its indexes, and its entry in the summary.
 
     Raises:
         CorruptLogError: An index or a record is damaged.
@@ -100,18 +95,15 @@ def check_statistics(reader: McapReader) -> list[Problem]:
     Raises:
         CorruptLogError: An index is damaged.
     """
-    found = []
-    if not reader.summary_start:
-        return []
-    for _, opcode, content in reader.records(reader.summary_start):
-        if opcode != Opcode.STATISTICS:
-            continue
-        listed: Statistics = parse_record(opcode, content)
+    records = reader.records(reader.summary_start) if reader.summary_start else ()
+    triples: list[tuple[str, int, int]] = []
+    for content in (content for _, opcode, content in records if opcode == Opcode.STATISTICS):
+        listed: Statistics = parse_record(Opcode.STATISTICS, content)
         counts = {
             channel_id: sum(map(len, reader.message_ranges(channel)))
             for channel_id, channel in reader.channels.items()
         }
-        triples = [
+        triples += [
             ("messages", listed.message_count, sum(counts.values())),
             ("chunks", listed.chunk_count, len(reader.chunks)),
             ("channels", listed.channel_count, len(reader.channels)),
@@ -121,12 +113,11 @@ def check_statistics(reader: McapReader) -> list[Problem]:
             for id_, count in listed.channel_message_counts.items()
             if id_ in counts
         ]
-        found += [
-            Problem(f"the summary counts {wrong} {name}, the file {count}", "the summary")
-            for name, wrong, count in triples
-            if wrong != count
-        ]
-    return found
+    return [
+        Problem(f"the summary counts {wrong} {name}, the file {count}", "the summary")
+        for name, wrong, count in triples
+        if wrong != count
+    ]
 
 
 def _wrong_indexes(
@@ -149,12 +140,8 @@ def check_file(reader: McapReader) -> list[Problem]:
     """Check the presence of a summary and the CRCs of the data section and attachments."""
     found = []
     if not reader.complete:
-        found.append(
-            Problem(
-                "the file has no summary: its writer was killed or is still running",
-                f"after byte {reader.data_end}",
-            )
-        )
+        what = "the file has no summary: its writer was killed or is still running"
+        found.append(Problem(what, f"after byte {reader.data_end}"))
     end = None
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
         if opcode == Opcode.ATTACHMENT and not is_intact_attachment(content):

@@ -26,9 +26,7 @@ _COPIED_BYTES = 2**20
 def create(path: Path, *, overwrite: bool) -> FileIO:
     """Create and lock a file and the missing folders of its path.
 
-    Args:
-        path: Path of the file.
-        overwrite: Whether to replace an existing file; its readers keep the old contents.
+    Readers of a file that is overwritten keep the old contents.
 
     Raises:
         OutputExistsError: The file exists, and `overwrite` is not set; or it is not a regular file.

@@ -140,15 +140,10 @@ class MessageRange:
 
 
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the messages of index entries as one structured array.
+    """Return the messages of `INDEX_ENTRY` entries as one structured array of a `record_dtype`.
 
     Adjacent messages are not copied. Others are copied by fancy indexing of void items, at the
     speed of memcpy; fancy indexing of structured items takes twenty times as long.
-
-    Args:
-        records: Uncompressed records of a chunk.
-        index: Entries of `INDEX_ENTRY`.
-        dtype: `record_dtype` of the payload.
 
     Raises:
         CorruptLogError: An entry points outside of the chunk.

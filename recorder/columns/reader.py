@@ -348,16 +348,10 @@ class McapReader:
         chunk: ChunkIndex | None,
         unchunked: UnindexedMessages,
     ) -> list[ChunkIndex]:
-        """Read a part of the data section and return its chunks.
+        """Read a part of the data section, by default the rest, and return its chunks.
 
-        Args:
-            start: First byte.
-            stop: First byte after the part; None for the end of the section.
-            chunk: Chunk before the part; message indexes at the start of the part belong to it.
-            unchunked: Collection to which messages outside of chunks are added.
-
-        Raises:
-            CorruptLogError: A file with a summary has an incomplete record in this part.
+        Message indexes at the start of the part belong to `chunk`, the one before the part.
+        Messages outside of chunks are added to `unchunked`.
         """
         self.data_end, found = start, []
         for offset, opcode, content in records_of(self.view, start, stop):

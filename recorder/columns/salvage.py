@@ -53,12 +53,7 @@ class Damage:
 
 
 def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidRecord]:
-    """Yield offset, opcode and content of each valid record of the data section.
-
-    Args:
-        view: Content of the file.
-        damages: List to which the bytes between valid records are added.
-    """
+    """Yield the valid records of the data section; add the bytes between them to `damages`."""
     offset = len(MCAP0_MAGIC)
     if bytes(view[:offset]) != MCAP0_MAGIC:
         damages.append(Damage(0, min(offset, len(view)), "no magic bytes"))

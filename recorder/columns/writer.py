@@ -161,9 +161,8 @@ class McapWriter(OutputFile):
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write messages of one channel and length as one chunk.
 
-        Args:
-            rows: Array of `message_rows.record_dtype` with log_time. This function sets sequence
-                numbers and publish times.
+        `rows` is an array of `message_rows.record_dtype` with log_time; this function sets its
+        sequence numbers and publish times.
         """
         if len(rows) == 0:
             return
@@ -184,11 +183,7 @@ class McapWriter(OutputFile):
         )
 
     def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
-        """Write messages of any channels and lengths as one chunk.
-
-        Args:
-            messages: Channel id, log_time in nanoseconds, and CDR bytes of each message.
-        """
+        """Write messages (channel id, log_time in nanoseconds, CDR bytes) as one chunk."""
         if not messages:
             return
         records = bytearray()

@@ -19,50 +19,52 @@ from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
 
 _END_FLAGS = ("terminated", "truncated")
+_SCALARS = {
+    "rewards": np.float64,
+    "terminated": np.bool_,
+    "truncated": np.bool_,
+    "behavior_probs": np.float32,
+}
 
 
-def columns_of_arrays(
-    *,
+def description_of(
+    env_id: str,
     observations: Any,
     actions: Any,
-    rewards: Any,
-    terminated: Any,
-    truncated: Any,
-    next_observations: Any,
-    behavior_probs: Any,
-    env_id: str,
     observation_space: spaces.Space[Any] | None,
     action_space: spaces.Space[Any] | None,
-) -> tuple[Transitions, LogMetadata]:
-    """Return the columns and metadata of arrays; arguments are those of `Dataset.from_arrays`.
-
-    Raises:
-        SpaceError: Lengths or shapes do not agree with each other or with the spaces.
-    """
+) -> LogMetadata:
+    """Return the metadata of arrays; see `Dataset.from_arrays`."""
     if observation_space is None and action_space is None:
         observation_space, action_space = _registered_spaces(env_id, observations)
-    description = LogMetadata(
+    return LogMetadata(
         observation_space=observation_space or _space_of(observations),
         action_space=action_space or action_space_of(np.asarray(actions)),
         env_id=env_id,
         versions=installed_versions(),
     )
-    steps = len(np.atleast_1d(np.asarray(rewards)))
+
+
+def columns_of_arrays(
+    description: LogMetadata, observations: Any, next_observations: Any, given: Mapping[str, Any]
+) -> Transitions:
+    """Return the columns of arrays, `given` by the names of `STEP_COLUMNS`.
+
+    Raises:
+        SpaceError: Lengths or shapes do not agree with each other or with the spaces.
+    """
+    steps = len(np.atleast_1d(np.asarray(given["rewards"])))
     if steps == 0:
         raise SpaceError("no transitions: the arrays are empty")
     leaves = observation_leaves(description.observation_space)
     here = [_leaf_array("observations", observations, leaf, steps) for leaf in leaves]
     there = [_leaf_array("next_observations", next_observations, leaf, steps) for leaf in leaves]
+    if given["behavior_probs"] is None:
+        given = {**given, "behavior_probs": np.full(steps, np.nan, np.float32)}
     action = action_leaf(description.action_space)
-    unknown = np.full(steps, np.nan, np.float32)
-    probs = unknown if behavior_probs is None else behavior_probs
-    columns = {
-        "actions": _leaf_array("actions", actions, action, steps),
-        "rewards": _scalars("rewards", rewards, np.float64, steps),
-        "terminated": _scalars("terminated", terminated, np.bool_, steps),
-        "truncated": _scalars("truncated", truncated, np.bool_, steps),
-        "behavior_probs": _scalars("behavior_probs", probs, np.float32, steps),
-    }
+    columns = {"actions": _leaf_array("actions", given["actions"], action, steps)}
+    for name, dtype in _SCALARS.items():
+        columns[name] = _scalars(name, given[name], dtype, steps)
     lasts = _last_steps(columns["terminated"] | columns["truncated"], here, there)
     after = lasts + 1
     frames = tuple(
@@ -87,7 +89,7 @@ def columns_of_arrays(
     transitions = Transitions(
         frames=frames, log_time_ns=times, episodes=tuple(summaries), **columns
     )
-    return with_fresh_times(transitions, 0, description.step_duration_ns), description
+    return with_fresh_times(transitions, 0, description.step_duration_ns)
 
 
 def _registered_spaces(

@@ -85,20 +85,14 @@ class Calibration:
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON object that commands print."""
-        ranges = [vars(one) for one in self.ranges]
-        mine = {"available": self.available, "actions": self.actions, "error": self.error}
-        mine |= {"smallest": self.smallest}
-        return {**mine, "possible": self.possible, "ranges": ranges}
+        found = {name: vars(self)[name] for name in ("available", "actions", "error", "smallest")}
+        return {**found, "possible": self.possible, "ranges": [vars(one) for one in self.ranges]}
 
 
 def calibration(
     behavior_probs: NDArray[np.floating], action_space: spaces.Space[Any]
 ) -> Calibration | None:
-    """Estimate the calibration of logged probabilities.
-
-    Args:
-        behavior_probs: (N,) probability of each action taken.
-        action_space: Space of the actions.
+    """Estimate the calibration of the logged probabilities (N,) of the actions taken.
 
     Returns:
         None if the actions are not discrete, or a probability is unknown or not in (0, 1].
@@ -118,15 +112,9 @@ def calibration(
         )
         for k in np.unique(place)
     ]
+    actions, smallest = float(inverse.mean()), float(probs.min())
     error = float(inverse.std(ddof=1) / math.sqrt(len(inverse)))
-    return Calibration(
-        int(action_space.n),
-        float(inverse.mean()),
-        error,
-        float(probs.min()),
-        len(probs),
-        tuple(ranges),
-    )
+    return Calibration(int(action_space.n), actions, error, smallest, len(probs), tuple(ranges))
 
 
 def _number(value: float) -> str:

@@ -83,20 +83,12 @@ class Dataset:
         Raises:
             SpaceError: Lengths or shapes do not agree with each other or with the spaces.
         """
-        from mcaprl.recorder.dataset.arrays import columns_of_arrays
+        from mcaprl.recorder.dataset.arrays import columns_of_arrays, description_of
 
-        transitions, description = columns_of_arrays(
-            observations=observations,
-            actions=actions,
-            rewards=rewards,
-            terminated=terminated,
-            truncated=truncated,
-            next_observations=next_observations,
-            behavior_probs=behavior_probs,
-            env_id=env_id,
-            observation_space=observation_space,
-            action_space=action_space,
-        )
+        description = description_of(env_id, observations, actions, observation_space, action_space)
+        steps = (actions, rewards, terminated, truncated, behavior_probs)
+        columns = dict(zip(STEP_COLUMNS, steps, strict=True))
+        transitions = columns_of_arrays(description, observations, next_observations, columns)
         return cls(transitions, description)
 
     @classmethod
@@ -272,10 +264,7 @@ class Dataset:
         return self._take([episode.index for episode in self.episodes if keep(episode)])
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
-        """Copy a batch of transitions, reading images from disk if needed.
-
-        Args:
-            steps: (B,) indexes of the transitions.
+        """Copy the transitions with indexes (B,), reading images from disk if needed.
 
         Raises:
             CorruptLogError: Images on disk are damaged.

@@ -141,11 +141,7 @@ def summaries(
 ) -> tuple[EpisodeSummary, ...]:
     """Return a summary of each episode, computed from its records if not recorded.
 
-    Args:
-        path: Path of the log for error messages.
-        columns: Columns of `/rl/step`.
-        lengths: (E,) number of transitions of each episode.
-        recorded: Summaries from `/rl/episode`.
+    `lengths` (E,) are the numbers of transitions, `recorded` the summaries from `/rl/episode`.
 
     Raises:
         CorruptLogError: A recorded summary disagrees with the records.

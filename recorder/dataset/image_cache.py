@@ -46,11 +46,7 @@ def image_cache(
 ) -> McapReader:
     """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
-    Args:
-        reader: Reader of the log.
-        leaf: Leaf of the images.
-        blocks: log_times and (K, *shape) images of the whole topic; consumed only if the copy has
-            to be written.
+    The log_times and (K, *shape) images of the whole topic are consumed only to write the copy.
 
     Raises:
         LogError: The copy cannot be written.

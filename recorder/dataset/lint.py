@@ -47,9 +47,7 @@ def _not_finite(dataset: Dataset) -> Iterator[Problem]:
 
 def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
     for leaf in _leaves(dataset):
-        space: Any = dataset.observation_space
-        for key in leaf.path:
-            space = space[key]
+        space = leaf.of(dataset.observation_space)
         if not isinstance(space, spaces.Box) or leaf.encoding is not None:
             continue
         column = dataset.statistics.observations[leaf.name]

@@ -30,12 +30,8 @@ class ImageFile:
     ) -> None:
         """Create a view of the file's images without reading them.
 
-        Args:
-            name: Name of the file.
-            view: Bytes of the whole file.
-            image_bytes: Size of one image in bytes.
-            checks: Function of each chunk that raises an error if the chunk is damaged.
-            check_unchanged: Function that raises an error if the file was changed in place.
+        A function of `checks` raises an error if its chunk is damaged, `check_unchanged` if the
+        file was changed in place.
         """
         self.name, self._check_unchanged = name, check_unchanged
         bytes_ = np.frombuffer(view, np.uint8)
@@ -49,11 +45,7 @@ class ImageFile:
         self._is_checked = np.zeros(len(checks), bool)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Copy the images at these byte offsets.
-
-        Args:
-            offsets: (K,) byte offsets in the file.
-            chunks: (K,) index of each image's chunk.
+        """Copy the images at byte offsets (K,), in chunks with indexes (K,).
 
         Raises:
             CorruptLogError: A chunk is damaged.
@@ -83,12 +75,9 @@ class MappedImages:
         shape: tuple[int, ...],
         places: NDArray[np.int64],
     ) -> None:
-        """Create an array of images without reading them.
+        """Create an array of images of one shape without reading them.
 
-        Args:
-            files: Files that contain the images.
-            shape: Shape of one image.
-            places: (F, 3) index of the file, index of the chunk in the file, and byte offset.
+        `places` (F, 3) are index of the file, index of the chunk in the file, and byte offset.
         """
         self._files, self._places = tuple(files), places
         self.shape = (len(places), *shape)

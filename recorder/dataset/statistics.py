@@ -109,17 +109,12 @@ def _describe(leaf: Leaf, frames: Frames) -> Column:
 
 def _describe_image(frames: Frames) -> Column:
     """Compute statistics from a histogram of the pixels, to avoid float copies of the images."""
+    if not len(frames):
+        unknown = np.full(1, np.nan)
+        return Column(unknown, unknown, unknown, unknown, not_finite=0)
     counts = sum((np.bincount(frame.ravel(), minlength=256) for frame in frames), np.zeros(256))
     codes = np.arange(256.0)
-    seen = codes[counts > 0] if len(frames) else np.full(1, np.nan)
-    if not len(frames):
-        return Column(mean=seen, std=seen, low=seen, high=seen, not_finite=0)
+    seen = codes[counts > 0]
     mean = float((codes * counts).sum() / counts.sum())
     variance = float(((codes - mean) ** 2 * counts).sum() / counts.sum())
-    return Column(
-        mean=np.array([mean]),
-        std=np.array([variance**0.5]),
-        low=seen[:1],
-        high=seen[-1:],
-        not_finite=0,
-    )
+    return Column(np.array([mean]), np.array([variance**0.5]), seen[:1], seen[-1:], not_finite=0)
