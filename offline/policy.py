@@ -125,8 +125,7 @@ class Policy:
     def q_values(self, observations: Any) -> NDArray[np.float32]:
         """Return the values (B, A) of all actions; minus infinity for masked actions.
 
-        Args:
-            observations: (B, *shape), or (B, k, *shape) for a frame stack of k.
+        Observations are (B, *shape), or (B, k, *shape) for a frame stack of k.
 
         Raises:
             PolicyError: The policy has no values, or the observations have another shape.
@@ -141,9 +140,7 @@ class Policy:
         """Return the probabilities (B, A) of all actions.
 
         A policy that selects by Q-values is greedy: the action of `act` has probability 1.
-
-        Args:
-            observations: (B, *shape), or (B, k, *shape) for a frame stack of k.
+        Observations are (B, *shape), or (B, k, *shape) for a frame stack of k.
 
         Raises:
             PolicyError: The observations have another shape.

@@ -128,20 +128,11 @@ class TargetNetwork:
     """
 
     def __init__(
-        self,
-        model: Model,
-        buffer: TransitionBuffer,
-        rows_per_sync: int,
-        *,
-        next_states: bool = True,
+        self, model: Model, buffer: TransitionBuffer, rows_per_sync: int, *, next_states: bool
     ) -> None:
-        """Copy `model`.
+        """Copy `model`, to evaluate a buffer's states or next states.
 
-        Args:
-            model: Learning model.
-            buffer: Training data.
-            rows_per_sync: Approximate number of rows per seed between two calls of `sync`.
-            next_states: Whether to evaluate the next states instead of the states.
+        `rows_per_sync` is the approximate number of rows per seed between two calls of `sync`.
         """
         self.model = model.clone()
         self._buffer = buffer

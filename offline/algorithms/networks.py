@@ -48,11 +48,7 @@ class Network(nn.Module):
     ) -> None:
         """Build the layers, with random weights.
 
-        Args:
-            vector_width: Length of the vector; 0 if there is none.
-            images: Shape and normalization of each image.
-            output_shape: Shape of the outputs for one observation; (A, ...) for A actions.
-            architecture: Architecture of the network.
+        `vector_width` is 0 if there is no vector; `output_shape` is (A, ...) for A actions.
         """
         super().__init__()
         self.output_shape = output_shape

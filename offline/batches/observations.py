@@ -113,10 +113,8 @@ class ImageInput:
     def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
         """Return the input with the mean image as shift and the standard deviation as scale.
 
-        All pixels share one scale, so pixels that hardly change stay small.
-
-        Args:
-            images: Images, (N, height, width) or (N, height, width, channels), N at least 1.
+        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale,
+        so pixels that hardly change stay small.
         """
         used = np.linspace(0, len(images) - 1, min(len(images), _MAX_IMAGES)).astype(np.int64)
         total = np.zeros(self.shape)
@@ -188,10 +186,7 @@ class ObservationEncoder:
         self.scale = np.where(constant, scale, deviation).astype(np.float32)
 
     def encode(self, observations: Any) -> Observations:
-        """Encode B observations of the space.
-
-        Args:
-            observations: Arrays (B, *shape), or nested dicts of such arrays.
+        """Encode B observations of the space: arrays (B, *shape), or nested dicts of these.
 
         Raises:
             SpaceError: The observations have other shapes.
