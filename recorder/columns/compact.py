@@ -181,11 +181,7 @@ class _CompactedFile(OutputFile):
         )
 
     def _merge(
-        self,
-        view: memoryview,
-        group: list[ChunkIndex],
-        compressors: Compressors,
-        scratch: Scratch,
+        self, view: memoryview, group: list[ChunkIndex], compressors: Compressors, scratch: Scratch
     ) -> None:
         """Write the messages of several chunks as one chunk."""
         joined = bytearray()
@@ -194,13 +190,12 @@ class _CompactedFile(OutputFile):
         records = memoryview(joined)
         indexes = contents_of(records).indexes
         count = sum(map(len, indexes.values()))
+        starts = [chunk.message_start_time for chunk in group]
+        ends = [chunk.message_end_time for chunk in group]
         self._write_chunk(
             records,
             {id_: index.tobytes() for id_, index in indexes.items()},
-            (
-                min(chunk.message_start_time for chunk in group),
-                max(chunk.message_end_time for chunk in group),
-            ),
+            (min(starts), max(ends)),
             compressors.of(records, count)(records),
             compressors.chunk_name,
         )

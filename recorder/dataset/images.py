@@ -27,12 +27,7 @@ _FIELDS = ("height", "width", "encoding", "step", "data")
 
 
 def read_images(
-    reader: McapReader,
-    leaf: Leaf,
-    times: NDArray[np.int64],
-    *,
-    storage: Storage,
-    threads: int = 1,
+    reader: McapReader, leaf: Leaf, times: NDArray[np.int64], *, storage: Storage, threads: int
 ) -> Frames:
     """Read the (F, *shape) images of a leaf at these log_times.
 
@@ -114,10 +109,9 @@ class _Images:
             places[start:stop, 2] = index["offset"].astype(np.int64) + data.start + first
             checks.append(self._check_of(decoder, messages, first))
             start = stop
-        name = str(self._reader.path)
-        file = ImageFile(
-            name, self._reader.view, self._leaf.size, checks, self._reader.check_unchanged
-        )
+        reader = self._reader
+        name, image_bytes = str(reader.path), self._leaf.size
+        file = ImageFile(name, reader.view, image_bytes, checks, reader.check_unchanged)
         return MappedImages([file], self._leaf.shape, places[order])
 
     def _data_offset(self) -> int:

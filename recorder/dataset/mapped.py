@@ -70,10 +70,7 @@ class MappedImages:
     dtype = np.dtype(np.uint8)
 
     def __init__(
-        self,
-        files: Sequence[ImageFile],
-        shape: tuple[int, ...],
-        places: NDArray[np.int64],
+        self, files: Sequence[ImageFile], shape: tuple[int, ...], places: NDArray[np.int64]
     ) -> None:
         """Create an array of images of one shape without reading them.
 
