@@ -84,7 +84,7 @@ def test_a_signal_ends_all_processes_with_whole_files(
             wait_for_end(worker)
     for path in (tmp_path / "shards").iterdir():
         assert check_log(path) == []
-        assert len(mcaprl.open(path).episodes) > 10
+        assert len(mcaprl.open(path).episodes) > 0
 
 
 @needs_proc
