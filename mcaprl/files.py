@@ -234,6 +234,7 @@ def replacing(
         OSError: The file cannot be written, and `error_type` is None.
     """
     check_target(path, overwrite=overwrite)
+    folder = path
     try:
         with work_folder(path, concurrent=concurrent) as folder:
             unfinished = folder / path.name
@@ -245,6 +246,12 @@ def replacing(
         if error_type is None:
             raise
         raise error_type(f"cannot write {path}: {error.strerror or error}") from error
+    except LogError as error:
+        # A user does not know the path in the work folder, which is removed.
+        cause = error.__cause__
+        if isinstance(cause, OSError) and str(folder) in str(error):
+            raise LogError(f"cannot write {path}: {cause.strerror or cause}") from error
+        raise
 
 
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:

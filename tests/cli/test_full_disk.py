@@ -74,6 +74,7 @@ def test_a_full_disk_is_one_line(limit: int, command: list[str], path: str) -> N
     assert lines[0].startswith("mcaprl: cannot write "), lines
     assert path in lines[0]
     assert "File too large" in lines[0]
+    assert ".part" not in lines[0], "the path of the user, not that of a temporary file"
     if command[0] == "record":
         found = sorted(Path().glob("x*/*.mcap")) or [Path("x.mcap")]
         with pytest.warns(UserWarning, match="cut off"):
