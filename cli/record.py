@@ -27,7 +27,11 @@ from mcaprl.texts import counted, size
     help="Probability of a random action instead of the policy's.",
 )
 @click.option("--episodes", type=click.IntRange(1), help="Number of episodes to record.")
-@click.option("--steps", type=click.IntRange(1), help="Number of steps to record instead.")
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    help="Number of steps to record, instead of a number of episodes.",
+)
 @integer_option("--seed", "Seed of the recording.", least=0)
 @integer_option(
     "--envs",

@@ -186,7 +186,7 @@ def remove_leftover(path: Path) -> None:
 
 
 def _remove_unlocked(parent: Path, prefix: str) -> None:
-    """Remove the work folders of killed writers that shared a target."""
+    """Remove the work folders of killed processes that wrote the same file at the same time."""
     for folder in parent.iterdir():
         if folder.name.startswith(prefix) and folder.name.endswith(".part"):
             with suppress(OSError, LogError), locked_folder(folder):

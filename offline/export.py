@@ -21,6 +21,7 @@ from gymnasium import spaces
 from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, import_extra
+from mcaprl.files import replacing
 from mcaprl.offline.batches.observations import Observations, discrete_sizes
 from mcaprl.offline.policy import Policy
 
@@ -85,11 +86,12 @@ class ExportedPolicy(nn.Module):
         return Observations((vector - self.shift) / self.scale, images, mask)
 
 
-def export_onnx(policy: object, path: Path) -> None:
+def export_onnx(policy: object, path: Path, *, overwrite: bool = True) -> None:
     """Write the policy of an offline run as an ONNX file, for a batch of any size.
 
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.
+        OutputExistsError: The file exists and is not to be replaced, or is not a regular file.
         PolicyError: The policy is not from an offline run, or the file cannot be written.
     """
     if not isinstance(policy, Policy):
@@ -108,10 +110,8 @@ def export_onnx(policy: object, path: Path) -> None:
             verbose=False,
         )
     assert program is not None
-    try:
-        program.save(str(path))
-    except OSError as error:
-        raise PolicyError(f"cannot write {path}: {error.strerror}") from error
+    with replacing(path, PolicyError, overwrite=overwrite) as unfinished:
+        program.save(str(unfinished))
 
 
 @contextmanager

@@ -70,10 +70,10 @@ class SimSpec:
 
 
 class SimCatalog(Mapping[str, str]):
-    """Mapping from short names to Gymnasium ids; a sim is registered when it is looked up.
+    """Mapping from short names to Gymnasium ids.
 
-    Built-in sims are registered immediately. An installed package is imported only when its sim
-    is looked up by name, or when an unregistered id is looked up.
+    Built-in sims are registered with Gymnasium when the catalog is created. An installed package is
+    imported, and its sim registered, when the name or an unregistered id is looked up.
     """
 
     def __init__(self, own: Iterable[SimSpec]) -> None:

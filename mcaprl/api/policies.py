@@ -10,7 +10,8 @@ import gymnasium as gym
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import OutputExistsError, PolicyError, UnknownNameError, UsageError
+from mcaprl.errors import PolicyError, UnknownNameError, UsageError
+from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.runs import BEST_NAME, CONFIG_NAME, POLICY_NAME, policy_files
 from mcaprl.sims.evaluation.rollout import Policy, check_fit, same_form
@@ -71,7 +72,7 @@ class TrainedPolicy(Policy, Protocol):
         """
 
     def action_probabilities(self, observations: Any) -> NDArray[Any]:
-        """Return the probabilities (B, A) of all actions; of a greedy policy, 0 and 1.
+        """Return the probabilities (B, A) of all actions: 0 or 1 if the policy is greedy.
 
         Raises:
             PolicyError: The observations have another shape.
@@ -118,11 +119,9 @@ def export(run: str | Path, out: str | Path, *, overwrite: bool = False) -> Trai
     """
     from mcaprl.offline.export import export_onnx
 
-    out = Path(out)
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists: choose another path, or pass --overwrite")
+    check_target(Path(out), overwrite=overwrite)
     policy = load_policy(run)
-    export_onnx(policy, out)
+    export_onnx(policy, Path(out), overwrite=overwrite)
     return policy
 
 

@@ -73,7 +73,7 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
 
 def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error of Q(s, a) (B,); its minimum is the mean target."""
+    """Return half the squared error of Q(s, a) (B,), lowest where Q(s, a) is the mean target."""
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
     return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
@@ -135,7 +135,7 @@ def square_penalty(logits_tm1: Tensor) -> Tensor:
 def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) -> Tensor:
     """Return the asymmetric square loss |expectile - 1{u < 0}| u^2 (B,), u = target - V(s).
 
-    With 0.5 its minimum is the mean target; toward 1 it approaches the largest target in the data.
+    With 0.5 the best V(s) is the mean target; toward 1 it approaches the largest target.
     See "Offline Reinforcement Learning with Implicit Q-Learning", equation 5,
     https://arxiv.org/abs/2110.06169.
     """

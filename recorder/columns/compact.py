@@ -36,7 +36,7 @@ SMALL_CHUNK_BYTES = 2**16
 _MERGED_BYTES = 2**20
 # Saving fewer chunks than this is not worth the time of rewriting the file.
 _MIN_CHUNKS_SAVED = 8
-# Copying more bytes than this per saved chunk costs more time than readers gain.
+# Copying more bytes than this to avoid one chunk takes longer than readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
 # Records that are between listed chunks only where the summary omits a chunk.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)

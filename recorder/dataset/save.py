@@ -37,7 +37,7 @@ def save_log(
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
-    # Data from arrays has times from 0.
+    # Data from arrays has no timestamps, so its times start at 0.
     if columns.log_time_ns[0] == 0 or (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
     path = Path(path)

@@ -140,7 +140,7 @@ def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dic
 
 
 def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return a series per component of an action, or per discrete action that marks its steps."""
+    """Return one series per component of an action, or one per discrete action at its steps."""
     names = metadata.action_names()
     if names:
         taken = {

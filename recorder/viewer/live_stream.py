@@ -215,7 +215,7 @@ class LiveStream(ViewerServer):
         self._pace.pause()
 
     def show(self, step: LiveStep) -> None:
-        """Send the messages that `look` stored, and the step taken after it."""
+        """Send the messages that `look` stored, and then the step that followed `look`."""
         self._pace.begin()
         time_ns, topics = self._time_ns, self._topics
         self._sink.write_messages([(topics[t], time_ns, data) for t, data in self._seen])

@@ -180,7 +180,7 @@ def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
 
 @inlined
 def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
-    """Return the car whose motion after a number of substeps is `motion`."""
+    """Return the car's state after `substeps` substeps, with the pose and speed in `motion`."""
     slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, before.along_m, slow_s)
 

@@ -78,7 +78,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # A running episode has no reason.
+        # An episode that is still running has no reason for its end.
         self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)

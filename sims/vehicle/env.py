@@ -1,4 +1,4 @@
-"""Base class of the single environments: a fleet of one vehicle, and its rendering."""
+"""Base class of environments with one vehicle: a fleet of one, and its rendering."""
 
 from __future__ import annotations
 
