@@ -17,7 +17,7 @@ import gymnasium as gym
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.probability import check_probability
+from mcaprl.recorder.format.probability import SMALLEST, check_probability
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
@@ -161,16 +161,18 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
-        if self.behavior_prob is not _UNKNOWN:
-            check_probability(self.behavior_prob, "behavior_prob")
+        probability = self.behavior_prob
+        # The function is called only where this comparison, at each step, does not suffice.
+        if probability is not _UNKNOWN and not SMALLEST <= probability <= 1.0:
+            check_probability(probability, "behavior_prob")
         try:
             # Copy the action before the environment can change it.
             try:
                 self._take_action(action)
             except (TypeError, OverflowError):
                 self._columns.store_action(action)
-            if self.behavior_prob is not _UNKNOWN:
-                self._columns.store_behavior_prob(self.behavior_prob)
+            if probability is not _UNKNOWN:
+                self._columns.store_behavior_prob(probability)
                 self.behavior_prob = _UNKNOWN
         except SpaceError:
             raise
