@@ -5,17 +5,20 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.errors import PolicyError
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.evaluation.evaluate import evaluate, improvements, normalize
 from mcaprl.sims.evaluation.report import evaluation_page
-from mcaprl.sims.evaluation.rollout import EpsilonGreedy, episode_seed, rollout
+from mcaprl.sims.evaluation.rollout import EpsilonGreedy, check_fit, episode_seed, rollout
 
 
 class AlwaysLeft:
@@ -109,3 +112,17 @@ def test_reports_are_written(env: gym.Env[Any, Any], tmp_path: Path) -> None:
     world = [Shape("line", "line", (1, 1, 1, 1), points=np.zeros((2, 3)))]
     evaluation_page(tmp_path / "b", "lane", [driven], [], world, None, None)
     assert (tmp_path / "b" / "trajectories.png").stat().st_size > 5000
+
+
+def test_policies_fit_environments_with_other_bounds() -> None:
+    """Bounds are no reason to refuse a policy; shapes and dtypes are."""
+    env = gym.make("CartPole-v1")
+    unbounded = spaces.Box(-np.inf, np.inf, (4,), np.float32)
+    trained = SimpleNamespace(
+        name="trained", observation_space=unbounded, action_space=env.action_space
+    )
+    check_fit(trained, env)
+    for other in (spaces.Box(-1, 1, (3,), np.float32), spaces.Box(-1, 1, (4,), np.float64)):
+        trained.observation_space = other
+        with pytest.raises(PolicyError, match="was trained on observation_space"):
+            check_fit(trained, env)
