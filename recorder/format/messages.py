@@ -121,9 +121,12 @@ def log_message(time_ns: int, text: str) -> bytes:
 
 
 def _append_strings(data: bytearray, *texts: str) -> bytearray:
-    """Append CDR strings: length, characters and NUL, each aligned to four bytes."""
+    """Append CDR strings: length, characters and NUL, each aligned to four bytes.
+
+    NUL ends a string of ROS; one inside of a text becomes the replacement character.
+    """
     for text in texts:
-        encoded = encodable(text).encode() + b"\0"
+        encoded = encodable(text).replace("\0", "\ufffd").encode() + b"\0"
         data += bytes(-len(data) % 4)
         data += len(encoded).to_bytes(4, "little")
         data += encoded

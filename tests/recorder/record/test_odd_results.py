@@ -68,3 +68,13 @@ def test_texts_that_utf_8_cannot_encode_are_stored_escaped(log_path: Path) -> No
     (episode,) = mcaprl.open(log_path).episodes
     assert (episode.reason, episode.policy) == (r"crash \ud800", r"runs/\udcff")
     assert mcaprl.check(log_path).ok
+
+
+def test_a_name_of_nul_characters_is_not_lost(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with closing(mcaprl.RecordMcap(gym.make("CartPole-v1"), path, policy="a\0")) as env:
+        env.reset(seed=0)
+        while not any(env.step(0)[2:4]):
+            pass
+    (episode,) = mcaprl.open(path).episodes
+    assert episode.policy == "a\ufffd"
