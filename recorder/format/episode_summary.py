@@ -50,17 +50,17 @@ class EpisodeSummary(NamedTuple):
         """Encode the summary as an `mcaprl_msgs/msg/Episode` in CDR."""
         return messages.episode_message(**self._asdict())
 
-    def log_lines(self) -> list[tuple[int, str]]:
-        """Return the log lines of the episode's start and end, each with its log_time."""
-        acting = f", {self.policy} acts" if self.policy else ""
-        return [
-            (self.start_time_ns, f"episode {self.episode} begins{acting}"),
-            (
-                self.end_time_ns,
-                f"episode {self.episode} ends after {self.length} steps: {self.reason},"
-                f" return {self.total_reward:.4g}",
-            ),
-        ]
+    def end_line(self) -> str:
+        """Return the log line of the episode's end."""
+        return (
+            f"episode {self.episode} ends after {self.length} steps: {self.reason},"
+            f" return {self.total_reward:.4g}"
+        )
+
+
+def begin_line(episode: int, policy: str) -> str:
+    """Return the log line of an episode's start."""
+    return f"episode {episode} begins" + (f", {policy} acts" if policy else "")
 
 
 def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:

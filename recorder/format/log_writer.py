@@ -6,7 +6,10 @@ A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, al
     /rl/step               mcaprl_msgs/msg/Step...   observation; fields in `schema`
     /rl/observation/<key>  sensor_msgs/msg/Image     image observation: mono8, rgb8 or rgba8
     /rl/episode            mcaprl_msgs/msg/Episode   episode, at its end; fields in `messages`
-    /rosout                rcl_interfaces/msg/Log    start and end of an episode, as text
+    /rosout                rcl_interfaces/msg/Log    start and end of an episode, as text; an end is
+                                                     a warning if the episode fails
+    /rl/phase              std_msgs/msg/String       start and end of an episode: `running`, then
+                                                     the reason of the end
     /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy version is known
     all others                                       display topics, see `record/display.py`
 
@@ -22,13 +25,13 @@ time, in integer nanoseconds. log_time increases strictly from record to record 
 across episodes. All messages of one observation have the same log_time, which joins the topics.
 `/rl/episode` has the log_time of the final record.
 
-Chunks. Each chunk contains one kind of topic, one line of the table above (`/rosout` is in the
-chunks of `/rl/episode`). It is compressed by zstd, lz4 or not at all, and has a CRC and a
-MessageIndex for each of its channels. Schemas, channels, metadata and attachments are top-level
-records before the chunks that need them. The summary repeats schemas and channels, and indexes
-everything else. All CRCs of MCAP are present. When a log is closed, chunks below 64 KiB are merged
-into chunks of about 1 MiB of the same kind, if there are many; the messages of each channel keep
-their order.
+Chunks. Each chunk contains one kind of topic, one line of the table above (`/rosout` and
+`/rl/phase` are in the chunks of `/rl/episode`). It is compressed by zstd, lz4 or not at all, and
+has a CRC and a MessageIndex for each of its channels. Schemas, channels, metadata and attachments
+are top-level records before the chunks that need them. The summary repeats schemas and channels,
+and indexes everything else. All CRCs of MCAP are present. When a log is closed, chunks below 64 KiB
+are merged into chunks of about 1 MiB of the same kind, if there are many; the messages of each
+channel keep their order.
 
 Order. The metadata record `mcaprl.dataset` comes first. `/rl/step` is written last in each episode:
 a file with the `final` record contains the whole episode. A file without a summary is still being
@@ -52,7 +55,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError
 from mcaprl.recorder.columns.writer import McapWriter
 from mcaprl.recorder.format import messages
-from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, begin_line
 from mcaprl.recorder.format.metadata import (
     METADATA_NAME,
     SAME_WHEN_APPENDED,
@@ -67,9 +70,14 @@ from mcaprl.recorder.format.topics import (
     IMAGES_PER_CHUNK,
     LEARNER_TOPIC,
     LOG_TOPIC,
+    PHASE_TOPIC,
+    RUNNING,
     STEP_TOPIC,
     STEPS_PER_CHUNK,
 )
+
+Message = tuple[int, int, bytes]
+"""Channel id, log_time and data of a message."""
 
 
 class MessageSink(Protocol):
@@ -86,7 +94,7 @@ class MessageSink(Protocol):
     def write_rows(self, rows: NDArray[Any]) -> None:
         """Write message records of one channel."""
 
-    def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
+    def write_messages(self, messages: Sequence[Message]) -> None:
         """Write messages, each with its channel id and log_time."""
 
 
@@ -100,8 +108,15 @@ class LogTopics:
         image_leaves: Parts of the observation that are images.
     """
 
-    def __init__(self, metadata: LogMetadata, sink: MessageSink) -> None:
+    def __init__(
+        self, metadata: LogMetadata, sink: MessageSink, *, names_actions: bool = True
+    ) -> None:
         """Announce the topics that every log has.
+
+        Args:
+            metadata: Metadata of the log.
+            sink: Receiver of the messages.
+            names_actions: Whether schemas contain the names of the actions as constants.
 
         Raises:
             SpaceError: A log cannot contain these spaces.
@@ -111,11 +126,13 @@ class LogTopics:
         self.action = action_leaf(metadata.action_space)
         self.image_leaves = tuple(leaf for leaf in leaves if leaf.encoding is not None)
         strings = metadata.to_strings()
-        name, self._step_text = step_schema(metadata.observation_space, metadata.action_space)
+        self._action_names = metadata.action_names() if names_actions else {}
+        spaces = (metadata.observation_space, metadata.action_space)
+        name, self._step_text = step_schema(*spaces, self._action_names)
         sink.add_metadata(METADATA_NAME, strings)
         self._step_channel = sink.add_channel(STEP_TOPIC, name, self._step_text, strings)
         self._episode_channel = self.add_channel(EPISODE_TOPIC, messages.EPISODE_TYPE)
-        self._log_channel: int | None = None
+        self._line_channels: list[int] | None = None
 
     def add_channel(self, topic: str, type_name: str) -> int:
         """Announce a topic of a known ROS type and return its channel id."""
@@ -132,7 +149,7 @@ class LogTopics:
 
     def values_rows(self, topic: str, actions: int, most: int = STEPS_PER_CHUNK) -> TopicRows:
         """Announce a topic of `schema.values_schema` and preallocate its rows."""
-        name, text = values_schema(actions)
+        name, text = values_schema(actions, self._action_names)
         channel = self.sink.add_channel(topic, name, text)
         return TopicRows.of_text(text, channel, most, self.sink.write_rows)
 
@@ -156,7 +173,7 @@ class LogTopics:
 
         Args:
             summaries: Summaries of the episodes.
-            log_lines: Whether to write the starts and ends to `/rosout` as well.
+            log_lines: Whether to write the starts and ends to `/rosout` and `/rl/phase` as well.
         """
         written = [
             (self._episode_channel, summary.end_time_ns, summary.to_message())
@@ -165,16 +182,38 @@ class LogTopics:
         self.sink.write_messages(written + (self._lines(summaries) if log_lines else []))
 
     def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
-        """Write the starts and ends of episodes to `/rosout` only."""
+        """Write the starts and ends of episodes to `/rosout` and `/rl/phase` only."""
         self.sink.write_messages(self._lines(summaries))
 
-    def _lines(self, summaries: list[EpisodeSummary]) -> list[tuple[int, int, bytes]]:
-        if self._log_channel is None:
-            self._log_channel = self.add_channel(LOG_TOPIC, messages.LOG_TYPE)
+    def begin_messages(self, episode: int, policy: str, time_ns: int) -> list[Message]:
+        """Return the messages of `/rosout` and `/rl/phase` at an episode's start."""
+        return self._line(time_ns, begin_line(episode, policy), RUNNING)
+
+    def end_messages(self, summary: EpisodeSummary) -> list[Message]:
+        """Return the messages of `/rosout` and `/rl/phase` at an episode's end."""
+        level = messages.WARN if self.metadata.is_failure(summary.reason) else messages.INFO
+        return self._line(summary.end_time_ns, summary.end_line(), summary.reason, level)
+
+    def _lines(self, summaries: list[EpisodeSummary]) -> list[Message]:
         return [
-            (self._log_channel, time_ns, messages.log_message(time_ns, text))
+            message
             for summary in summaries
-            for time_ns, text in summary.log_lines()
+            for message in (
+                *self.begin_messages(summary.episode, summary.policy, summary.start_time_ns),
+                *self.end_messages(summary),
+            )
+        ]
+
+    def _line(
+        self, time_ns: int, text: str, phase: str, level: int = messages.INFO
+    ) -> list[Message]:
+        if self._line_channels is None:
+            topics = ((LOG_TOPIC, messages.LOG_TYPE), (PHASE_TOPIC, messages.TEXT_TYPE))
+            self._line_channels = [self.add_channel(*topic) for topic in topics]
+        log, phases = self._line_channels
+        return [
+            (log, time_ns, messages.log_message(time_ns, text, level)),
+            (phases, time_ns, messages.text_message(phase)),
         ]
 
 
@@ -212,13 +251,15 @@ class LogWriter(LogTopics):
         """
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
-        step_schema(metadata.observation_space, metadata.action_space)
+        plain_name, _ = step_schema(metadata.observation_space, metadata.action_space)
         self.mcap = McapWriter(
             path, compression=compression, overwrite=overwrite, append=append, source=source
         )
         if self.mcap.untouched:
             self._check_same(strings)
-        super().__init__(metadata, self.mcap)
+        # Logs from before schemas named the actions are continued without the names.
+        is_plain = plain_name in {schema.name for schema in self.mcap.schemas.values()}
+        super().__init__(metadata, self.mcap, names_actions=not is_plain)
 
     def _check_same(self, strings: dict[str, str]) -> None:
         """Raise LogError unless the existing log was recorded from the same environment."""

@@ -17,6 +17,7 @@ from rosbags.typesys.store import Typestore
 from mcaprl.errors import CorruptLogError
 from mcaprl.texts import encodable
 
+TEXT_TYPE = "std_msgs/msg/String"
 LOG_TYPE = "rcl_interfaces/msg/Log"
 EPISODE_TYPE = "mcaprl_msgs/msg/Episode"
 EPISODE_TEXT = """\
@@ -41,7 +42,8 @@ string policy
 # Options passed to reset(), as JSON.
 string options
 """
-_INFO = 20
+INFO, WARN = 20, 30
+"""Levels of log lines."""
 # CDR: the encapsulation header, then the fields, aligned relative to the end of the header.
 _ENCAPSULATION = b"\0\1\0\0"
 _EPISODE_START, _LOG_START = struct.Struct("<dqqqdII??"), struct.Struct("<IIB")
@@ -108,12 +110,17 @@ def episode_message(
     return bytes(_append_strings(data, reason, policy, options))
 
 
-def log_message(time_ns: int, text: str) -> bytes:
-    """Encode an `rcl_interfaces/msg/Log` of level INFO as CDR bytes."""
+def text_message(text: str) -> bytes:
+    """Encode a `std_msgs/msg/String` as CDR bytes."""
+    return bytes(_append_strings(bytearray(_ENCAPSULATION), text))
+
+
+def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
+    """Encode an `rcl_interfaces/msg/Log` as CDR bytes."""
     data = bytearray(_ENCAPSULATION)
     sec, nanosec = divmod(time_ns, 10**9)
     # The 32-bit seconds of ROS wrap around; the log_time of the record does not.
-    data += _LOG_START.pack(sec % 2**32, nanosec, _INFO)
+    data += _LOG_START.pack(sec % 2**32, nanosec, level)
     _append_strings(data, "mcaprl", text, "", "")
     # The value 0 of the field `line`.
     data += bytes(-len(data) % 4 + 4)

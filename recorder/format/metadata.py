@@ -13,6 +13,7 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         derived from the space by `spaces.observation_leaves`
     observation_names   JSON list of names of a vector observation's elements; may be empty
     action_meanings     JSON list of names of the discrete actions; may be empty
+    success_reasons     JSON list of the reasons with which an episode succeeds; empty if unknown
     step_duration_ns    simulated time between two records
     policy, epsilon, seed   values at the start of the recording; empty if unknown
     versions            JSON object: package -> version
@@ -33,6 +34,7 @@ from gymnasium import spaces
 from mcaprl._version import __version__
 from mcaprl.errors import LogError
 from mcaprl.files import parse_json
+from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_json, space_to_json
 from mcaprl.texts import encodable
 
@@ -75,6 +77,7 @@ class LogMetadata:
         env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
+        success_reasons: Reasons with which an episode succeeds; empty if unknown.
         step_duration_ns: Simulated time between two records, nanoseconds.
         policy: Name of the first policy; each episode's summary names its own.
         epsilon: Probability of a random action, as text; empty if unknown.
@@ -88,6 +91,7 @@ class LogMetadata:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     observation_names: tuple[str, ...] = ()
     action_meanings: tuple[str, ...] = ()
+    success_reasons: tuple[str, ...] = ()
     step_duration_ns: int = DEFAULT_STEP_DURATION_NS
     policy: str = ""
     epsilon: str = ""
@@ -110,6 +114,10 @@ class LogMetadata:
             return {value: str(value) for value in shown}
         return dict(zip(values, meanings, strict=True))
 
+    def is_failure(self, reason: str) -> bool:
+        """Return whether an episode that ends for this reason fails; False if that is unknown."""
+        return bool(self.success_reasons) and reason not in (*self.success_reasons, INTERRUPTED)
+
     def to_strings(self) -> dict[str, str]:
         """Return the map that is written to the file."""
         fields = [
@@ -128,6 +136,7 @@ class LogMetadata:
             "observation_fields": json.dumps(fields),
             "observation_names": json.dumps(self.observation_names),
             "action_meanings": json.dumps(self.action_meanings),
+            "success_reasons": json.dumps(self.success_reasons),
             "step_duration_ns": str(self.step_duration_ns),
             "policy": encodable(self.policy),
             "epsilon": self.epsilon,
@@ -160,6 +169,7 @@ class LogMetadata:
                 env_kwargs=_object(strings, "env_kwargs"),
                 observation_names=_texts(strings, "observation_names"),
                 action_meanings=_texts(strings, "action_meanings"),
+                success_reasons=_texts(strings, "success_reasons"),
                 step_duration_ns=int(strings.get("step_duration_ns", DEFAULT_STEP_DURATION_NS)),
                 policy=strings.get("policy", ""),
                 epsilon=strings.get("epsilon", ""),
@@ -216,6 +226,7 @@ class LogMetadata:
             env_kwargs=kwargs,
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
+            success_reasons=_names(inner, "success_reasons"),
             step_duration_ns=round(step_duration_s * 1e9),
             policy=policy,
             epsilon=epsilon,

@@ -7,7 +7,7 @@ is a NumPy structured dtype, so a chunk of messages is one array.
 The fields of `/rl/step` are sorted by decreasing size, so there is no padding:
 
     float64 reward              reward of this record's action; 0 in a final record
-    int64 | float32[M] action   0 in a final record
+    int64 | float32[M] action   0 in a final record; constants name the discrete actions
     float32[N] observation      one field per leaf of a Dict space, `observation_<key>`
     float32 behavior_prob       probability of the action under the policy that took it, or NaN
     uint32 episode, step        counted from 0
@@ -28,7 +28,7 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -55,12 +55,20 @@ _FIELD = re.compile(r"(\w+)(?:\[(\d+)\])?\s+([a-z][a-z0-9_]*)")
 
 
 def step_schema(
-    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    action_names: Mapping[int, str] | None = None,
 ) -> tuple[str, str]:
     """Return the type name and definition of `/rl/step` for a pair of spaces.
 
     The name contains a hash of the text, because a viewer with several logs open expects one
     layout for each name.
+
+    Args:
+        observation_space: Observation space of the environment.
+        action_space: Action space of the environment.
+        action_names: Names of the discrete actions by value, for the constants of `action`; see
+            `action_constants`.
 
     Raises:
         SpaceError: A log cannot store these spaces.
@@ -78,7 +86,7 @@ def step_schema(
         ("bool", 0, "final"),
     ]
     fields.sort(key=lambda field: -np.dtype(ROS_TO_NUMPY[field[0]]).itemsize)
-    return _named("Step", fields)
+    return _named("Step", fields, {"action": action_constants(action_names or {})})
 
 
 def telemetry_schema(names: Iterable[str]) -> tuple[str, str]:
@@ -108,7 +116,29 @@ def telemetry_message(values: Iterable[float]) -> bytes:
     return struct.pack(f"<I{len(rounded)}f", ENCAPSULATION, *rounded.tolist())
 
 
-def values_schema(actions: int) -> tuple[str, str]:
+def action_constants(names: Mapping[int, str]) -> dict[str, int]:
+    """Return the ROS constants of actions, with which a viewer displays `BRAKE (0)` for 0.
+
+    A name is converted to upper case, without text in parentheses and with an underscore for other
+    characters than letters and digits. Names without letters have no constant.
+
+    >>> action_constants({0: "brake", 1: "slightly left", 2: "faster north (+x)"})
+    {'BRAKE': 0, 'SLIGHTLY_LEFT': 1, 'FASTER_NORTH': 2}
+
+    Args:
+        names: Name of each action by value.
+    """
+    words: dict[str, int] = {}
+    for value, name in names.items():
+        word = _constant(re.sub(r"\(.*?\)", "", name)) or _constant(name)
+        if word in words:
+            word = _constant(f"{name} {value}")
+        if word and word not in words:
+            words[word] = value
+    return words
+
+
+def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -> tuple[str, str]:
     """Return the type name and definition of `/rl/values`, a policy's evaluation of a step.
 
     float32[A] q            value of each action; NaN if the policy has none
@@ -122,11 +152,13 @@ def values_schema(actions: int) -> tuple[str, str]:
 
     Args:
         actions: Number of actions A.
+        action_names: As for `step_schema`, for the constants of `policy_action`.
     """
     fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
     fields += [("float32", actions, "preference")]
     fields += [("float32", 0, name) for name in ("value", "advantage", "td_error", "entropy")]
-    return _named("Values", [*fields, ("bool", 0, "agrees")])
+    constants = {"policy_action": action_constants(action_names or {})}
+    return _named("Values", [*fields, ("bool", 0, "agrees")], constants)
 
 
 def message_dtype(text: str) -> np.dtype[Any] | None:
@@ -239,11 +271,26 @@ def _leaf_field(leaf: Leaf) -> tuple[str, int, str]:
     return name, leaf.size if leaf.shape else 0, leaf.name
 
 
-def _named(prefix: str, fields: list[tuple[str, int, str]]) -> tuple[str, str]:
-    text = "".join(
-        f"{kind}{f'[{count}]' if count else ''} {name}\n" for kind, count, name in fields
-    )
+def _named(
+    prefix: str,
+    fields: list[tuple[str, int, str]],
+    constants: Mapping[str, Mapping[str, int]] | None = None,
+) -> tuple[str, str]:
+    """Return the type name and definition of fields, with constants before the field they name."""
+    lines = []
+    for kind, count, name in fields:
+        named = (constants or {}).get(name, {})
+        lines += [f"{kind} {word}={value}" for word, value in named.items()]
+        lines.append(f"{kind}{f'[{count}]' if count else ''} {name}")
+    text = "".join(f"{line}\n" for line in lines)
     return f"mcaprl_msgs/msg/{prefix}{_digest(text.encode())}", text
+
+
+def _constant(name: str) -> str:
+    """Return a name as a ROS constant; empty if the name contains no letter."""
+    word = re.sub(r"[^A-Z0-9]+", "_", name.upper()).strip("_")
+    word = word if not word[:1].isdigit() else f"ACTION_{word}"
+    return word if re.search("[A-Z]", name.upper()) else ""
 
 
 def _digest(text: bytes) -> str:

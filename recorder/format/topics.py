@@ -6,6 +6,9 @@ STEP_TOPIC = "/rl/step"
 EPISODE_TOPIC = "/rl/episode"
 LEARNER_TOPIC = "/rl/learner"
 LOG_TOPIC = "/rosout"
+PHASE_TOPIC = "/rl/phase"
+RUNNING = "running"
+"""Phase of an episode before its end; from then on the phase is the reason of the end."""
 # Maximum numbers of /rl/step rows, images and bytes in a chunk.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100

@@ -3,6 +3,7 @@
 /scene, /scene/static   shapes: moving ones at most five times a second and at each episode's start
                         and end; static ones when they differ from the previous episode's. A viewer
                         that seeks needs only the latest message of each topic
+/scene/tracks           tracks of the episodes so far, written at the ends of episodes
 /tf, /tf_static         frames: moving ones at each step; static ones as above
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
@@ -15,6 +16,7 @@ import warnings
 from collections.abc import Sequence
 from operator import itemgetter
 
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
@@ -29,11 +31,14 @@ from mcaprl.recorder.record.scene import (
     transforms,
 )
 from mcaprl.recorder.record.step_rows import ImageColumn
+from mcaprl.recorder.record.tracks import Tracks
 
-SCENE, SCENE_STATIC = "/scene", "/scene/static"
+SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
 TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
 # Display messages are written when they exceed this size or the episode ends.
 _CHUNK_BYTES = 2**20
+# Tracks are written again when the messages since the last ones have this many times their size.
+_BYTES_PER_TRACKS = 4
 # Bodies move with their frames at each step; other moving shapes are redrawn after this time.
 _SCENE_PERIOD_NS = 200_000_000
 
@@ -54,7 +59,9 @@ class ShownTopics:
         self.follow_frame = ""
         if isinstance(source, SceneSource):
             self.follow_frame = next((frame.name for frame in source.frames()), "")
-            types |= dict.fromkeys((SCENE, SCENE_STATIC), "visualization_msgs/msg/MarkerArray")
+            types |= dict.fromkeys(
+                (SCENE, SCENE_STATIC, TRACKS), "visualization_msgs/msg/MarkerArray"
+            )
             types |= dict.fromkeys((TF, TF_STATIC), "tf2_msgs/msg/TFMessage")
         self.channels = {topic: log.add_channel(topic, name) for topic, name in types.items()}
         if isinstance(source, TelemetrySource):
@@ -93,6 +100,7 @@ class Display:
         self._depth_images: ImageColumn | None = None
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._shown: ShownTopics | None = None
+        self._tracks, self._bytes_since_tracks = Tracks(), 0
         self._static: dict[str, bytes] = {}
         # Latest shapes that are not drawn yet; they are drawn at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
@@ -112,6 +120,7 @@ class Display:
         """Begin an episode, after the environment's reset, at the log_time `start_ns`."""
         self._start_ns, self._step_ns = start_ns, step_ns
         self._return_so_far = 0.0
+        self._tracks.begin()
         self._steps_per_scene = max(1, _SCENE_PERIOD_NS // step_ns)
         if self._shown is None:
             self._shown = ShownTopics(self._log, self._source)
@@ -132,7 +141,10 @@ class Display:
             self._pending = (time_ns, self._scene.scene())
             if step % self._steps_per_scene == 0:
                 self._draw_pending()
-            self._emit(TF, time_ns, transforms(self._scene.frames(), time_ns))
+            frames = self._scene.frames()
+            self._emit(TF, time_ns, transforms(frames, time_ns))
+            if frames:
+                self._tracks.add(frames[0].position)
         if self._telemetry is not None:
             message = self.shown.telemetry(self._telemetry, self._return_so_far)
             self._emit(TELEMETRY, time_ns, message)
@@ -142,12 +154,14 @@ class Display:
                     self._depth_images.flush(step)
             self._depth_images.append(depth_millimeters(self._depth.depth_image_m()))
 
-    def end(self, steps: int) -> None:
-        """Write the messages of an episode of `steps` transitions."""
+    def end(self, summary: EpisodeSummary) -> None:
+        """Write the messages of an episode that has ended."""
         self._draw_pending()
+        if self._scene is not None:
+            self._emit_tracks(summary)
         self._flush_messages()
         if self._depth_images is not None:
-            self._depth_images.flush(steps + 1)
+            self._depth_images.flush(summary.length + 1)
 
     def clear(self) -> None:
         """Drop the messages that are not written yet."""
@@ -166,6 +180,15 @@ class Display:
             self._emit(SCENE, time_ns, marker_array(shapes))
             self._pending = None
 
+    def _emit_tracks(self, summary: EpisodeSummary) -> None:
+        """Write the tracks so far, unless short episodes would make them most of the log."""
+        failed = self._log.metadata.is_failure(summary.reason)
+        self._tracks.end(summary.episode, summary.total_reward, failed=failed)
+        data = marker_array(self._tracks.shapes())
+        if self._bytes_since_tracks >= _BYTES_PER_TRACKS * len(data):
+            self._emit(TRACKS, summary.end_time_ns, data)
+            self._bytes_since_tracks = 0
+
     def _emit_changed(self, topic: str, time_ns: int, data: bytes) -> None:
         if self._static.get(topic) != data:
             self._static[topic] = data
@@ -174,6 +197,7 @@ class Display:
     def _emit(self, topic: str, time_ns: int, data: bytes) -> None:
         self._messages.append((self.shown.channels[topic], time_ns, data))
         self._bytes += len(data)
+        self._bytes_since_tracks += len(data)
         if self._bytes > _CHUNK_BYTES:
             self._flush_messages()
 

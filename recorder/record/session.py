@@ -18,7 +18,7 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
-from mcaprl.recorder.format.topics import LOG_TOPIC, STEP_TOPIC
+from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.record.display import Display
 from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
 from mcaprl.texts import encodable
@@ -129,7 +129,7 @@ class EpisodeLog:
             self._first_in_file = self.episodes
         display.begin(start_ns, self.step_ns)
         if not self._has_layout:
-            topics, shown = (LOG_TOPIC, *display.topics), display.shown
+            topics, shown = (LOG_TOPIC, PHASE_TOPIC, *display.topics), display.shown
             layout = layout_of(self._description, topics, shown.telemetry_names, shown.follow_frame)
             mcap.add_attachment(
                 LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns

@@ -304,7 +304,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         recording.begin(self._display)
         for table in self._images.values():
             table.write(number, steps + 1, start_ns, step_ns)
-        self._display.end(steps)
+        self._display.end(summary)
         recording.log.write_episodes([summary], log_lines=True)
         if self._learner is not None:
             self._learner.write(number, steps, start_ns, step_ns)

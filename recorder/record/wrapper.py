@@ -268,7 +268,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         )
         for image in self._images:
             image.flush(episode.steps + 1)
-        self._display.end(episode.steps)
+        self._display.end(summary)
         self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
         self._recording.advance(summary)

@@ -127,9 +127,11 @@ class EpisodeCheck:
         """Return whether `/rl/step` has one channel, and the schema of the metadata's spaces."""
         channels = self._reader.channels_of(STEP_TOPIC)
         assert self._metadata is not None
-        name, text = step_schema(self._metadata.observation_space, self._metadata.action_space)
+        spaces = (self._metadata.observation_space, self._metadata.action_space)
         schema = self._reader.schema_of(channels[0])
-        fits = schema.name == name and schema.data.decode(errors="replace") == text
+        # Schemas of older logs do not name the actions.
+        possible = [step_schema(*spaces, names) for names in (self._metadata.action_names(), None)]
+        fits = (schema.name, schema.data.decode(errors="replace")) in possible
         if schema.name.startswith("mcaprl_msgs/msg/Step") and not fits:
             raise CorruptLogError(f"schema {schema.name} does not match the metadata's spaces")
         return fits and len(channels) == 1

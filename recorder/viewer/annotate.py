@@ -102,7 +102,7 @@ class AnnotatedCopy:
                 display.begin(episode.summary.start_time_ns, step_ns)
             display.observe(step, float(episode.rewards[step - 1]) if step else 0.0)
             if step == episode.length:
-                display.end(episode.length)
+                display.end(episode.summary)
 
         found = verify(dataset, env, on_frame=show)
         if found.difference is not None:

@@ -24,6 +24,7 @@ from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.schema import stored_dtype
 from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.viewer.annotate import annotated_copy
 from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import make_sim
 from tests.conftest import need
@@ -104,15 +105,19 @@ def by_rosbags(path: Path) -> Messages:
     return messages
 
 
-def by_node(path: Path) -> Messages:
+def node_lines(script: str, path: Path) -> list[Any]:
+    """Return the lines of JSON that a script of `tests/node` prints for a log."""
     need(shutil.which("node") is not None, "Node is not installed")
     need((NODE / "node_modules").is_dir(), "packages of tests/node are not installed: npm ci")
-    command = ["node", str(NODE / "dump.mjs"), str(path)]
+    command = ["node", str(NODE / script), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def by_node(path: Path) -> Messages:
     messages: Messages = defaultdict(list)
-    for line in done.stdout.splitlines():
-        found = json.loads(line)
+    for found in node_lines("dump.mjs", path):
         messages[found["topic"]].append((int(found["logTime"]), found["value"]))
     return messages
 
@@ -145,6 +150,20 @@ def scene_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for _ in range(3):
             env.step(1)
     return path
+
+
+def test_viewers_find_the_names_of_the_actions(scene_log: Path, tmp_path: Path) -> None:
+    annotated = tmp_path / "annotated.mcap"
+    values = {"q": np.zeros((3, 6)), "preference": np.full((3, 6), 1 / 6)}
+    values |= {name: np.zeros(3) for name in ("value", "advantage", "td_error", "entropy")}
+    values |= {"policy_action": np.zeros(3, np.int64), "agrees": np.zeros(3, bool)}
+    with annotated_copy(scene_log, annotated) as copy:
+        copy.add_values("/rl/values", [(mcaprl.open(scene_log).episodes[0], values)])
+    actions = [["BRAKE", 0], ["STRAIGHT", 1], ["RIGHT", 2], ["LEFT", 3]]
+    actions += [["SLIGHTLY_RIGHT", 4], ["SLIGHTLY_LEFT", 5]]
+    found = {each["topic"]: each["constants"] for each in node_lines("constants.mjs", annotated)}
+    assert found["/rl/step"] == found["/rl/values"] == actions
+    assert not mcaprl.check(annotated).problems
 
 
 @pytest.mark.parametrize("read", READERS)

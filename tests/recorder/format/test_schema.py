@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.schema import (
+    action_constants,
     image_dtype,
     is_intact,
     message_dtype,
@@ -52,6 +54,37 @@ def test_different_spaces_have_different_type_names() -> None:
     box, larger = (spaces.Box(-1, 1, (n,), np.float32) for n in (3, 4))
     assert step_schema(box, spaces.Discrete(4))[0] == step_schema(box, spaces.Discrete(5))[0]
     assert step_schema(box, spaces.Discrete(4))[0] != step_schema(larger, spaces.Discrete(4))[0]
+
+
+def test_constants_name_the_discrete_actions() -> None:
+    box = spaces.Box(-1, 1, (3,), np.float32)
+    plain = step_schema(box, spaces.Discrete(3))
+    name, text = step_schema(box, spaces.Discrete(3), {0: "brake", 1: "go (+x)", 2: "Go!"})
+    assert text.splitlines()[1:5] == [
+        "int64 BRAKE=0",
+        "int64 GO=1",
+        "int64 GO_2=2",
+        "int64 action",
+    ]
+    assert name != plain[0]
+    assert message_dtype(text) == message_dtype(plain[1])
+    assert is_intact(name, text.encode())
+
+
+@given(st.dictionaries(st.integers(-(2**31), 2**31), st.text(max_size=12), max_size=8))
+def test_constants_are_distinct_names_of_ros(names: dict[int, str]) -> None:
+    found = action_constants(names)
+    assert all(re.fullmatch("[A-Z][A-Z0-9]*(_[A-Z0-9]+)*", word) for word in found)
+    assert len(set(found.values())) == len(found)
+    assert set(found.values()) <= set(names)
+
+
+def test_numbers_are_no_names() -> None:
+    assert action_constants({0: "0", 1: "1"}) == {}
+    assert action_constants({0: "90 degrees", 1: "straße"}) == {
+        "ACTION_90_DEGREES": 0,
+        "STRASSE": 1,
+    }
 
 
 def test_field_names_of_dict_leaves() -> None:

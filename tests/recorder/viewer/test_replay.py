@@ -258,7 +258,7 @@ def test_without_a_scene_only_transitions_are_recorded(tmp_path: Path) -> None:
         recorder.reset(seed=0)
         recorder.step(1)
     topics = {channel.topic for channel in McapReader(path).channels.values()}
-    assert topics == {"/rl/step", "/rl/episode", "/rosout"}
+    assert topics == {"/rl/step", "/rl/episode", "/rl/phase", "/rosout"}
 
 
 def test_vectors_are_read_without_the_images(tmp_path: Path) -> None:

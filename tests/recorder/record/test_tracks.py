@@ -1,0 +1,138 @@
+"""Topics about whole episodes: phases, log lines and tracks."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.record.tracks import Tracks
+from mcaprl.sims import make_sim
+
+START_NS = 1_700_000_000 * 10**9
+STEP_NS = 250_000_000
+RIGHT = 2
+# At the edge of the lane, driving away from it with 20 m/s: the first step leaves the lane.
+EDGE = {"pose": (60.0, -2.0, -math.pi / 2, 20.0)}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record an episode that is interrupted after three steps, and one that leaves the lane."""
+    path = tmp_path_factory.mktemp("phases") / "lane.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path, start_time_ns=START_NS)) as env:
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(1)
+        env.reset(seed=1)
+        while not any(env.step(RIGHT)[2:4]):
+            pass
+    return path
+
+
+def read(path: Path, topic: str, type_name: str) -> list[tuple[int, Any]]:
+    reader = McapReader(path)
+    channel = reader.channel_of(topic)
+    assert channel is not None, f"no topic {topic}"
+    return [(time, messages.decode(data, type_name)) for time, data in reader.messages(channel)]
+
+
+def test_phase_is_running_until_the_reason_of_the_end(log: Path) -> None:
+    found = [(time, text.data) for time, text in read(log, "/rl/phase", messages.TEXT_TYPE)]
+    second_ns = START_NS + 4 * STEP_NS
+    steps = mcaprl.open(log).episodes[1].length
+    assert found == [
+        (START_NS, "running"),
+        (START_NS + 3 * STEP_NS, "interrupted"),
+        (second_ns, "running"),
+        (second_ns + steps * STEP_NS, "off_lane"),
+    ]
+
+
+def test_only_the_end_of_a_failed_episode_is_a_warning(log: Path) -> None:
+    lines = [(line.level, line.msg) for _, line in read(log, "/rosout", messages.LOG_TYPE)]
+    assert [level for level, _ in lines] == [20, 20, 20, 30]
+    assert lines[3][1].startswith("episode 1 ends after ")
+    assert "off_lane" in lines[3][1]
+
+
+def test_an_environment_without_success_reasons_causes_no_warnings(tmp_path: Path) -> None:
+    path = tmp_path / "cart.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("CartPole-v1"), path)) as env:
+        env.reset(seed=0)
+        while not any(env.step(0)[2:4]):
+            pass
+    lines = read(path, "/rosout", messages.LOG_TYPE)
+    assert [line.level for _, line in lines] == [messages.INFO, messages.INFO]
+    assert read(path, "/rl/phase", messages.TEXT_TYPE)[-1][1].data == "terminated"
+
+
+def test_tracks_follow_the_vehicle_and_mark_failures(log: Path) -> None:
+    (first_ns, first), (second_ns, second) = read(
+        log, "/scene/tracks", "visualization_msgs/msg/MarkerArray"
+    )
+    ends = [int(episode.log_time_ns[-1]) for episode in mcaprl.open(log).episodes]
+    assert [first_ns, second_ns] == ends
+    assert [marker.ns for marker in first.markers] == ["", "track_0"]
+    assert [marker.ns for marker in second.markers] == ["", "track_0", "track_1", "failed_1"]
+    places = [
+        transform.transforms[0].transform.translation
+        for _, transform in read(log, "/tf", "tf2_msgs/msg/TFMessage")
+    ]
+    begin, end = first.markers[1].points[0], first.markers[1].points[-1]
+    assert math.isclose(begin.x, places[0].x, abs_tol=1 / 64)
+    mark = second.markers[3].pose.position
+    assert math.isclose(mark.x, places[-1].x, abs_tol=1 / 64)
+    assert math.isclose(mark.y, places[-1].y, abs_tol=1 / 64)
+    assert end.x != begin.x
+
+
+def test_track_colors_and_points_by_hand() -> None:
+    tracks = Tracks()
+    for episode, (steps, total_reward) in enumerate([(2, 0.0), (200, 10.0), (3, 5.0), (1, 7.0)]):
+        tracks.begin()
+        for step in range(steps):
+            tracks.add((float(step), 0.0, 1.0))
+        tracks.end(episode, total_reward, failed=episode == 2)
+    lowest, highest, middle, mark = tracks.shapes()
+    assert [len(shape.points) for shape in (lowest, highest, middle)] == [2, 64, 3]
+    np.testing.assert_allclose(lowest.color, (0.30, 0.25, 0.80, 1.0))
+    np.testing.assert_allclose(highest.color, (0.98, 0.85, 0.25, 1.0))
+    np.testing.assert_allclose(middle.color, (0.64, 0.55, 0.525, 1.0))
+    assert lowest.size[0] == 199 / 250
+    assert (mark.name, mark.position) == ("failed_2", (2.0, 0.0, 1.2))
+    assert highest.points[-1].tolist() == [199.0, 0.0, 1.2]
+
+
+def test_only_the_latest_tracks_are_kept() -> None:
+    tracks = Tracks()
+    for episode in range(40):
+        tracks.begin()
+        tracks.add((0.0, 0.0, 0.0))
+        tracks.add((1.0, 0.0, 0.0))
+        tracks.end(episode, math.nan if episode == 39 else math.inf, failed=False)
+    shapes = tracks.shapes()
+    assert [shape.name for shape in shapes] == [f"track_{k}" for k in range(8, 40)]
+    assert all(0 <= part <= 1 for shape in shapes for part in shape.color)
+
+
+def test_tracks_are_a_small_part_of_a_log_of_short_episodes(tmp_path: Path) -> None:
+    path = tmp_path / "short.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path)) as env:
+        for _ in range(60):
+            env.reset(options=EDGE)
+            env.step(1)
+    reader = McapReader(path)
+    sizes = {
+        channel.topic: sum(len(data) for _, data in reader.messages(channel))
+        for channel in reader.channels.values()
+    }
+    shown = sum(sizes[topic] for topic in ("/scene", "/scene/static", "/tf", "/telemetry"))
+    assert 0 < sizes["/scene/tracks"] <= shown / 4
