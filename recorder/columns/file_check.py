@@ -140,7 +140,10 @@ def check_file(reader: McapReader) -> list[Problem]:
     """Check the presence of a summary and the CRCs of the data section and attachments."""
     found = []
     if not reader.complete:
-        what = "the file has no summary: its writer was killed or is still running"
+        what = (
+            "the file has no summary, so viewers cannot open it: its writer was killed or is still"
+            " running"
+        )
         found.append(Problem(what, f"after byte {reader.data_end}"))
     end = None
     for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):

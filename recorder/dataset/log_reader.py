@@ -153,9 +153,11 @@ class LogReader:
             raise NoEpisodesError(f"{self.path} has no finished episode")
         extra = len(self._steps) - int(lengths.sum()) - len(lengths)
         if extra or not self._reader.complete:
+            viewers = f"; for a viewer, run `mcaprl recover {self.path} OUT`"
             warnings.warn(
                 f"{self.path} was cut off or is still being written; finished episodes read:"
-                f" {len(lengths)}, later records skipped: {extra}",
+                f" {len(lengths)}, later records skipped: {extra}"
+                + (viewers if not self._reader.complete else ""),
                 stacklevel=4,
             )
         return lengths

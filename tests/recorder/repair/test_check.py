@@ -321,3 +321,15 @@ def test_actions_outside_their_space_are_found(log_path: Path) -> None:
     found = [one for one in mcaprl.info(log_path).findings if one.severity == "problem"]
     assert [one.what for one in found] == ["1 action outside of Discrete(3)"]
     assert found[0].where == "episode 0 step 1"
+
+
+def test_a_cut_log_says_that_viewers_need_a_recovered_copy(good: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    reader = McapReader(good)
+    # The writer was killed after the chunks of all episodes.
+    cut.write_bytes(good.read_bytes()[: reader.data_end])
+    problem = check_log(cut)[0]
+    assert "viewers cannot open it" in problem.what
+    assert problem.next == f"run `mcaprl recover {cut} OUT`"
+    with pytest.warns(UserWarning, match=f"for a viewer, run `mcaprl recover {cut} OUT`"):
+        assert len(mcaprl.open(cut).episodes) == 3
