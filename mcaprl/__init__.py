@@ -5,9 +5,9 @@
     mcaprl.train(data, "runs/cql")                                            # trained policy
     policy = mcaprl.load_policy("runs/cql")                                   # loaded policy
 
-Each command of the program has a function of the same name (but `train-offline` is `train`,
-`evaluate --data` is `estimate`, and `replay` is also `verify` and `render`). Importing this package
-does not import torch or numba; functions import them when called.
+Each command of the program has a function of the same name, with three exceptions: `train-offline`
+is `train`, `evaluate --data` is `estimate`, and `replay` is split into `replay`, `verify` and
+`render`. Importing this package does not import torch or numba; functions import them when called.
 """
 
 from typing import TYPE_CHECKING

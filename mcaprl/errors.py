@@ -1,4 +1,4 @@
-"""Errors caused by data or a request of the user. Messages state the problem, place and remedy.
+"""Errors caused by data or by a user's request. Messages state the problem, place and remedy.
 
 McaprlError
 ├── UsageError            the request is invalid                       (exit code 2)
@@ -26,7 +26,7 @@ from typing import ClassVar
 
 
 class McaprlError(Exception):
-    """Base class of all errors caused by data or a request of the user."""
+    """Base class of all errors caused by data or by a user's request."""
 
     exit_code: ClassVar[int] = 1
 
@@ -58,7 +58,7 @@ class UnknownNameError(UsageError):
         self._arguments = (kind, name, names, more)
 
     def __reduce__(self) -> tuple[type[UnknownNameError], tuple[str, str, list[str], list[str]]]:
-        """Return the constructor arguments for pickle; the message does not suffice."""
+        """Return the constructor arguments for pickle; by default, pickle passes the message."""
         return type(self), self._arguments
 
 

@@ -73,7 +73,7 @@ def save_png(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Return an SVG element: `INK` becomes the text color, `PALE` the page's `--pale`."""
+    """Convert a figure to SVG: replace `INK` by the text color, and `PALE` by `--pale`."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     _make_literal(figure)
@@ -85,12 +85,12 @@ def to_svg(figure: Any) -> str:
 
 
 def tick_labels(names: Iterable[str]) -> list[str]:
-    """Return names from data as they can stand at an axis: short, without control characters."""
+    """Shorten names from data for an axis, and escape their control characters."""
     return [shortened(printable(name), _MAX_TICK_LABEL) for name in names]
 
 
 def _make_literal(figure: Any) -> None:
-    """Draw all texts of a figure as they are: texts from data may contain anything."""
+    """Turn off formulas in all texts of a figure, escape control characters, and shorten lines."""
     for text in figure.findobj(import_extra("matplotlib.text", "report").Text):
         text.set_parse_math(False)
         # Matplotlib aligns lines, each of which may be long.

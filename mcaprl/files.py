@@ -81,7 +81,7 @@ def locked_folder(folder: Path, error_type: type[McaprlError] = LogError) -> Ite
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Check that a file can be written: the path is new or that of a regular file to replace.
+    """Check that a path is new, or belongs to a regular file that may be replaced.
 
     Raises:
         OutputExistsError: The file exists, and `overwrite` is not set; or the path is that of a
@@ -128,12 +128,12 @@ def locked_file(path: Path) -> Iterator[None]:
 
 
 def open_at_once(path: Path) -> int:
-    """Open a file for reading; unlike `open`, do not wait for the writer of a FIFO."""
+    """Open a file for reading without waiting for the writer of a FIFO."""
     return os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Return whether an open file or folder is the one at a path."""
+    """Return whether an open file or folder is identical to the one at a path."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except (FileNotFoundError, NotADirectoryError):
@@ -179,14 +179,14 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
 
 
 def remove_leftover(path: Path) -> None:
-    """Remove the work folder of a killed writer of this target, if there is one."""
+    """Remove the work folder that a killed writer of this target left, if there is one."""
     if _work_path(path).is_dir():
         with suppress(OSError, LogError), work_folder(path):
             pass
 
 
 def _remove_unlocked(parent: Path, prefix: str) -> None:
-    """Remove the work folders of killed processes that wrote the same file at the same time."""
+    """Remove the work folders that killed concurrent writers left."""
     for folder in parent.iterdir():
         if folder.name.startswith(prefix) and folder.name.endswith(".part"):
             with suppress(OSError, LogError), locked_folder(folder):
@@ -247,7 +247,7 @@ def replacing(
             raise
         raise error_type(f"cannot write {path}: {error.strerror or error}") from error
     except LogError as error:
-        # A user does not know the path in the work folder, which is removed.
+        # The message names the target, because the user does not know the work folder.
         cause = error.__cause__
         if isinstance(cause, OSError) and str(folder) in str(error):
             raise LogError(f"cannot write {path}: {cause.strerror or cause}") from error
@@ -255,7 +255,7 @@ def replacing(
 
 
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:
-    """Move a complete file to its target, which no other writer has locked, atomically."""
+    """Move a complete file to its target atomically, unless another writer has locked it."""
     if not overwrite:
         # Unlike a rename, a link does not replace a file that was created in the meantime. Some
         # file systems have no links.
@@ -278,7 +278,7 @@ def write_atomically(
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON whose nesting is no deeper than a file of this package can need.
+    """Parse JSON; refuse nesting that is deeper than any file of this package needs.
 
     Raises:
         ValueError: The text is not JSON, or is nested too deeply.

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeVar
 Severity = Literal["problem", "note"]
 LISTED = 10
 """Number of findings of one kind that are listed; the others are counted."""
-# Kinds are distinguished by texts from the file, so their number is limited, too.
+# Descriptions contain texts from the file, so the number of kinds must be limited, too.
 _MAX_KINDS = 100
 _OTHERS = "other findings"
 _NUMBER = re.compile(r"-?\d[\d.,]*")
@@ -54,7 +54,7 @@ class Finding(Protocol):
 
     @property
     def what(self) -> str:
-        """Description; descriptions that differ only in numbers are of one kind."""
+        """Description. Findings whose descriptions differ only in numbers are of the same kind."""
 
 
 F = TypeVar("F", bound=Finding)
@@ -89,7 +89,7 @@ class Shortlist(list[F]):
         return self._counts.total()
 
     def rest(self) -> list[Problem]:
-        """Return one finding for each kind that has more than are listed."""
+        """Return one problem for each kind with unlisted findings; it states their number."""
         return [
             Problem(f"{count - LISTED} more findings of the kind: {kind}", "not listed")
             for kind, count in self._counts.items()

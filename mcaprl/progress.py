@@ -57,7 +57,7 @@ def terminal_bar(description: str, total: int | None) -> Iterator[Advance]:
 
 
 class _ProgressLines:
-    """Progress as lines on stderr; short operations print none."""
+    """Progress that is printed as lines to stderr; short operations print no line."""
 
     def __init__(self, description: str, total: int | None) -> None:
         self._description, self._total = description, total
@@ -100,7 +100,7 @@ ProgressCallback = Callable[[TrainingProgress], None]
 
 @contextmanager
 def terminal_progress(unit: str, term: str) -> Iterator[ProgressCallback]:
-    """Show a progress bar per seed with rate, one term and remaining time on a terminal.
+    """Show a progress bar for each seed on a terminal: rate, one term and remaining time.
 
     Args:
         unit: Unit of the total, such as `updates`.

@@ -44,7 +44,7 @@ class RunSummary:
         seed: Seed K.
         steps: Number of gradient updates (offline) or environment steps (online) of all sessions.
         resumed_at: Number of steps of earlier sessions; 0 for a new run.
-        seconds: Wall time of this session; offline, the same for seeds trained together.
+        seconds: Wall time of this session. Seeds that are trained in parallel share it.
     """
 
     folder: Path
@@ -98,7 +98,7 @@ class RunIdentity:
 
 @contextmanager
 def locked_run(folder: Path, resume: bool) -> Iterator[None]:
-    """Lock a run folder against other trainings; create it if it is missing and not resumed.
+    """Lock a run folder against other trainings; create the folder of a new run.
 
     Raises:
         OutputExistsError: `folder` is a file.
@@ -115,7 +115,7 @@ def locked_run(folder: Path, resume: bool) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Report an OSError of the body as a TrainingError: `path` cannot be written."""
+    """Convert an OSError of the body to a TrainingError that names `path`."""
     try:
         yield
     except OSError as error:
@@ -161,7 +161,7 @@ def seed_folder(run: Path, seed: int) -> Path:
 
 
 def run_to_resume(folder: Path) -> dict[str, Any]:
-    """Return the config of a run; empty if the run ended before it was written.
+    """Return the config of a run, or an empty dict if the run ended before writing its config.
 
     Raises:
         TrainingError: There is no run in the folder, or its config cannot be read.
@@ -231,7 +231,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def read_curves(run: Path, name: str) -> list[Curve]:
-    """Read the curves file, `metrics.csv` or `curve.csv`, of each seed that has one."""
+    """Read the file NAME, `metrics.csv` or `curve.csv`, of each seed that has it."""
     return [read_curve(path) for path in sorted(run.glob(f"seed-*/{name}"))]
 
 

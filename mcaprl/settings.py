@@ -96,7 +96,7 @@ def flag(name: str) -> str:
 
 
 def field_help(config_type: type) -> dict[str, str]:
-    """Return the help of each field of a dataclass by name, inherited fields first."""
+    """Return a dict from the field names of a dataclass to help texts, inherited fields first."""
     assert is_dataclass(config_type)
     lines: dict[str, str] = {}
     for base in reversed(config_type.__mro__):

@@ -51,7 +51,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
-    """Check, before layers are created, that the weights of a file suffice for them.
+    """Check that a file has enough weights for layers, before the layers are created.
 
     Args:
         widths: Numbers of inputs, hidden units and outputs of successive layers.
@@ -65,11 +65,11 @@ def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
     present = sum(tensor.numel() for tensor in weights.values())
     needed = max((first * second for first, second in itertools.pairwise(widths)), default=0)
     if needed > present:
-        raise ValueError(f"a layer has {needed} weights, more than the {present} of the file")
+        raise ValueError(f"a layer has {needed} weights, more than the {present} in the file")
 
 
 def convolved_features(image_shape: Iterable[int], channels: int = 64) -> int:
-    """Return the number of outputs of the convolutions of Nature DQN; 0 for too small an image.
+    """Return how many features Nature DQN's convolutions output; 0 if the image is too small.
 
     Args:
         image_shape: (height, width, ...) of the image.

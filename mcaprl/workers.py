@@ -1,4 +1,4 @@
-"""Worker processes that end with their parent, however it ends."""
+"""Worker processes that end when their parent ends, even if it is killed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 _STOPS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# Shells let background processes ignore SIGINT; Windows has no SIGTERM from within.
+# Shells make background processes ignore SIGINT. On Windows, a process cannot handle SIGTERM.
 _END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 
@@ -51,8 +51,8 @@ def run_workers(
 ) -> None:
     """Run a task in one process for each request, until all are done.
 
-    If a worker fails, or this process is interrupted, all other tasks are interrupted with
-    KeyboardInterrupt and end before this function does. If this process is killed, too, they are.
+    If a worker fails, or this process is interrupted, all other tasks receive a KeyboardInterrupt,
+    and this function waits until they end. They also receive it if this process is killed.
 
     Args:
         task: Function of a module, called with a request and a function that sends a message.
@@ -65,7 +65,7 @@ def run_workers(
         Exception: The task of a worker raised it.
     """
     context = multiprocessing.get_context("spawn")
-    # No worker has the other end of this pipe: it closes when this process ends.
+    # Only this process holds the other end of this pipe, so the end closes with the process.
     ours, held = context.Pipe(duplex=False)
     processes = []
     open_pipes: dict[Connection, int] = {}
@@ -98,7 +98,7 @@ def run_workers(
     finally:
         held.close()
         for messages in open_pipes:
-            # A worker that waits for room in its pipe would not end.
+            # Empty the pipe: a worker that waits for room in it would not end.
             with suppress(EOFError, OSError):
                 while True:
                     messages.recv_bytes()
@@ -109,7 +109,7 @@ def run_workers(
 def _work(
     task: Callable[[T, Callable[[Any], None]], None], request: T, parent: Connection, to: Connection
 ) -> None:
-    """Run a task; send its messages and how it ended."""
+    """Run a task; send its messages, and finally its outcome."""
     outcome: tuple[_Kind, Any]
     try:
         for number in _STOPS:
@@ -140,7 +140,7 @@ def _send(to: Connection, content: Any) -> None:
 
 
 def _end_with(parent: Connection) -> None:
-    """Interrupt the main thread when the parent closes its end of a pipe, or ends."""
+    """Interrupt the main thread when the parent ends or closes its end of the pipe."""
     with suppress(EOFError, OSError):
         parent.recv()
     if sys.platform == "win32":
@@ -153,13 +153,13 @@ def _end_with(parent: Connection) -> None:
 
 
 def _interrupt_once(*_: Any) -> None:
-    # The terminal and the parent both interrupt; the second must not interrupt the clean-up.
+    # The terminal and the parent both send a signal. The second must not interrupt the clean-up.
     _ignore_stops()
     raise KeyboardInterrupt
 
 
 def _ignore_stops() -> None:
-    # With SIG_IGN, Python reports a signal that has already arrived.
+    # SIG_IGN is not used: with it, Python prints an error for a signal that has already arrived.
     for number in _STOPS:
         signal.signal(number, _ignore)
 
@@ -170,11 +170,11 @@ def _ignore(*_: Any) -> None:
 
 @contextmanager
 def _signals_blocked() -> Iterator[None]:
-    """Block signals in this thread and in the processes that it starts, which unblock them."""
+    """Block signals in this thread and the processes it starts; the processes unblock them."""
     if sys.platform == "win32":
         yield
         return
-    # It would unblock the signals if it started later.
+    # The resource tracker unblocks the signals when it starts, so start it first.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOPS)
     try:

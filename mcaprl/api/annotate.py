@@ -54,7 +54,7 @@ def annotate(
         file: Path of the log.
         out: Path of the copy.
         policy: Path of a trained run, or several paths.
-        gamma: Discount of the TD errors; None for that of the run.
+        gamma: Discount of the TD errors; None for the discount of the run.
         scene: Whether to step the sim again and add its scene.
         camera: Whether to add metric depth images to the scene.
         sim: Short name or Gymnasium id to use instead of the logged one.
@@ -64,7 +64,8 @@ def annotate(
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: Nothing is requested, the log already has it, or `gamma` is out of range.
+        UsageError: Nothing is requested, the log already has a requested topic, or `gamma` is out
+            of range.
         UnknownNameError: There is no such policy.
         PolicyError: A policy was trained on spaces other than the log's.
         LogError: The log cannot be read, or the sim does not reproduce it.
@@ -89,7 +90,7 @@ def annotate(
 def _values(
     dataset: Dataset, name: str, gamma: float | None, progress: ProgressBar
 ) -> list[tuple[Any, Any]]:
-    """Return each episode with the values of the first policy of a run."""
+    """Compute the values that a run's first policy assigns to the steps of each episode."""
     from mcaprl.offline.estimate.values import gamma_of_run, value_columns
 
     policy: Any = trained_policies(name, dataset)[0]

@@ -47,8 +47,8 @@ def sim_of(
         **others: Additional arguments of the environment.
 
     Raises:
-        UsageError: The log has no environment id, or one that must be trusted; or the environment
-            cannot be made.
+        UsageError: The log has no environment id, its environment needs `trust_env`, or the
+            environment cannot be made.
     """
     name = sim or dataset.env_id
     if not name:
@@ -59,7 +59,7 @@ def sim_of(
 
 
 def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None:
-    """Check that a log makes nobody import a module or call a constructor with its arguments."""
+    """Refuse a log that names a module to import, or arguments for an unknown environment."""
     if sim is None and ":" in dataset.env_id:
         module = dataset.env_id.partition(":")[0]
         raise UsageError(

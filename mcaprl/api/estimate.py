@@ -124,7 +124,7 @@ def estimate(
 
 
 def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Return the policies by their names in tables."""
+    """Load the policies; return a dict from the names for tables to the policies."""
     shown = policy_names(names)
     found: dict[str, StochasticPolicy | None] = {}
     for name in dict.fromkeys(names):

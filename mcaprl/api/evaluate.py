@@ -115,8 +115,8 @@ def evaluate(
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: `behavior` is of another sim or would be overwritten, or a number is out of
-            range.
+        UsageError: `behavior` was recorded in another sim or would be overwritten, or a number is
+            out of range.
         UnknownNameError: There is no such sim or policy.
         PolicyError: A policy has other spaces than the sim.
         OutputExistsError: `record` exists.
@@ -187,13 +187,18 @@ def _set_policy(recorder: RecordMcap | None, name: str) -> None:
 
 
 def _behavior(data: str, env: gym.Env[Any, Any], record: Path | None) -> LoggedReturns:
-    """Return the returns of logs, which are of this environment and are not overwritten."""
+    """Return the episode returns in logs.
+
+    Check that the logs were recorded in this environment and are not overwritten.
+    """
     if record is not None and record.resolve() in [path.resolve() for path in find_logs(data)]:
         raise UsageError(f"{record} is in --behavior {data}: record the episodes elsewhere")
     dataset = open_logs(data)
     env_id = env.spec.id if env.spec else ""
     if not same_env(dataset.env_id, env_id):
-        raise UsageError(f"--behavior {data} is of {dataset.env_id or 'unknown'}, not of {env_id}")
+        raise UsageError(
+            f"--behavior {data} was recorded in {dataset.env_id or 'unknown'}, not in {env_id}"
+        )
     returns = dataset.statistics.returns
     interval = mean_interval(returns[None])
     return LoggedReturns(data, len(returns), float(returns.mean()), interval)

@@ -129,7 +129,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     """Return the policies that a name refers to: one, or one per training seed of a run.
 
     Args:
-        name: `pilot`; `random`, which is [None]; or a path.
+        name: `pilot`, a path, or `random`, for which the result is [None].
         env: Environment in which the policies will act.
 
     Raises:

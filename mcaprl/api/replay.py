@@ -196,7 +196,7 @@ def render(
         episode: Index of the episode.
         speed: Simulated seconds per second of the video.
         video: Video to write: .mp4 or .gif.
-        contact_sheet: Image to write, .png, with evenly spaced steps.
+        contact_sheet: PNG image to write; it shows evenly spaced steps.
         overwrite: Whether existing files are replaced.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged

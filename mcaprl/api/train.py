@@ -51,8 +51,8 @@ def train(
         data: Dataset, file, folder or glob of logs, or several of them. `PATH:2` draws
             the transitions of PATH twice as often as others.
         out: Run folder to create.
-        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`; None for that of the resumed
-            run, or else `cql`.
+        algo: `dqn`, `double-dqn`, `cql`, `bc`, `bcq` or `iql`; None for `cql` or, with `resume`,
+            for the algorithm of the run.
         seeds: Number of networks, which are trained in parallel.
         seed: Seed of the first network; network k uses seed + k.
         threads: Number of threads of PyTorch and of the reader.
@@ -62,8 +62,8 @@ def train(
         other_data: Whether `resume` accepts checkpoints trained on other data.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
-        **settings: Settings of the algorithm; their defaults are the algorithm's, or with `resume`
-            the run's.
+        **settings: Settings of the algorithm. Missing settings have the defaults of the algorithm
+            or, with `resume`, the values of the run.
 
     Returns:
         One summary for each seed.
@@ -115,7 +115,7 @@ def train(
             seed=seed,
             weights=weights,
             resume=resume,
-            # The checkpoints were trained on the logs before they grew.
+            # The logs have grown since the checkpoints were trained.
             other_data=other_data or follow,
             follow=growing,
             device=device,
@@ -151,8 +151,8 @@ def train_online(
     """Train a policy in a sim; the same seed and machine produce the same curve.
 
     Args:
-        sim: Short name of a sim, or a Gymnasium id; None for that of the preset or of the resumed
-            run.
+        sim: Short name of a sim, or a Gymnasium id; None for the sim of the preset or of the
+            resumed run.
         out: Run folder to create.
         algo: `dqn`, `double-dqn`, `ppo` or `a2c`; None for the default of the preset, run or sim.
         preset: Name of published settings.
@@ -172,8 +172,8 @@ def train_online(
         sim_options: Other arguments of the environment.
         on_live: Function called with the address once viewers can connect.
         progress: Function called repeatedly during training.
-        **settings: Settings of the algorithm; their defaults are the preset's or the sim's, or
-            with `resume` the run's.
+        **settings: Settings of the algorithm. Missing settings have the defaults of the preset or
+            the sim or, with `resume`, the values of the run.
 
     Returns:
         One summary for each seed.
@@ -184,7 +184,7 @@ def train_online(
             range.
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support the observations or actions.
-        PolicyError: The policy's network in `sources` differs from the agent's.
+        PolicyError: The policy in `sources` has a different network than the agent.
         TrainingError: `out` cannot be written, or contains a run of another task.
         MissingExtraError: The packages of the `online` extra are not installed.
     """
@@ -221,7 +221,7 @@ def train_online(
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
-    """Return the dataset and the policies, one per seed, among the sources."""
+    """Open the logs among the sources as one dataset, and load the policies of the run, if any."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")

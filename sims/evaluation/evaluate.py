@@ -139,7 +139,7 @@ def evaluate(
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
-    """Add the score on the scale random = 0, pilot = 1; do nothing without a pilot."""
+    """Add the score on the scale random = 0, pilot = 1; without a pilot, change nothing."""
     if pilot is None or pilot.mean_return == random.mean_return:
         return score
     span = pilot.mean_return - random.mean_return

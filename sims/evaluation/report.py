@@ -61,7 +61,7 @@ def comparison_figure(
         label = f"{score.mean_return:.1f}"
         if score.normalized_score is not None:
             label += f"   score {score.normalized_score:.2f}"
-        # The label follows the longest of bar, interval and dots.
+        # The label is to the right of the bar, the interval and the dots.
         end = max(high, 0.0, float(means.max()))
         text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
         # The line of the logged behavior may cross the label.

@@ -1,7 +1,7 @@
 """Statistics of returns: robust means, comparisons of policies, and intervals.
 
-Returns have the shape (S, E): S training seeds, E episodes of each, which have the same starts for
-all seeds.
+Returns have the shape (S, E): S training seeds with E episodes each. Episode e starts in the same
+state for all seeds.
 
     Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice",
     https://arxiv.org/abs/2108.13264
@@ -13,8 +13,8 @@ means of the seeds:
     Zou and Donner, "Construction of confidence limits about effect measures: a general approach",
     Statistics in Medicine 27, 2008
 
-Intervals of other statistics are percentiles of bootstrap samples, which draw seeds with
-replacement, and then episodes within each.
+Intervals of other statistics are percentiles of bootstrap samples. A sample draws seeds with
+replacement, and then episodes within each drawn seed.
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def interquartile_mean(returns: Floats) -> Floats:
 def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the mean.
 
-    With several seeds, the deviations of two limits from the mean are added in squares: Student's t
-    over the means of the seeds, and bootstrap-t over the means of the starts. Neither contains the
-    other: all seeds have the same starts.
+    With several seeds, two intervals are combined: Student's t over the means of the seeds, and
+    bootstrap-t over the means of the starts. The squared distances of their limits from the mean
+    are added, because neither interval covers the variation of the other.
 
     Args:
         returns: (S, E) returns.
@@ -140,16 +140,16 @@ def _improvement(firsts: Floats, seconds: Floats) -> Floats:
 
 
 def _student_interval(values: Floats) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of values (N,), N > 1, if these are normal."""
+    """Return the 95 % interval of the mean of N > 1 normally distributed values."""
     half = student_quantile(len(values) - 1) * _standard_errors(values)
     return float(values.mean() - half), float(values.mean() + half)
 
 
 def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
-    """Return the 95 % bootstrap-t interval of the mean of values (N,), N > 1.
+    """Return the 95 % bootstrap-t interval of the mean of N > 1 values.
 
-    Each limit is at least as far from the mean as that of Student's t, because few or equal values
-    have few different bootstrap samples. Samples without a standard error are excluded.
+    Few or equal values have few different bootstrap samples. Therefore, the interval is at least as
+    wide as that of Student's t on each side. Samples without a standard error are excluded.
     """
     random = np.random.default_rng(seed)
     count, mean, error = len(values), values.mean(), _standard_errors(values)
@@ -176,7 +176,8 @@ def _standard_errors(values: Floats) -> Floats:
 def student_quantile(degrees_of_freedom: int) -> float:
     """Return the 97.5 % quantile of Student's t, within 0.1 %.
 
-    Between the degrees of the table, it is linear in their inverse. SciPy is not a requirement.
+    Values between the rows of a table are interpolated linearly in 1 / degrees of freedom. SciPy,
+    which has this function, is not a dependency of this package.
     """
     degrees = np.array(list(_STUDENT))
     quantiles = np.array(list(_STUDENT.values()))
@@ -184,7 +185,7 @@ def student_quantile(degrees_of_freedom: int) -> float:
 
 
 def _resampled(returns: Floats, random: np.random.Generator) -> Floats:
-    """Return (RESAMPLES, S, E) bootstrap samples of seeds, and of episodes within each seed."""
+    """Draw (RESAMPLES, S, E) bootstrap samples: first the seeds, then episodes of each seed."""
     seeds, episodes = returns.shape
     rows = random.integers(seeds, size=(RESAMPLES, seeds, 1))
     columns = random.integers(episodes, size=(RESAMPLES, seeds, episodes))

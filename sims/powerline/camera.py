@@ -1,8 +1,8 @@
 """Depth camera of the drone; renders the ground, the firs, the towers and the conductors.
 
 The mesh is in ROS axes, like the scene for viewers. Towers are rendered as solids without lattice.
-Conductors are drawn one pixel wide at any distance, because a real one of 3 cm is thinner than a
-pixel from a distance of 1.3 m.
+Conductors are drawn one pixel wide at any distance, because a conductor with the real diameter of
+3 cm is thinner than a pixel beyond 1.3 m.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def step_classic(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Advance N drones by one decision each, in place; arguments as in `step_flights`.
+    """Advance N drones by one decision each, in place; see `step_flights` for the arguments.
 
     The wind is constant within an episode.
     """

@@ -54,7 +54,7 @@ TREE_COUNT = 240
 
 
 class Place(NamedTuple):
-    """Nearest point of the line to a position."""
+    """Point of the line that is nearest to a position."""
 
     leg: int
     along_m: float
@@ -123,7 +123,7 @@ def nearest_on_line(position_m: Vector) -> Place:
 def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
     """Return the distance to the infinite line through a leg, meters.
 
-    |(p - a) x t| for a point p, a point a on the line, and the line's unit vector t.
+    It is |(p - a) x t| for a position p, a point a on the line, and the line's unit vector t.
     """
     start = Vector(POINTS_M[leg, 0], POINTS_M[leg, 1], POINTS_M[leg, 2])
     tangent = Vector(TANGENTS[leg, 0], TANGENTS[leg, 1], TANGENTS[leg, 2])
@@ -248,7 +248,7 @@ def towers() -> tuple[Tower, ...]:
 
 
 def _wires() -> Floats:
-    """Return the points of the conductors (12, CHORDS + 1, 3), three conductors for each span."""
+    """Return the points (12, CHORDS + 1, 3) of the 12 conductors; each span has three."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     found = towers()
     wires = []

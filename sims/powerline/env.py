@@ -65,32 +65,34 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     | 16 | exp(-distance to the leg's end / 10 m) | 1 | 1 |
     | 17 | distance along the line to the furthest point so far | 10 m | 10 |
 
-    `observation="depth"`: a `Dict` of `depth`, (84, 84, 1) uint8, the camera's depth, encoded by
-    `mcaprl.sims.drawing.depth.encode_depth`, 255 where there is no surface; and `motion`, 6
-    float32, rows 3 to 8 of the table. Conductors are drawn one pixel wide to be visible. With
-    `rules="classic"`, the observation is only the image, encoded by `encode_nearness`.
+    `observation="depth"`: a `Dict` of two parts. `depth`, (84, 84, 1) uint8, is the camera's depth,
+    encoded by `mcaprl.sims.drawing.depth.encode_depth`; it is 255 where there is no surface.
+    `motion`, 6 float32, has the values 3 to 8 of the table. Conductors are drawn one pixel wide to
+    be visible. With `rules="classic"`, the observation is only the image, encoded by
+    `encode_nearness`.
 
     ## Rewards
 
-    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds along the line beyond the
-    furthest point so far, at distance d from the line; highest at 5 m/s. +5 in addition for
-    finishing; -5 instead for leaving the line or a collision.
+    The reward is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from
+    the line, and ds is its progress along the line beyond the furthest point so far. The reward is
+    highest at 5 m/s. Finishing adds 5. Leaving the line or a collision gives -5 instead.
 
     ## Starting State
 
-    `start="line"`: after 5 s at (1, -0.5, -1) m/s from the first point, with an offset of up to
-    0.2 m on each axis.
-    `start="anywhere"`: half of the episodes as above; the others at a random position on the
-    line, except its last 20 m, with an offset of up to 1 m, along the line at 0 to 5 m/s, rounded
-    to 0.5 m/s on each axis.
+    `start="line"`: the drone has flown for 5 s with the command (1, -0.5, -1) m/s from the first
+    point of the line, with an offset of up to 0.2 m on each axis.
+    `start="anywhere"`: half of the episodes start as above. The others start at a random position
+    on the line, except its last 20 m, with an offset of up to 1 m. The drone flies along the line
+    at 0 to 5 m/s; the velocity is rounded to 0.5 m/s on each axis.
     `reset(options={"pose": (x_m, y_m, z_m)})`, optionally with the velocity in m/s as three more
     numbers, starts at that pose; the velocity is also the first command.
 
     ## Episode End
 
-    Terminated with `info["reason"]` = `off_line` (more than 7 m from the line), `collision` (less
-    than 0.6 m from a conductor, 1.2 m from the middle of a tower's mast or arm, 0.3 m from the
-    ground) or `finished` (1 m before the line's end). Truncated after 400 steps.
+    An episode terminates with `info["reason"]` = `off_line` (more than 7 m from the line),
+    `collision` (less than 0.6 m from a conductor, 1.2 m from the middle of a tower's mast or arm,
+    or 0.3 m from the ground) or `finished` (1 m before the line's end). It is truncated after 400
+    steps.
 
     `info` contains lateral_offset_m (left positive), vertical_offset_m (up positive),
     line_distance_m, speed_m_s and progress_m (distance along the line since the start).
@@ -101,7 +103,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     with a lag of 0.5 s. A decision lasts 5 s; actions change the *measured* velocity by
     0.25 m/s. The reward is (exp(-d) - 0.5) + (speed - 0.5), with the distance d to the nearest of
     the *infinite* lines through the legs. An episode terminates beyond 7 m with -10, and at a
-    collision with -100. It starts after 5 s at (1, -0.67, -0.8) m/s. Known faults:
+    collision with -100. It starts after 5 s of flight with the command (1, -0.67, -0.8) m/s. Known
+    faults:
 
     - Speed is rewarded in any direction: flying back and forth has a higher return than following
       the line.
@@ -110,8 +113,9 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     - Hovering on the line costs nothing and never ends the episode; flying backward is rewarded
       like flying forward.
     - Commands that change the measured velocity drift: the effects of gusts and lag persist.
-    - 5 s is too long for corrections: the drone flies 25 m at 5 m/s; 7 m is the limit.
-    - The image encoding uses half of its values for distances of 1 to 2 m.
+    - Decisions of 5 s are too long for corrections: at 5 m/s, the drone flies 25 m, but an episode
+      terminates 7 m from the line.
+    - The image encoding spends half of its values on distances of 1 to 2 m.
 
     The world and the lag differ from the published ones, and images are downsampled by averaging
     instead of interpolation. A collision stops the drone.
@@ -152,11 +156,11 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return {**powerline_scene.telemetry(self.flight), **self.fleet.info(0)}
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return the camera's (84, 84) distances along each ray, meters, or infinity."""
+        """Return (84, 84) distances along the camera's rays, meters; infinity without surface."""
         return self.fleet.depth_image_m(0)
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that never change; those of the drone are in the frame `drone`."""
+        """Return the shapes that never change; the drone's shapes are in the frame `drone`."""
         return powerline_scene.static_shapes()
 
     def scene(self) -> Sequence[Shape]:

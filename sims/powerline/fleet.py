@@ -45,7 +45,7 @@ _INFO = ("lateral_offset_m", "vertical_offset_m", "line_distance_m", "speed_m_s"
 
 
 class PowerlineFleet(Fleet):
-    """N drones on the line, each with its own wind; arguments as in `PowerlineEnv`."""
+    """N drones on the line, each with its own wind; see `PowerlineEnv` for the arguments."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
@@ -150,7 +150,7 @@ class PowerlineFleet(Fleet):
         return {key: np.stack([each[key] for each in seen]) for key in ("depth", "motion")}
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Return drone i's (84, 84) distances along each ray, meters, or infinity."""
+        """Return (84, 84) distances along the rays of drone i, meters; infinity without surface."""
         if i not in self._depth_m:
             if self._camera is None:
                 self._camera = DroneCamera(self.camera_view)

@@ -25,7 +25,7 @@ NO_CHANGE = len(ACTION_MEANINGS) - 1
 
 @compiled
 def corner_speed(leg: int) -> float:
-    """Return the speed, m/s, for the corner at a leg's end; lower for sharper corners."""
+    """Return the speed, m/s, for the corner at a leg's end; sharper corners need a lower speed."""
     if leg + 1 >= LEGS:
         return MAX_SPEED_M_S
     cosine = 0.0

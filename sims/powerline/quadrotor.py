@@ -184,9 +184,9 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
     """Return the acceleration with which the velocity controller approaches the command.
 
-    On each axis, the sum of k (c - v), the drag at the commanded speed, and the integral of the
-    deviation from the reference velocity, which is caused by wind but not by command changes;
-    limited to 6 m/s^2.
+    On each axis, add k (c - v), the drag at the commanded speed, and the integral of the deviation
+    from the reference velocity. Wind causes such a deviation; a change of the command does not. The
+    result is limited to 6 m/s^2.
     """
     c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
     return Vector(_asked(c.x, v.x, i.x), _asked(c.y, v.y, i.y), _asked(c.z, v.z, i.z))
@@ -212,9 +212,9 @@ def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
     """Return the commanded thrusts of the rotors, newtons, for a desired acceleration.
 
     The desired attitude is the shortest rotation from upright that points the body's z axis along
-    g - a. The attitude error determines the commanded angular velocity, and the angular velocity
-    error the torques: the cascade of Mellinger and Kumar, "Minimum snap trajectory generation and
-    control for quadrotors", ICRA 2011.
+    g - a. The attitude error determines the commanded angular velocity. The error of the angular
+    velocity determines the torques. Mellinger and Kumar describe this cascade in "Minimum snap
+    trajectory generation and control for quadrotors", ICRA 2011.
     """
     down = minus(Vector(0.0, 0.0, GRAVITY_M_S2), wanted_m_s2)
     size = norm(down)

@@ -125,7 +125,7 @@ def store_flight(flight: Flight, row: NDArray[np.float64]) -> None:
 
 @compiled
 def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Return the start of a flight at its commanded velocity."""
+    """Return a flight that begins at a position, already at its commanded velocity."""
     drone = cruising(position_m, command_m_s)
     place = nearest_on_line(position_m)
     return Flight(drone, command_m_s, wind_m_s, Vector(0.0, 0.0, 0.0), place.along_m)
@@ -133,7 +133,7 @@ def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
 
 @compiled
 def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Return the flight 5 s after a command to a drone that hovers at a position."""
+    """Return the flight of a drone that hovered at a position and got a command 5 s ago."""
     drone = cruising(position_m, Vector(0.0, 0.0, 0.0))
     drone = fly(plant, drone, command_m_s, wind_m_s, APPROACH_S)
     along_m = nearest_on_line(drone.position_m).along_m
@@ -142,7 +142,7 @@ def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vect
 
 @compiled
 def commanded(command_m_s: Vector, action: int) -> Vector:
-    """Return the command after an action; unchanged if it would exceed 8 m/s."""
+    """Return the command after an action; ignore an action that would exceed 8 m/s."""
     direction = vector_at(DIRECTIONS[action], 0)
     changed = plus(command_m_s, times(VELOCITY_STEP_M_S, direction))
     return changed if norm(changed) <= MAX_COMMAND_M_S else command_m_s
@@ -189,10 +189,10 @@ def end_of(position_m: Vector, place: Place) -> int:
 def reward_of(furthest_m: float, after: Flight, end: int) -> float:
     """Return the reward of a decision.
 
-    min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m, for progress ds beyond `furthest_m`, the
-    maximum progress before the decision, at distance d from the line; +5 for the finish, -5 for a
-    failure. The reward decreases beyond 5 m/s: if it were constant there, an agent with a discount
-    would fly too fast, although a crash forfeits the rewards of the remaining line.
+    It is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from the line,
+    and ds is its progress beyond `furthest_m`, the maximum before the decision. The finish adds 5;
+    a failure gives -5 instead. The reward decreases beyond 5 m/s. If it were constant there, an
+    agent with a discount would fly too fast, although a crash forfeits the remaining rewards.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD
@@ -230,8 +230,8 @@ def store_bearings(flights: NDArray[np.float64], bearings: NDArray[np.float64]) 
 
     Args:
         flights: (N, 33) rows of `Flight`.
-        bearings: (N, 5) output: offsets from the line to the left and up, distance from it, speed,
-            and distance along it.
+        bearings: (N, 5) output: offset to the left of the line, offset above the line, distance
+            from the line, speed, and distance along the line.
     """
     for i in range(len(flights)):
         drone = drone_at(flights[i])

@@ -51,7 +51,7 @@ def ros(ned: Vector) -> tuple[float, float, float]:
 
 
 def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> list[Shape]:
-    """Color triangles (T, 3, 3) by their angle to the sun; one shape per brightness level."""
+    """Return triangles (T, 3, 3), shaded by their angle to the sun; one shape per brightness."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     light = np.clip(normals @ SUN / np.linalg.norm(normals, axis=1), 0.0, 1.0)
     classes = np.minimum((light * SHADES).astype(np.int64), SHADES - 1)
@@ -153,7 +153,7 @@ def ground_shapes() -> tuple[Shape, ...]:
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Return the shapes that never change: the world in `map`, ground first, and the drone."""
+    """Return the shapes that never change: the ground, the rest of the world, and the drone."""
     return (*ground_shapes(), *_line(), *_drone())
 
 
@@ -162,7 +162,7 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     position = flight.drone.position_m
     place = course.nearest_on_line(position)
     here = np.array(ros(position))
-    # Shapes at the drone are in its frame: they then repeat and compress well in logs.
+    # Shapes near the drone use its frame, so that their points repeat and compress well in logs.
     level, origin = "base_stabilized", np.zeros(3)
     link = np.array([origin, ros(place.point_m) - here])
     ahead = np.array([ros(course.point_on_line(place.along_m + 6.0)) - here])
@@ -180,8 +180,8 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
 def drone_frames(drone: Drone) -> tuple[Frame, ...]:
     """Return the drone's level frame in the map, and the body's frame in the level frame.
 
-    NED axes are ROS axes rotated by half a turn about x, for the world and for the body; therefore
-    y and z change sign in quaternions as in vectors.
+    Both in the world and in the body, NED axes are ROS axes rotated by half a turn about x.
+    Therefore, y and z change sign, in vectors and in quaternions.
     """
     q = drone.attitude
     return (

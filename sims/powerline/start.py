@@ -49,14 +49,17 @@ def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
 def start_on_line(
     random: np.random.Generator, plant: int, command: tuple[float, float, float], wind: Vector
 ) -> Flight:
-    """Return the flight 5 s after a command, m/s, to a drone that hovers near the first point."""
+    """Return the flight of a drone that hovered near the first point and got a command 5 s ago."""
     noise = random.uniform(-FIRST_POINT_NOISE_M, FIRST_POINT_NOISE_M, 3)
     position = Vector(*(POINTS_M[0] + noise).tolist())
     return approach(plant, position, Vector(*command), wind)
 
 
 def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
-    """Return a flight along the line at a random position, rounded to 0.5 m/s on each axis."""
+    """Return a flight along the line from a random position, at a random speed.
+
+    The velocity is rounded to 0.5 m/s on each axis.
+    """
     along_m = float(random.uniform(0.0, LENGTH_M - LAST_START_M))
     point = point_on_line(along_m)
     speed_m_s = random.uniform(0.0, MAX_SPEED_M_S)

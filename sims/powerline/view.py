@@ -1,4 +1,4 @@
-"""Top view of the powerline sim, with a side view along the line in a strip below.
+"""Top view of the powerline sim; a strip below it shows a side view along the line.
 
 In the top view, x (north) points right and y (west) up, as in the ROS axes of the scene.
 """

@@ -7,7 +7,7 @@ SPEC = SimSpec(
     env_id="mcaprl/Racer-v0",
     entry_point="mcaprl.sims.racer.env:RacerEnv",
     vector_entry_point="mcaprl.sims.racer.env:BatchedRacerEnv",
-    # The limit of the classic rules; episodes of the default rules end earlier.
+    # Only the classic rules reach this limit; the default rules truncate after 1,000 steps.
     max_episode_steps=10_000,
     pilot="mcaprl.sims.racer.pilot:RacerPilot",
     engine="numba",

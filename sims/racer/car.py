@@ -66,9 +66,9 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 def placed(
     track: Track, x_px: float, y_px: float, heading_rad: float, speed_px: float, near_m: float
 ) -> Car:
-    """Return a car on a track before its first step; its next gate is the first one ahead.
+    """Return a car on a track before its first step; the gate ahead is its next gate.
 
-    Search its position on the path within half a lap of `near_m`.
+    The car's position along the path is searched within half a lap of `near_m`.
     """
     half_lap_m = 0.5 * track.path.length_m
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)

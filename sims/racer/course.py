@@ -98,9 +98,9 @@ def asphalt(track: Track) -> Floats:
 
 
 def _progress(path: Path, corners_px: Floats) -> list[float]:
-    """Return how far along the path each wall corner of one side is.
+    """Return the distance along the path to each wall corner of one side.
 
-    The last item is the first corner again, a lap later.
+    The last item is the first corner again, one lap later.
     """
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
@@ -169,18 +169,18 @@ def _left_normals(center: Floats) -> Floats:
 
 
 def _along(line: Floats) -> Floats:
-    """Return the distance of each point from the first, along the line."""
+    """Return the distance along the line from its first point to each point."""
     steps = np.diff(line, axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
 
 
 def _at(values: Floats, along: Floats, places: Floats) -> Floats:
-    """Interpolate values (M, 2) at distances `along` to the distances `places`."""
+    """Interpolate values (M, 2), known at the distances `along`, at the distances `places`."""
     return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
 
 
 def _wall(line: Floats) -> Floats:
-    """Approximate a closed line by `WALLS_PER_SIDE` walls (W, 4); they are shorter in bends."""
+    """Approximate a closed line by `WALLS_PER_SIDE` walls (W, 4); walls in bends are shorter."""
     tangents = _tangents(line)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(yaw)))])
@@ -212,7 +212,7 @@ def _distance(start: Floats, direction: Floats, walls: Floats) -> float:
 
 
 def _random_controls(random: np.random.Generator) -> Floats:
-    """Draw control points around the image's center, counter-clockwise from the left."""
+    """Draw random control points around the image's center, counter-clockwise from the left."""
     count = int(random.integers(11, 16))
     angles = math.pi - (np.arange(count) + random.uniform(-0.25, 0.25, count)) * (
         2 * math.pi / count

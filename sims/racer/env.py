@@ -74,21 +74,22 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     ## Rewards
 
-    +1 if the car's center passes the next gate, -1 for a crash, otherwise 0.
+    The reward is +1 if the car's center passes the next gate, -1 for a crash, and otherwise 0.
 
     ## Starting State
 
     `start="anywhere"`: a random position on the track, with an offset of up to 12 pixels and 0.2
-    rad from its center line, at 0 to 6 pixels per step.
+    rad from the center line. The speed is 0 to 6 pixels per step.
     `start="line"`: (50, 300) pixels, facing down in the image, with an offset of up to 3 pixels and
-    0.05 rad, at rest; on random tracks, the start of their path.
+    0.05 rad. The car is at rest. On a random track, it is at the start of the track's path.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
     number, starts at that pose.
 
     ## Episode End
 
-    Terminated with `info["reason"]` = `crash` if a wall intersects an edge of the car. Truncated
-    with `no_gate` after 100 steps without a gate, and with `time_limit` after 1,000 steps.
+    An episode terminates with `info["reason"]` = `crash` if a wall intersects an edge of the car.
+    It is truncated with `no_gate` after 100 steps without a gate, and with `time_limit` after 1,000
+    steps.
 
     `info` contains lateral_offset_m, heading_error_rad, speed_m_s, progress_m (distance along the
     center line since the start, over all laps) and gates_passed.
@@ -99,15 +100,15 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
     - Forward and back are swapped: `forward` drives in the direction opposite to ray 0, so that
       gates can only be passed with `back`. The observed speed has the sign of `forward`.
-    - The lengths of the rays of the front's corners are measured from the car's center. The
-      sideways rays cross the nose: from the left corner to the right, and vice versa.
+    - Rays that start at the front corners have lengths that are measured from the car's center. The
+      sideways ray of the left corner points right, across the nose, and vice versa.
     - The hit point of a ray is rounded down to whole pixels, so that a car in the middle of a
       straight observes unequal distances.
-    - Rays are observed as (1000 - d) / 1000: five in six of the values are between 0.8 and 1.
+    - Rays are observed as (1000 - d) / 1000; five of six values are between 0.8 and 1.
     - A gate is passed if it is straight ahead of the car and within 20 pixels of its center
       (rounded down), hence before the car crosses it. A gate that the car crosses otherwise can
       never be passed.
-    - The reward of a crash is -1 for each wall that is hit, so -2 at a joint of walls.
+    - The reward of a crash is -1 for each wall that is hit; at the joint of two walls, it is -2.
     - The start is always exactly on the line, at rest.
     - An episode is truncated after 10,000 steps.
 
@@ -153,7 +154,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
         return {"x_m": x_m, "y_m": y_m, "yaw_rad": -self.car.heading_rad, **info}
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that never change; those of the car are in the frame `car`."""
+        """Return the shapes that never change; the car's shapes are in the frame `car`."""
         return racer_scene.static_shapes(self.track)
 
     def scene(self) -> Sequence[Shape]:
@@ -161,7 +162,7 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
         return racer_scene.moving_shapes(self.track, self.car, self.trail)
 
     def static_frames(self) -> Sequence[Frame]:
-        """Return no frames: there is no sensor frame."""
+        """Return an empty tuple, because the car has no sensor frame."""
         return ()
 
     def frames(self) -> Sequence[Frame]:
@@ -178,6 +179,6 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
 
 
 class BatchedRacerEnv(BatchedEnv):
-    """Vectorized environment of N cars; arguments as in `RacerEnv`."""
+    """Vectorized environment of N cars; see `RacerEnv` for the arguments."""
 
     fleet_type = RacerFleet

@@ -35,7 +35,7 @@ _INFO = (*CAR_INFO, "gates_passed")
 
 
 class RacerFleet(Fleet):
-    """N cars on one track; arguments as in `RacerEnv`."""
+    """N cars on one track; see `RacerEnv` for the arguments."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = TRUNCATES
@@ -74,7 +74,7 @@ class RacerFleet(Fleet):
         self._numbers = ACTION_SETS[actions]
         self.last_actions = np.zeros(count, dtype=np.int64)
         on_line = start == "line" or (self.classic and start is None)
-        # Random numbers of a single start; the array's size selects the kind of start.
+        # Random numbers for one start; the size of the array selects the kind of start.
         self._shares = np.zeros(ANYWHERE if not on_line else EXACTLY if self.classic else ON_LINE)
         self._drift = bool(drift)
         self._cars = np.zeros((count, STARTED_AT + 1))
@@ -106,7 +106,7 @@ class RacerFleet(Fleet):
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
             self._numbers[action]
         )
-        # Faster than `zip` of `_INFO`.
+        # A dict display is faster than `dict(zip(_INFO, ...))`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,

@@ -25,10 +25,10 @@ STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
 
 @compiled
 def choose(track: Track, car: Car, allowed: NDArray[np.int64], classic: bool) -> int:
-    """Choose one of the allowed actions from the rays up to 90 degrees to each side.
+    """Choose one of the allowed actions, based on the rays up to 90 degrees to each side.
 
-    The mean direction of the rays, weighted by length, determines the turn; the ray straight ahead
-    determines the speed. If no action achieves both, the turn has priority.
+    The mean direction of the rays, weighted by length, determines the turn. The ray straight ahead
+    determines the speed. If no allowed action fits both, the turn has priority.
     """
     lengths_px = np.empty(RAYS)
     measure(track.walls_px, car, False, lengths_px)

@@ -47,8 +47,8 @@ def crossing(
 
     Returns:
         Position of the intersection as a fraction of the segment between the points, and as a
-        fraction of `line`; both are between 0 and 1 if the segments intersect. Infinite for
-        parallel lines.
+        fraction of `line`. Both are between 0 and 1 if the segments intersect, and infinite if
+        the lines are parallel.
     """
     ex, ey = line[2] - line[0], line[3] - line[1]
     cross = dx * ey - dy * ex
@@ -62,7 +62,7 @@ def crossing(
 def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
     """Write a car's rays (4, 18): x and y of the start, and x and y of a vector of 1000 pixels.
 
-    The left corner's sideways ray points to the left, or in the classic rules across the nose.
+    The sideways ray of the left corner points left; in the classic rules, it points right.
     """
     cos, sin = heading_of(car.heading_rad)
     for ray in range(CENTER_RAYS):
@@ -111,9 +111,9 @@ def cast(
 
 @compiled
 def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float:
-    """Return the distance from a car's center to a line's point, rounded down to whole pixels.
+    """Return the distance from a car's center to a point on a line, rounded to whole pixels.
 
-    `share` is the point's position as a fraction of the line.
+    The coordinates of the point are rounded down; `share` is its position on the line, 0 to 1.
     """
     hit_x = math.floor(line[0] + share * (line[2] - line[0]))
     hit_y = math.floor(line[1] + share * (line[3] - line[1]))
@@ -126,7 +126,7 @@ def floored_ray_length(
 ) -> float:
     """Return the classic length of a ray: the distance from the car's center to the nearest hit.
 
-    Hits are rounded down to whole pixels before the comparison; 1000 without a hit.
+    The coordinates of hits are rounded down to whole pixels. Without a hit, the length is 1000.
     """
     nearest = math.inf
     for wall in walls:
@@ -153,7 +153,7 @@ def measure(
 
 
 def ray_ends(walls: NDArray[np.float64], car: Car) -> NDArray[np.float64]:
-    """Return the rays as segments (18, start and end, x and y) to the walls, pixels."""
+    """Return the rays as segments from the car to the walls, (18, 2, 2) pixels."""
     rays, shares = np.empty((4, RAYS)), np.empty(RAYS)
     write_rays(car, False, rays)
     cast(walls, rays, shares)

@@ -75,7 +75,7 @@ def walls_hit(track: Track, car: Car) -> int:
         along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
         away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
         if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
-            # The line through the wall is farther away than any corner.
+            # The line through the wall is farther from the car's center than any corner.
             continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
@@ -88,7 +88,7 @@ def walls_hit(track: Track, car: Car) -> int:
 
 @compiled
 def drive(track: Track, car: Car, action: int, classic: bool, drift: bool) -> Car:
-    """Return the car after one action; count the next gate if the car passed it.
+    """Return the car after one action; if it passed the next gate, increase its count of gates.
 
     In the classic rules, forward and back are swapped.
     """
@@ -126,7 +126,7 @@ def crosses_gate(before: Car, after: Car, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
-    """Return whether a gate (4,) is ahead within 20 pixels, hence passed in the classic rules."""
+    """Return whether a gate (4,) is less than 20 pixels ahead: the classic rule for passing it."""
     dx, dy = LOOK_PX * math.cos(car.course_rad), LOOK_PX * math.sin(car.course_rad)
     share, along_gate = crossing(car.x_px, car.y_px, dx, dy, gate)
     if not (0.0 < share < 1.0 and 0.0 < along_gate < 1.0):
@@ -138,7 +138,7 @@ def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
 def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[float, int]:
     """Return a step's reward and end: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
 
-    The reward is +1 for a gate and -1 for a crash, or in the classic rules -1 for each wall hit.
+    The reward is +1 for a gate and -1 for a crash. In the classic rules, each wall hit costs 1.
     """
     hits = walls_hit(track, after)
     reward = after.gates - before.gates
@@ -226,7 +226,7 @@ def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
     """Compute the contents of the `info` of N cars.
 
     Args:
-        cars: (N, 13) rows: the `Car`, and its initial distance along the path.
+        cars: (N, 13) rows of a `Car`, followed by its distance along the path at the start.
         info: (5, N) output: offsets, heading errors, speeds, progress and gates.
     """
     for i in range(len(cars)):

@@ -44,7 +44,7 @@ WHEEL_RADIUS_M, WHEEL_WIDTH_M = 0.3, 0.26
 
 
 def _wall(index: int, ends_m: Floats) -> Shape:
-    """Return the wall between two points (2, 2); colors alternate from wall to wall."""
+    """Return the wall between two points (2, 2); odd and even walls have different colors."""
     along, middle = ends_m[1] - ends_m[0], ends_m.mean(axis=0)
     size = (float(np.hypot(*along)) + WALL_THICKNESS_M, WALL_THICKNESS_M, WALL_HEIGHT_M)
     at = (float(middle[0]), float(middle[1]), WALL_HEIGHT_M / 2)

@@ -57,9 +57,9 @@ def start_car(
     Args:
         track: Track of the cars.
         classic: Whether the classic rules apply.
-        shares: Random numbers from 0 to 1: (4,) for a start anywhere, (2,) near the line, (0,)
-            exactly on the line.
-        cars: (N, 13) rows: the `Car`, and its initial distance along the path.
+        shares: Random numbers from 0 to 1: four for a start anywhere, two for a start near the
+            line, none for a start exactly on the line.
+        cars: (N, 13) rows of a `Car`, followed by its distance along the path at the start.
         observations: (N, 19) output.
         i: Index of the car.
     """

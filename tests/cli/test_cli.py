@@ -288,7 +288,7 @@ def test_logs_are_not_overwritten_by_other_outputs(
     assert "record the episodes elsewhere" in fails_after(capsys, 2, *evaluate, *both)
     assert cartpole.read_bytes() == before
     line = fails_after(capsys, 2, "evaluate", "pilot", "--sim", "lane", "--behavior", str(cartpole))
-    assert "is of CartPole-v1, not of mcaprl/LaneKeeping-v0" in line
+    assert "was recorded in CartPole-v1, not in mcaprl/LaneKeeping-v0" in line
 
 
 def test_policies_with_equal_names_are_shown_with_paths(capsys: pytest.CaptureFixture[str]) -> None:
