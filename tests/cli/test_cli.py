@@ -119,7 +119,7 @@ def test_counts_of_one_are_singular(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["record", "CartPole-v1", "--policy=random", "--steps=1", "--out=one.mcap"]) == 0
     assert "one.mcap: 1 episode, 1 step, mean return 1.00" in capsys.readouterr().out
     assert run(["recover", "one.mcap", "two.mcap"]) == 0
-    assert "two.mcap: 1 episode, 5 messages" in capsys.readouterr().out
+    assert "two.mcap: 1 episode, 7 messages" in capsys.readouterr().out
 
 
 def test_recordings_repeat(capsys: pytest.CaptureFixture[str]) -> None:
