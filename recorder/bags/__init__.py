@@ -1,0 +1,1 @@
+"""Reading of any robot's bag: its topics as columns of fields."""

@@ -1,0 +1,209 @@
+"""Assembly of a dataset from the episodes that a mapping finds."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.spaces import leaves_of
+from mcaprl.recorder.mapping.config import Quantity
+from mcaprl.recorder.mapping.images import ImageReader
+from mcaprl.recorder.mapping.paths import as_numbers
+from mcaprl.recorder.mapping.plan import Plan
+from mcaprl.recorder.mapping.segments import Segment
+from mcaprl.recorder.mapping.steps import NS_PER_S, Steps
+
+Array = NDArray[Any]
+
+_STATE = "state"
+"""Key of the vector in an observation that also has images."""
+
+
+class _Observations(NamedTuple):
+    """The frames of each leaf by its path, the space, and the names of a vector."""
+
+    frames: dict[tuple[str, ...], Array]
+    space: spaces.Space[Any]
+    names: tuple[str, ...]
+
+
+def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Dataset:
+    """Return the dataset of the kept episodes of each run; there is at least one.
+
+    Raises:
+        UsageError: A reward is not a number, or an observation is a text.
+        LogError: An image cannot be read.
+    """
+    summaries: list[EpisodeSummary] = []
+    times: list[NDArray[np.int64]] = []
+    frames, taken, offset = [], [], 0
+    for run, episodes in zip(runs, kept, strict=True):
+        shift_ns = _shift(run, episodes, times)
+        for each in episodes:
+            times.append(run.times_ns[each.first : each.last + 1] + shift_ns)
+            summaries.append(_summary(plan, run, each, len(summaries), times[-1]))
+            frames.append(offset + np.arange(each.first, each.last + 1))
+            taken.append(offset + np.arange(each.first, each.last))
+        offset += len(run.times_ns)
+    steps = np.concatenate(taken)
+    lengths = np.array([each.length for each in summaries])
+    observed = _observations(plan, runs, np.concatenate(frames), lengths)
+    metadata = LogMetadata(
+        observation_space=observed.space,
+        action_space=_common_space([run.actions.space for run in runs]),
+        env_id=plan.mapping.meta.env_id,
+        observation_names=observed.names,
+        action_meanings=runs[0].actions.meanings,
+        step_duration_ns=_step_ns(plan, times),
+        policy=plan.mapping.meta.policy,
+    )
+    transitions = Transitions(
+        frames=tuple(observed.frames[leaf.path] for leaf in leaves_of(observed.space)),
+        log_time_ns=np.concatenate(times),
+        actions=np.concatenate([run.actions.values for run in runs])[steps],
+        rewards=np.concatenate([run.rewards for run in runs])[steps],
+        terminated=_at_ends(lengths, [each.terminated for each in summaries]),
+        truncated=_at_ends(lengths, [each.truncated for each in summaries]),
+        behavior_probs=np.concatenate([run.probs for run in runs])[steps],
+        episodes=tuple(summaries),
+    )
+    return Dataset(transitions, metadata, sources=plan.bag.paths)
+
+
+def _shift(run: Steps, episodes: list[Segment], times: list[NDArray[np.int64]]) -> int:
+    """Return what is added to the times of a run, so that times rise from run to run."""
+    if not (times and episodes):
+        return 0
+    first_ns, end_ns = int(run.times_ns[episodes[0].first]), int(times[-1][-1])
+    return max(0, end_ns + NS_PER_S - first_ns) if first_ns <= end_ns else 0
+
+
+def _summary(
+    plan: Plan, run: Steps, segment: Segment, number: int, times_ns: NDArray[np.int64]
+) -> EpisodeSummary:
+    rewards = run.rewards[segment.first : segment.last]
+    wrong = np.flatnonzero(~np.isfinite(rewards))
+    if len(wrong):
+        raise UsageError(
+            f"{plan.place.of('reward')}: the reward is {rewards[wrong[0]]} at"
+            f" {run.times_ns[segment.first + wrong[0]]} ns, and in {len(wrong)} of {len(rewards)}"
+            " steps of its episode: give `missing` to the quantities that it uses"
+        )
+    named = (name for name, holds in run.reasons.items() if holds[segment.last])
+    kind = "terminated" if segment.terminated else "truncated"
+    return EpisodeSummary(
+        episode=number,
+        length=segment.length,
+        total_reward=add_up(rewards),
+        terminated=segment.terminated,
+        truncated=segment.truncated,
+        start_time_ns=int(times_ns[0]),
+        end_time_ns=int(times_ns[-1]),
+        reason=next(named, segment.reason or kind),
+        policy=plan.mapping.meta.policy,
+    )
+
+
+def _at_ends(lengths: NDArray[np.int64], flags: list[bool]) -> NDArray[np.bool_]:
+    """Return the flags of all transitions, set at the last one of each episode."""
+    found = np.zeros(int(lengths.sum()), bool)
+    found[np.cumsum(lengths) - 1] = flags
+    return found
+
+
+def _step_ns(plan: Plan, times: list[NDArray[np.int64]]) -> int:
+    rate_hz = plan.mapping.clock.rate_hz
+    if rate_hz is not None:
+        return round(NS_PER_S / rate_hz)
+    return max(1, int(np.median(np.concatenate([np.diff(each) for each in times]))))
+
+
+def _observations(
+    plan: Plan, runs: list[Steps], rows: NDArray[np.int64], lengths: NDArray[np.int64]
+) -> _Observations:
+    arrays: dict[str, Array] = {}
+    parts: dict[str, spaces.Space[Any]] = {}
+    names = _put_vector(plan, runs, rows, arrays, parts)
+    for name, quantity in plan.mapping.observation.items():
+        if quantity.image is not None:
+            places = np.concatenate([run.quantities[name].values for run in runs])[rows]
+            with plan.place.named("observation", name):
+                reader = ImageReader(plan.bag, quantity.image, quantity)
+                arrays[name] = reader.read(places)
+            parts[name] = reader.space(arrays[name])
+    count = plan.mapping.stack
+    if count > 1:
+        stacked = _stacked(lengths, count)
+        arrays = {
+            name: np.concatenate([array[each] for each in stacked.T], axis=-1)
+            for name, array in arrays.items()
+        }
+        parts = {name: _repeated(space, count) for name, space in parts.items()}
+        ages = [f"_{age}_ago" if age else "" for age in range(count - 1, -1, -1)]
+        names = [f"{name}{age}" for age in ages for name in names]
+    if len(parts) == 1:
+        (name,) = parts
+        return _Observations({(): arrays[name]}, parts[name], tuple(names))
+    by_path: dict[tuple[str, ...], Array] = {(name,): array for name, array in arrays.items()}
+    return _Observations(by_path, spaces.Dict(parts), ())
+
+
+def _put_vector(
+    plan: Plan,
+    runs: list[Steps],
+    rows: NDArray[np.int64],
+    arrays: dict[str, Array],
+    parts: dict[str, spaces.Space[Any]],
+) -> list[str]:
+    """Add all numbers as one vector, unless there are only images; return their names."""
+    vectors, limits, names = [], list[tuple[float, float]](), list[str]()
+    for name, quantity in plan.mapping.observation.items():
+        if quantity.image is None:
+            values = np.concatenate([run.quantities[name].values for run in runs])[rows]
+            with plan.place.named("observation", name):
+                numbers = as_numbers(values, name).astype(np.float32).reshape(len(rows), -1)
+            vectors.append(numbers)
+            names += _names(name, quantity, numbers.shape[1])
+            limits += [quantity.clip or (-np.inf, np.inf)] * numbers.shape[1]
+    if vectors:
+        arrays[_STATE] = np.concatenate(vectors, axis=1)
+        low, high = np.array(limits, np.float32).T
+        parts[_STATE] = spaces.Box(low, high)
+    return names
+
+
+def _names(name: str, quantity: Quantity, count: int) -> list[str]:
+    if quantity.transform is not None:
+        return [f"{name}_{part}" for part in ("x", "y", "yaw")]
+    return [name] if count == 1 else [f"{name}_{k}" for k in range(count)]
+
+
+def _stacked(lengths: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return the (F, count) frames that are stacked in each frame, the oldest first.
+
+    Before an episode's first frame, that frame is repeated.
+    """
+    firsts = np.repeat(np.cumsum(lengths + 1) - lengths - 1, lengths + 1)
+    here = np.arange(len(firsts))[:, np.newaxis]
+    found: NDArray[np.int64] = np.maximum(here - np.arange(count)[::-1], firsts[:, np.newaxis])
+    return found
+
+
+def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
+    """Return the space of `count` observations side by side."""
+    assert isinstance(space, spaces.Box), "all parts are Boxes"
+    low, high = (np.concatenate([limit] * count, axis=-1) for limit in (space.low, space.high))
+    return spaces.Box(low, high, dtype=space.dtype.type)
+
+
+def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:
+    """Return the space of all runs: the largest of Discrete ones; Boxes are equal."""
+    return max(found, key=lambda space: int(getattr(space, "n", 0)))

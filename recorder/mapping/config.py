@@ -1,0 +1,331 @@
+"""The mapping file: which fields of a bag are observations, actions, rewards and ends."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from collections.abc import Mapping as MappingOf
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from mcaprl.errors import UsageError, import_extra
+
+TimeSource = Literal["log_time", "publish_time", "header"]
+Alignment = Literal["last", "nearest", "linear"]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Part(BaseModel):
+    """A part of the mapping; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Clock(_Part):
+    """Times of the steps: a fixed rate, or the messages of a topic."""
+
+    rate_hz: Positive | None = Field(default=None, description="Steps per second.")
+    topic: str | None = Field(default=None, description="Topic with one message for each step.")
+
+    @model_validator(mode="after")
+    def _has_one(self) -> Clock:
+        if (self.rate_hz is None) == (self.topic is None):
+            raise ValueError("give either rate_hz or topic")
+        return self
+
+
+class Quantity(_Part):
+    """A named quantity: a field, an image or a transform, aligned with the steps."""
+
+    field: str | None = Field(
+        default=None, description="Path of a field, as `/odom.twist.twist.linear.x`."
+    )
+    image: str | None = Field(
+        default=None, description="Topic of Image or CompressedImage messages."
+    )
+    transform: str | None = Field(
+        default=None, description="Frame whose pose is looked up in `/tf`."
+    )
+    in_: str = Field(default="map", alias="in", description="Frame in which the pose is given.")
+    as_: Literal["yaw"] | None = Field(
+        default=None,
+        alias="as",
+        description="`yaw` converts a quaternion to its angle about z, radians.",
+    )
+    align: Alignment = Field(
+        default="last",
+        description="`last` message up to the step's time, `nearest`, or `linear` interpolation;"
+        " the last two use messages after the step.",
+    )
+    tolerance_s: Positive | None = Field(
+        default=None, description="Age in seconds beyond which a value is missing."
+    )
+    missing: float | None = Field(
+        default=None,
+        description="Number for missing values; without it, steps with any are left out.",
+    )
+    scale: float = Field(default=1.0, description="Factor of the value.")
+    offset: float = Field(default=0.0, description="Number added after scaling.")
+    clip: tuple[float, float] | None = Field(default=None, description="Lowest and highest value.")
+    wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
+    crop: tuple[int, int, int, int] | None = Field(
+        default=None, description="Left, top, width and height of the part of the image, pixels."
+    )
+    resize: tuple[int, int] | None = Field(default=None, description="Width and height, pixels.")
+    gray: bool = Field(default=False, description="Whether to convert colors to gray.")
+    range_m: tuple[float, float] | None = Field(
+        default=None,
+        description="Depth that becomes 0 and 255; without it, depth stays in its unit.",
+    )
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Quantity:
+        given = [name for name in ("field", "image", "transform") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError("give one of field, image and transform")
+        for name in ("crop", "resize", "range_m", "gray"):
+            if getattr(self, name) and given != ["image"]:
+                raise ValueError(f"{name} is for images only")
+        if given == ["image"] and self.align == "linear":
+            raise ValueError("images cannot be interpolated: use last or nearest")
+        if self.clip is not None and self.clip[0] >= self.clip[1]:
+            raise ValueError("clip is the lowest value, then the highest")
+        return self
+
+
+class Limits(_Part):
+    """Limits of continuous actions."""
+
+    low: list[float]
+    high: list[float]
+
+
+class Action(_Part):
+    """The action of each step: a discrete field, or commands that are binned, named or kept."""
+
+    field: str | None = Field(
+        default=None, description="Path of an integer, boolean or string field."
+    )
+    fields: list[str] = Field(
+        default=[], description="Paths of the fields of a continuous command."
+    )
+    names: dict[str, int] = Field(
+        default={}, description="Number of each value of a string field, or name of each number."
+    )
+    actions: dict[str, list[float]] = Field(
+        default={}, description="Named commands; the nearest one is the action."
+    )
+    edges: list[list[float]] = Field(
+        default=[],
+        description="Rising edges of the bins of each field; their product is the action.",
+    )
+    box: Limits | None = Field(
+        default=None, description="Limits of a command that is kept as a Box."
+    )
+    far: Positive = Field(
+        default=0.25,
+        description="Distance from every named command, as a share of their range in each field,"
+        " from which a command is counted as far.",
+    )
+    align: Literal["during", "last", "nearest"] = Field(
+        default="during",
+        description="`during`: the last command before the next step; `last`: up to the step's"
+        " time; `nearest` to the step's time.",
+    )
+    tolerance_s: Positive | None = Field(
+        default=None, description="Age in seconds beyond which the command is missing."
+    )
+
+    @model_validator(mode="after")
+    def _has_one_kind(self) -> Action:
+        if bool(self.field) == bool(self.fields):
+            raise ValueError("give either field or fields")
+        kinds = [bool(self.actions), bool(self.edges), self.box is not None]
+        if self.fields and sum(kinds) != 1:
+            raise ValueError("fields need one of actions, edges and box")
+        if self.field and any(kinds):
+            raise ValueError("actions, edges and box are for fields, not for a discrete field")
+        count = len(self.fields)
+        lengths = [len(command) for command in self.actions.values()]
+        lengths += [len(self.edges)] if self.edges else []
+        lengths += [len(self.box.low), len(self.box.high)] if self.box else []
+        if any(length != count for length in lengths):
+            raise ValueError(f"each command, low, high and edges need {count} entries, as fields")
+        if any(sorted(set(each)) != each for each in self.edges):
+            raise ValueError("edges must rise")
+        return self
+
+
+class Episodes(_Part):
+    """Begin and end of the episodes; each condition is an expression, see `reward`."""
+
+    begin: str | None = Field(
+        default=None,
+        description="Condition whose rising edge begins an episode; default: the first step.",
+    )
+    end: str | None = Field(default=None, description="Condition that truncates the episode.")
+    terminated: str | None = Field(default=None, description="Condition of a terminal state.")
+    truncated: str | None = Field(default=None, description="Condition that truncates the episode.")
+    reasons: dict[str, str] = Field(
+        default={}, description="Conditions by the name of the reason that they give to an end."
+    )
+    gap_s: Positive = Field(
+        default=2.0, description="Longest gap, in seconds, in an observed topic within an episode."
+    )
+    max_steps: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="Number of steps after which an episode is truncated."
+    )
+    min_steps: Annotated[int, Field(ge=1)] = Field(
+        default=2, description="Number of steps below which an episode is dropped."
+    )
+
+
+class Meta(_Part):
+    """Facts that a bag does not contain."""
+
+    env_id: str = Field(default="", description="Gymnasium id of an environment like the robot.")
+    policy: str = Field(default="", description="Name of the policy that acted.")
+
+
+class Mapping(_Part):
+    """Mapping of a bag's topics to transitions."""
+
+    time: TimeSource = Field(default="log_time", description="Time of a message.")
+    clock: Clock = Field(description="Times of the steps.")
+    observation: dict[str, Quantity] = Field(description="Observed quantities by name.")
+    stack: Annotated[int, Field(ge=1)] = Field(
+        default=1, description="Number of observations that are stacked, the oldest first."
+    )
+    fields: dict[str, Quantity] = Field(
+        default={}, description="Quantities that are not observed, for expressions."
+    )
+    action: Action = Field(description="Action of each step.")
+    reward: str = Field(
+        default="0",
+        description="Expression of the names of quantities, `next(NAME)` for the next step and"
+        " `action`; or `module:function` of Python, with --trust-code.",
+    )
+    episodes: Episodes = Field(default=Episodes(), description="Begin and end of the episodes.")
+    behavior_prob: Quantity | None = Field(
+        default=None, description="Probability of the action under the policy that acted."
+    )
+    meta: Meta = Field(default=Meta(), description="Facts that the bag does not contain.")
+
+    @model_validator(mode="after")
+    def _names_are_words(self) -> Mapping:
+        if not self.observation:
+            raise ValueError("observation has no entry")
+        for name in (*self.observation, *self.fields):
+            if not name.isidentifier():
+                raise ValueError(f"'{name}' cannot be used in expressions: use letters, digits, _")
+        both = set(self.observation) & set(self.fields)
+        if both:
+            raise ValueError(f"'{min(both)}' is both in observation and in fields")
+        return self
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """All named quantities, observed ones first."""
+        return {**self.observation, **self.fields}
+
+
+class Place:
+    """Position of each key of a mapping file, for errors."""
+
+    def __init__(self, path: str = "mapping", tree: Any = None) -> None:
+        """Refer to a file and its YAML tree; without a tree, keys have no line."""
+        self.path, self._tree = path, tree
+
+    @contextmanager
+    def named(self, *keys: Any) -> Iterator[None]:
+        """Name a key of the mapping in errors of the body that do not name one."""
+        try:
+            yield
+        except UsageError as error:
+            if str(error).startswith(self.path):
+                raise
+            raise UsageError(f"{self.of(*keys)}: {error}") from error
+
+    def of(self, *keys: Any) -> str:
+        """Return `FILE:LINE: key.key` of a key, or of the innermost of its parents that exists."""
+        tree: Any = self._tree
+        line = None
+        for key in keys:
+            try:
+                lines = getattr(tree, "lc")  # noqa: B009
+                row, _ = lines.key(key) if isinstance(tree, dict) else lines.item(key)
+                tree, line = tree[key], row + 1
+            except (AttributeError, KeyError, IndexError, TypeError):
+                break
+        where = self.path if line is None else f"{self.path}:{line}"
+        return f"{where}: {'.'.join(map(str, keys))}" if keys else where
+
+
+def load_mapping(path: str | Path) -> tuple[Mapping, Place]:
+    """Read a mapping file, and return it with the positions of its keys.
+
+    Raises:
+        UsageError: The file cannot be read, is not YAML, or has an unknown key or a wrong value;
+            the message names file, line and key.
+        MissingExtraError: The packages of the `bags` extra are not installed.
+    """
+    yaml = import_extra("ruamel.yaml", "bags")
+    try:
+        tree = yaml.YAML(typ="rt").load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path} is not UTF-8 text: {error.reason}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise UsageError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
+    place = Place(str(path), tree)
+    if not isinstance(tree, dict):
+        raise UsageError(f"{path}: a mapping has keys and values, such as `clock: {{rate_hz: 10}}`")
+    return parse_mapping(tree, place), place
+
+
+def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapping:
+    """Validate the keys and values of a mapping.
+
+    Raises:
+        UsageError: A key is unknown, or a value is wrong; all errors are named, one per line.
+    """
+    place = place or Place()
+    try:
+        return Mapping.model_validate(tree)
+    except ValidationError as error:
+        texts = [_text(found, place) for found in error.errors()]
+        raise UsageError("\n".join(texts)) from error
+
+
+def _text(error: Any, place: Place) -> str:
+    keys = tuple(error["loc"])
+    if error["type"] == "extra_forbidden":
+        known = _keys_of(keys[:-1])
+        near = difflib.get_close_matches(str(keys[-1]), known, n=3, cutoff=0.4) or known
+        return f"{place.of(*keys)}: unknown key; nearest: {', '.join(near)}"
+    if error["type"] == "missing":
+        return f"{place.of(*keys)}: this key is missing"
+    return f"{place.of(*keys)}: {error['msg'].removeprefix('Value error, ')}"
+
+
+def _keys_of(parents: tuple[Any, ...]) -> list[str]:
+    """Return the keys that a part of the mapping may have."""
+    model: Any = Mapping
+    for key in parents:
+        field = model.model_fields.get(key) if hasattr(model, "model_fields") else None
+        model = _model_in(field.annotation) if field is not None else model
+    fields = getattr(model, "model_fields", {})
+    return [found.alias or name for name, found in fields.items()]
+
+
+def _model_in(annotation: Any) -> Any:
+    """Return the model in an annotation such as `dict[str, Quantity]`."""
+    parts = [annotation, *getattr(annotation, "__args__", ())]
+    models = [part for part in parts if isinstance(part, type) and issubclass(part, _Part)]
+    return models[0] if models else None

@@ -1,0 +1,235 @@
+"""Expressions of a mapping: arithmetic over named columns, and nothing else of Python.
+
+An expression is parsed by `ast` and evaluated for all steps at once. It may contain numbers,
+strings for comparison, names, elements such as `pose[0]`, `+ - * / // % **`, comparisons, `and`,
+`or`, `not`, `A if CONDITION else B`, and calls of the functions in `FUNCTIONS`. Attributes, other
+calls, and all other syntax are errors.
+"""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import UnknownNameError, UsageError
+
+Column = NDArray[Any]
+
+FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
+    "abs": (np.abs, 1),
+    "sqrt": (np.sqrt, 1),
+    "exp": (np.exp, 1),
+    "log": (np.log, 1),
+    "sin": (np.sin, 1),
+    "cos": (np.cos, 1),
+    "tan": (np.tan, 1),
+    "atan2": (np.arctan2, 2),
+    "hypot": (np.hypot, 2),
+    "min": (np.minimum, 2),
+    "max": (np.maximum, 2),
+    "sign": (np.sign, 1),
+    "isnan": (np.isnan, 1),
+    "clip": (np.clip, 3),
+}
+"""Functions of numbers, with their number of arguments."""
+NEXT: Final = "next"
+"""Function of a name or expression whose value at the next step is meant."""
+_MAX_CHARACTERS, _MAX_DEPTH = 4000, 50
+
+_BINARY: Final[dict[type[ast.operator], Callable[..., Any]]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.Pow: operator.pow,
+}
+_COMPARED: Final[dict[type[ast.cmpop], Callable[..., Any]]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+}
+
+
+class Expression:
+    """A parsed expression.
+
+    Attributes:
+        text: Text of the expression.
+        names: Names of the columns that the expression reads.
+    """
+
+    def __init__(self, text: str) -> None:
+        """Parse the text.
+
+        Raises:
+            UsageError: The text is not an expression, or contains something that is not allowed.
+        """
+        self.text = text
+        if len(text) > _MAX_CHARACTERS:
+            raise UsageError(
+                f"the expression has {len(text)} characters, at most {_MAX_CHARACTERS}"
+            )
+        try:
+            self._tree = ast.parse(text.strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            raise UsageError(f"'{text}' is not an expression: {error}") from error
+        self._check(self._tree, 0)
+        self.names = frozenset(
+            node.id
+            for node in ast.walk(self._tree)
+            if isinstance(node, ast.Name) and node.id not in FUNCTIONS and node.id != NEXT
+        )
+
+    def evaluate(self, columns: Mapping[str, Column], following: NDArray[np.int64]) -> Column:
+        """Return the value at each step, (N,).
+
+        Args:
+            columns: (N,) or (N, K) column of each name.
+            following: (N,) row of each step's next step.
+
+        Raises:
+            UsageError: A name is unknown, or a value has the wrong type or shape.
+        """
+        for name in self.names:
+            if name not in columns:
+                raise UnknownNameError("name in an expression", name, columns)
+        try:
+            with np.errstate(all="ignore"):
+                found = np.asarray(self._value(self._tree, columns, following))
+        except (TypeError, ValueError, IndexError) as error:
+            raise UsageError(f"'{self.text}' cannot be evaluated: {error}") from error
+        if found.ndim > 1 or found.dtype.kind not in "biuf":
+            raise UsageError(f"'{self.text}' must be one number for each step")
+        return np.broadcast_to(found, following.shape)
+
+    def _check(self, node: ast.AST, depth: int) -> None:
+        if depth > _MAX_DEPTH:
+            raise UsageError(f"'{self.text[:60]}...' is nested too deeply")
+        allowed: tuple[type[ast.AST], ...] = (ast.Name, ast.Constant, ast.BinOp, ast.UnaryOp)
+        allowed += (ast.BoolOp, ast.Compare, ast.IfExp, ast.Call, ast.Subscript)
+        if not isinstance(node, allowed):
+            raise self._refused(node)
+        match node:
+            case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
+                raise self._refused(node)
+            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
+                count = 1 if name == NEXT else FUNCTIONS.get(name, (None, -1))[1]
+                if count < 0:
+                    raise UnknownNameError("function", name, [*FUNCTIONS, NEXT])
+                if len(args) != count:
+                    raise UsageError(f"'{self.text}': {name} has {count} arguments")
+                parts = args
+            case ast.Call():
+                raise self._refused(node)
+            case ast.Subscript(value=value, slice=part):
+                ast.literal_eval(part) if _is_integer(part) else self._refuse(node)
+                parts = [value]
+            case ast.BinOp(left=left, op=op, right=right):
+                parts = [left, right] if type(op) in _BINARY else self._refuse(node)
+            case ast.Compare(left=left, ops=ops, comparators=others):
+                known = all(type(op) in _COMPARED for op in ops)
+                parts = [left, *others] if known else self._refuse(node)
+            case ast.UnaryOp(op=op, operand=operand):
+                parts = [operand] if not isinstance(op, ast.Invert) else self._refuse(node)
+            case ast.BoolOp(values=values):
+                parts = values
+            case ast.IfExp(test=test, body=body, orelse=other):
+                parts = [test, body, other]
+            case _:
+                parts = []
+        for part in parts:
+            self._check(part, depth + 1)
+
+    def _refused(self, node: ast.AST) -> UsageError:
+        part = ast.unparse(node)
+        return UsageError(
+            f"'{self.text}': '{part}' is not allowed; use names, numbers, operators, and"
+            f" {', '.join([*FUNCTIONS, NEXT])}"
+        )
+
+    def _refuse(self, node: ast.AST) -> Any:
+        raise self._refused(node)
+
+    def _value(
+        self, node: ast.AST, columns: Mapping[str, Column], following: NDArray[np.int64]
+    ) -> Any:
+        def value(part: ast.AST) -> Any:
+            return self._value(part, columns, following)
+
+        match node:
+            case ast.Constant(value=constant):
+                # Integers would overflow, or grow without limit.
+                return constant if isinstance(constant, str) else np.float64(cast(Any, constant))
+            case ast.Name(id=name):
+                return columns[name]
+            case ast.Subscript(value=inner, slice=part):
+                found = np.asarray(value(inner))
+                if found.ndim != 2:
+                    raise ValueError(f"'{ast.unparse(inner)}' has no elements")
+                return found[:, ast.literal_eval(part)]
+            case ast.BinOp(left=left, op=op, right=right):
+                return _BINARY[type(op)](_number(value(left)), _number(value(right)))
+            case ast.UnaryOp(op=ast.Not(), operand=operand):
+                return np.logical_not(_number(value(operand)))
+            case ast.UnaryOp(op=op, operand=operand):
+                number = _number(value(operand))
+                return -number if isinstance(op, ast.USub) else number
+            case ast.BoolOp(op=op, values=parts):
+                combine = np.logical_and if isinstance(op, ast.And) else np.logical_or
+                return combine.reduce(np.broadcast_arrays(*(_number(value(p)) for p in parts)))
+            case ast.Compare(left=left, ops=ops, comparators=others):
+                sides = [value(left), *map(value, others)]
+                pairs = zip(ops, itertools.pairwise(sides), strict=True)
+                holds = [_compared(op, *pair) for op, pair in pairs]
+                return np.logical_and.reduce(np.broadcast_arrays(*holds))
+            case ast.IfExp(test=test, body=body, orelse=other):
+                return np.where(_number(value(test)) != 0, value(body), value(other))
+            case ast.Call(func=ast.Name(id=name), args=args):
+                if name == NEXT:
+                    found = np.asarray(value(args[0]))
+                    return found[following] if found.ndim else found
+                return FUNCTIONS[name][0](*(_number(value(part)) for part in args))
+            case _:
+                raise AssertionError(f"{ast.dump(node)} was checked")
+
+
+def _is_integer(node: ast.AST) -> bool:
+    match node:
+        case ast.Constant(value=int()):
+            return True
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int())):
+            return True
+        case _:
+            return False
+
+
+def _number(value: Any) -> Any:
+    """Return booleans and numbers as float64.
+
+    Raises:
+        TypeError: The value is a text.
+    """
+    found = np.asarray(value)
+    if found.dtype.kind not in "biuf":
+        raise TypeError("a text can only be compared")
+    return found.astype(np.float64)
+
+
+def _compared(op: ast.cmpop, left: Any, right: Any) -> Any:
+    are_texts = [np.asarray(side).dtype.kind not in "biuf" for side in (left, right)]
+    if any(are_texts):
+        if not all(are_texts) or not isinstance(op, ast.Eq | ast.NotEq):
+            raise TypeError("a text can only be compared with a text, by == or !=")
+        left, right = np.asarray(left, object), np.asarray(right, object)
+    return _COMPARED[type(op)](left, right)

@@ -1,0 +1,180 @@
+"""Images of a bag as observations: decoded, cropped, resized and converted to gray.
+
+Raw `sensor_msgs/Image` messages of the encodings below and compressed images of every format that
+Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes
+float32 meters (H, W, 1), 0 where there is no surface; with `range_m`, it becomes uint8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.recorder.bags.bag import Bag, TopicInfo
+from mcaprl.recorder.mapping.config import Quantity
+
+Image = NDArray[Any]
+
+_BLOCK_ROWS = 32
+_GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
+"""ITU-R BT.601 weights of red, green and blue."""
+# Numbers per pixel, dtype, and order of red, green and blue of raw encodings.
+_RAW: dict[str, tuple[int, str, tuple[int, ...]]] = {
+    "rgb8": (3, "u1", (0, 1, 2)),
+    "bgr8": (3, "u1", (2, 1, 0)),
+    "rgba8": (4, "u1", (0, 1, 2)),
+    "bgra8": (4, "u1", (2, 1, 0)),
+    "8UC3": (3, "u1", (2, 1, 0)),
+    "mono8": (1, "u1", (0,)),
+    "8UC1": (1, "u1", (0,)),
+    "mono16": (1, "u2", (0,)),
+    "16UC1": (1, "u2", (0,)),
+    "32FC1": (1, "f4", (0,)),
+}
+_METERS_PER_UNIT = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}
+"""Depth encodings (REP 118), with their unit."""
+_RAW_FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
+_COMPRESSED_FIELDS = ("format", "data")
+
+
+class ImageReader:
+    """Reader of the images of one topic in the form that a mapping asks for."""
+
+    def __init__(self, bag: Bag, topic: str, quantity: Quantity) -> None:
+        """Find the kind of the images.
+
+        Raises:
+            UsageError: The topic has no images.
+        """
+        self._bag, self.topic, self._quantity = bag, topic, quantity
+        self._fields = _image_fields(bag.topics[topic])
+
+    def read(self, rows: NDArray[np.int64]) -> Image:
+        """Read the images of messages (N,), each message once, as (N, H, W, C).
+
+        Args:
+            rows: Positions of the messages in the topic.
+
+        Raises:
+            LogError: An image is damaged or of an unknown encoding, or sizes differ.
+        """
+        wanted, places = np.unique(rows, return_inverse=True)
+        found: Image | None = None
+        for first in range(0, len(wanted), _BLOCK_ROWS):
+            block = wanted[first : first + _BLOCK_ROWS]
+            columns = self._bag.read(self.topic, self._fields, block).columns
+            for k in range(len(block)):
+                message = {name: column[k] for name, column in columns.items()}
+                image = self._prepared(self._decoded(message))
+                if found is None:
+                    found = np.empty((len(wanted), *image.shape), image.dtype)
+                if image.shape != found.shape[1:] or image.dtype != found.dtype:
+                    raise LogError(
+                        f"{self.topic}: image {block[k]} is {image.shape} {image.dtype}, the first"
+                        f" {found.shape[1:]} {found.dtype}: give `resize` in the mapping"
+                    )
+                found[first + k] = image
+        assert found is not None, "there is at least one image"
+        return found if len(places) == len(wanted) and (np.diff(rows) > 0).all() else found[places]
+
+    def space(self, images: Image) -> spaces.Box:
+        """Return the space of one image."""
+        if images.dtype == np.uint8:
+            return spaces.Box(0, 255, images.shape[1:], np.uint8)
+        return spaces.Box(0.0, np.inf, images.shape[1:], np.float32)
+
+    def _decoded(self, message: dict[str, Any]) -> Image:
+        """Return an image as (H, W, 3) uint8 colors, (H, W) uint8 gray, or float32 meters."""
+        if "encoding" in message:
+            return _raw_image(self.topic, message)
+        return _compressed_image(self.topic, str(message["format"]), bytes(message["data"]))
+
+    def _prepared(self, image: Image) -> Image:
+        quantity = self._quantity
+        if quantity.crop is not None:
+            left, top, width, height = quantity.crop
+            cropped = image[top : top + height, left : left + width]
+            if left < 0 or top < 0 or cropped.shape[:2] != (height, width):
+                raise UsageError(
+                    f"{self.topic}: crop {list(quantity.crop)} is outside of the image of"
+                    f" {image.shape[1]} x {image.shape[0]} pixels"
+                )
+            image = cropped
+        if quantity.gray and image.ndim == 3:
+            image = np.rint(image @ _GRAY_WEIGHTS).astype(np.uint8)
+        if quantity.resize is not None:
+            image = _resized(image, *quantity.resize)
+        if quantity.range_m is not None and image.dtype == np.float32:
+            low, high = quantity.range_m
+            share = np.clip((image - low) / (high - low), 0.0, 1.0)
+            # As in the sims, nothing is the farthest value.
+            image = np.where(image > 0, np.rint(255 * share), 255).astype(np.uint8)
+        return image if image.ndim == 3 else image[..., np.newaxis]
+
+
+def _image_fields(topic: TopicInfo) -> tuple[str, ...]:
+    known = {name.split("[")[0] for name in topic.fields}
+    for fields in (_RAW_FIELDS, _COMPRESSED_FIELDS):
+        if known.issuperset(fields):
+            return fields
+    raise UsageError(
+        f"{topic.name} has {topic.type_name}, not images: expected sensor_msgs/Image or"
+        " CompressedImage"
+    )
+
+
+def _raw_image(topic: str, message: dict[str, Any]) -> Image:
+    encoding = str(message["encoding"])
+    if encoding not in _RAW:
+        raise LogError(f"{topic}: encoding '{encoding}'; supported: {', '.join(_RAW)}")
+    channels, code, order = _RAW[encoding]
+    height, width, step = (int(message[name]) for name in ("height", "width", "step"))
+    dtype = np.dtype(code).newbyteorder(">" if message["is_bigendian"] else "<")
+    used = width * channels * dtype.itemsize
+    data = np.frombuffer(bytes(message["data"]), np.uint8)
+    if step < used or len(data) < step * height or not height * width:
+        raise LogError(
+            f"{topic}: an image of {width} x {height} {encoding} with {step} bytes per row has"
+            f" {len(data)} bytes"
+        )
+    rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used])
+    pixels = rows.view(dtype).reshape(height, width, channels)[..., list(order)]
+    if encoding in _METERS_PER_UNIT:
+        return _meters(pixels[..., 0], _METERS_PER_UNIT[encoding])
+    return pixels if channels > 1 else pixels[..., 0]
+
+
+def _compressed_image(topic: str, kind: str, data: bytes) -> Image:
+    pillow = import_extra("PIL.Image", "bags")
+    # compressed_depth_image_transport puts 12 bytes of parameters before the PNG.
+    is_depth = "compressedDepth" in kind
+    try:
+        with pillow.open(BytesIO(data[12:] if is_depth else data)) as image:
+            if image.mode in ("I;16", "I", "F"):
+                unit = 1.0 if image.mode == "F" else 1e-3
+                return _meters(np.asarray(image), unit)
+            return np.asarray(image.convert("L" if image.mode in ("L", "1") else "RGB"))
+    # Pillow raises errors of many types for damaged images.
+    except Exception as error:
+        raise LogError(f"{topic}: a compressed image ({kind}) cannot be read: {error}") from error
+
+
+def _meters(depth: Image, unit_m: float) -> Image:
+    meters = depth.astype(np.float32) * np.float32(unit_m)
+    return np.where(np.isfinite(meters) & (meters > 0), meters, np.float32(0))
+
+
+def _resized(image: Image, width: int, height: int) -> Image:
+    """Resize by averaging; depth takes the nearest pixel, since a mean of distances is no place."""
+    pillow = import_extra("PIL.Image", "bags")
+    if image.shape[:2] == (height, width):
+        return image
+    is_depth = image.dtype == np.float32
+    method: Callable[..., Any] = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
+    return np.asarray(pillow.fromarray(image).resize((width, height), method))

@@ -1,0 +1,145 @@
+"""A mapping resolved against a bag: topics, fields and expressions."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from collections.abc import Mapping as MappingOf
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.bag import Bag
+from mcaprl.recorder.mapping.config import Mapping, Place, Quantity
+from mcaprl.recorder.mapping.expression import Expression
+from mcaprl.recorder.mapping.observe import Source, source_of
+from mcaprl.recorder.mapping.paths import topic_of
+from mcaprl.recorder.mapping.streams import TopicStream
+
+Columns = MappingOf[str, NDArray[Any]]
+Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
+"""Function of the columns of all steps and of each step's next row that returns the rewards."""
+
+
+class Wanted(NamedTuple):
+    """A quantity, where it stands in the mapping, and where it comes from."""
+
+    keys: tuple[str, ...]
+    quantity: Quantity
+    source: Source
+
+
+class Plan:
+    """A mapping resolved against a bag.
+
+    Attributes:
+        bag: Bag to read.
+        mapping: Mapping to read it by.
+        place: Positions of the mapping's keys, for errors.
+        quantities: Observed and other quantities, by name.
+        behavior_prob: Probability of the action; None if unknown.
+        commands: Fields of the action.
+        conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
+        reasons: Conditions of the reasons, by reason.
+        reward: Function that computes the rewards.
+        streams: Messages of the used topics.
+    """
+
+    def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
+        """Resolve all paths and parse all expressions.
+
+        Raises:
+            UsageError: A topic, field or name is unknown, or an expression is wrong.
+        """
+        self.bag, self.mapping, self.place = bag, mapping, place
+        self.quantities = {
+            name: self._wanted((section, name), quantity)
+            for section in ("observation", "fields")
+            for name, quantity in getattr(mapping, section).items()
+        }
+        prob = mapping.behavior_prob
+        self.behavior_prob = None if prob is None else self._wanted(("behavior_prob",), prob)
+        action = mapping.action
+        align = action.align if action.align != "during" else "last"
+        paths = [action.field] if action.field is not None else action.fields
+        self.commands = [
+            self._wanted(
+                ("action",), Quantity(field=path, align=align, tolerance_s=action.tolerance_s)
+            )
+            for path in paths
+        ]
+        episodes = mapping.episodes
+        self.conditions = {
+            name: self._expression(("episodes", name), getattr(episodes, name))
+            for name in ("begin", "end", "terminated", "truncated")
+            if getattr(episodes, name) is not None
+        }
+        self.reasons = {
+            name: self._expression(("episodes", "reasons", name), text)
+            for name, text in episodes.reasons.items()
+        }
+        with place.named("reward"):
+            self.reward = _reward_of(mapping.reward, trust_code=trust_code)
+        self.streams = self._opened()
+
+    def _wanted(self, keys: tuple[str, ...], quantity: Quantity) -> Wanted:
+        with self.place.named(*keys):
+            return Wanted(keys, quantity, source_of(self.bag, quantity))
+
+    def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
+        with self.place.named(*keys):
+            return Expression(text)
+
+    def _opened(self) -> dict[str, TopicStream]:
+        fields: dict[str, set[str]] = {}
+        prob = [] if self.behavior_prob is None else [self.behavior_prob]
+        for wanted in (*self.quantities.values(), *self.commands, *prob):
+            fields.setdefault(wanted.source.topic, set()).update(wanted.source.fields)
+        if self.mapping.clock.topic is not None:
+            with self.place.named("clock", "topic"):
+                fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
+        gap_s = self.mapping.episodes.gap_s
+        return {
+            # Messages of transforms have no time of their own, but one for each frame.
+            topic: TopicStream(
+                self.bag,
+                topic,
+                wanted,
+                "log_time" if topic.startswith("/tf") else self.mapping.time,
+                gap_s,
+            )
+            for topic, wanted in fields.items()
+        }
+
+
+def _reward_of(text: str, *, trust_code: bool) -> Reward:
+    """Return the function that computes the rewards of all steps.
+
+    Raises:
+        UsageError: The text is neither an expression nor, if code is trusted, a function.
+    """
+    module, colon, name = text.partition(":")
+    if not colon or not module.replace(".", "").isidentifier():
+        expression = Expression(text)
+        return lambda columns, following: expression.evaluate(columns, following).astype(np.float64)
+    if not trust_code:
+        raise UsageError(
+            f"the function '{text}' is Python code: pass --trust-code if you trust the mapping"
+        )
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"the function '{text}' cannot be imported: {error}") from error
+
+    def rewards(columns: Columns, following: NDArray[np.int64]) -> NDArray[np.float64]:
+        found = np.asarray(function(columns, following), np.float64)
+        if found.shape != following.shape:
+            raise UsageError(
+                f"the function '{text}' returned {found.shape}, expected {following.shape}: one"
+                " reward for each step"
+            )
+        return found
+
+    return rewards

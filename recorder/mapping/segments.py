@@ -1,0 +1,112 @@
+"""Division of the steps of a bag into episodes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Flags = NDArray[np.bool_]
+
+GAP, NO_ACTION, TIME_LIMIT, RESTARTED = "gap", "no_action", "time_limit", "restarted"
+END_OF_DATA = "end_of_data"
+
+
+class Marks(NamedTuple):
+    """What is known of each of N steps, for the division into episodes.
+
+    Attributes:
+        usable: Whether all observations are present.
+        acted: Whether there is an action.
+        gap_before: Whether there is a gap between the step and the one before it.
+        begin: Condition whose rising edge begins an episode; None if every step may begin one.
+        terminated: Whether the step is a terminal state.
+        truncated: Whether the step truncates an episode.
+    """
+
+    usable: Flags
+    acted: Flags
+    gap_before: Flags
+    begin: Flags | None
+    terminated: Flags
+    truncated: Flags
+
+
+class Segment(NamedTuple):
+    """Steps of one episode.
+
+    Attributes:
+        first: Step with the first observation.
+        last: Step with the final observation.
+        terminated: Whether the final observation is a terminal state.
+        truncated: Whether the episode was truncated.
+        reason: Reason of the end; empty if a condition of the mapping ended the episode.
+    """
+
+    first: int
+    last: int
+    terminated: bool
+    truncated: bool
+    reason: str
+
+    @property
+    def length(self) -> int:
+        """Number of transitions."""
+        return self.last - self.first
+
+
+def segments(marks: Marks, max_steps: int | None) -> list[Segment]:
+    """Divide steps into episodes.
+
+    An episode begins at a usable step with an action that is not an end. It ends at the first later
+    step that is terminal or truncating, at the last step before a gap or an unusable step, at a
+    step without an action, after `max_steps` transitions, or before the next rising edge of
+    `begin`. The next episode begins after the final observation.
+
+    Args:
+        marks: Facts of the steps.
+        max_steps: Maximum number of transitions; None for no limit.
+    """
+    count = len(marks.usable)
+    begins = marks.usable if marks.begin is None else marks.usable & _edges(marks.begin)
+    # The positions of all steps that end an episode there or just before, with their kind.
+    ends = np.flatnonzero(marks.terminated | marks.truncated | ~marks.acted)
+    cuts = marks.gap_before | ~marks.usable
+    if marks.begin is not None:
+        cuts |= begins
+    cut_at = np.append(np.flatnonzero(cuts), count)
+    starts = np.flatnonzero(begins & marks.acted & ~marks.terminated & ~marks.truncated)
+    found: list[Segment] = []
+    at = 0
+    while (k := int(np.searchsorted(starts, at))) < len(starts):
+        first = int(starts[k])
+        cut = int(cut_at[np.searchsorted(cut_at, first, side="right")])
+        e = int(np.searchsorted(ends, first, side="right"))
+        end = int(ends[e]) if e < len(ends) else count
+        limit = first + max_steps if max_steps is not None else count
+        last = min(cut - 1, end, limit)
+        found.append(_segment(marks, first, last, cut, limit))
+        at = last + 1
+    return found
+
+
+def _segment(marks: Marks, first: int, last: int, cut: int, limit: int) -> Segment:
+    terminated, truncated = (bool(flags[last]) for flags in (marks.terminated, marks.truncated))
+    if last > first and (terminated or truncated):
+        return Segment(first, last, terminated, truncated, "")
+    if last == limit:
+        return Segment(first, last, False, True, TIME_LIMIT)
+    if not marks.acted[last]:
+        return Segment(first, last, False, True, NO_ACTION)
+    if cut == len(marks.usable):
+        return Segment(first, last, False, True, END_OF_DATA)
+    is_gap = marks.gap_before[cut] or not marks.usable[cut]
+    return Segment(first, last, False, True, GAP if is_gap else RESTARTED)
+
+
+def _edges(condition: Flags) -> Flags:
+    """Return where a condition becomes true."""
+    found: Flags = condition.copy()
+    found[1:] &= ~condition[:-1]
+    return found

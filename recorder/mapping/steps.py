@@ -1,0 +1,182 @@
+"""Steps of a bag: all that a mapping knows of each one, and the episodes that they form."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.recorder.mapping.actions import Actions, actions_of
+from mcaprl.recorder.mapping.expression import Expression
+from mcaprl.recorder.mapping.observe import Values, values_of
+from mcaprl.recorder.mapping.plan import Plan, Wanted
+from mcaprl.recorder.mapping.segments import Marks, Segment, segments
+from mcaprl.recorder.mapping.streams import Run, TopicStream
+from mcaprl.recorder.mapping.transforms import Transforms
+
+NS_PER_S = 10**9
+_MAX_STEPS = 50_000_000
+
+
+class Steps(NamedTuple):
+    """The N steps between two resets of the clock.
+
+    Attributes:
+        times_ns: (N,) times.
+        quantities: Values of each quantity by name.
+        actions: Action of each step.
+        probs: (N,) probability of the action; NaN if unknown.
+        rewards: (N,) reward of each step's action, which needs the next step.
+        episodes: Episodes that the steps form.
+        reasons: (N,) conditions of the reasons, by reason.
+    """
+
+    times_ns: NDArray[np.int64]
+    quantities: dict[str, Values]
+    actions: Actions
+    probs: NDArray[np.float32]
+    rewards: NDArray[np.float64]
+    episodes: list[Segment]
+    reasons: dict[str, NDArray[np.bool_]]
+
+
+class StepReader:
+    """Reader of the steps of a bag, one run of the clock after the other."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Read the transforms, if the mapping uses them."""
+        self._plan, self._mapping = plan, plan.mapping
+        uses_transforms = any(each.quantity.transform for each in plan.quantities.values())
+        by_header = plan.mapping.time == "header"
+        self._transforms = Transforms(plan.bag, by_header=by_header) if uses_transforms else None
+
+    def read(self, number: int) -> Steps:
+        """Return the steps of the run `number` of the clock.
+
+        Raises:
+            UsageError: The mapping does not fit the messages.
+        """
+        plan, times_ns = self._plan, self._times(number)
+        ends_ns = _ends(times_ns)
+        quantities = {
+            name: self._values(wanted, number, times_ns) for name, wanted in plan.quantities.items()
+        }
+        actions = self._actions(number, times_ns, ends_ns)
+        probs = np.full(len(times_ns), np.nan, np.float32)
+        if plan.behavior_prob is not None:
+            found = self._values(plan.behavior_prob, number, times_ns, ends_ns)
+            probs = found.values.astype(np.float32)
+        columns = {
+            name: values.values
+            for name, values in quantities.items()
+            if plan.quantities[name].quantity.image is None
+        }
+        if actions.values.ndim == 1:
+            columns["action"] = actions.values
+        following = np.minimum(np.arange(len(times_ns)) + 1, max(len(times_ns) - 1, 0))
+        conditions = self._conditions(("episodes",), plan.conditions, columns, following)
+        reasons = self._conditions(("episodes", "reasons"), plan.reasons, columns, following)
+        nothing = np.zeros(len(times_ns), bool)
+        terminated = conditions.get("terminated", nothing)
+        truncated = conditions.get("truncated", nothing) | conditions.get("end", nothing)
+        # A terminal state is an end of the transition that leads to it.
+        columns |= {"terminated": terminated[following], "truncated": truncated[following]}
+        gap_ns = self._mapping.episodes.gap_s * NS_PER_S
+        marks = Marks(
+            usable=self._usable(quantities, len(times_ns)),
+            acted=~actions.missing,
+            gap_before=np.diff(times_ns, prepend=times_ns[:1]) > gap_ns,
+            begin=conditions.get("begin"),
+            terminated=terminated,
+            truncated=truncated,
+        )
+        with plan.place.named("reward"):
+            rewards = plan.reward(columns, following)
+        episodes = segments(marks, self._mapping.episodes.max_steps)
+        return Steps(times_ns, quantities, actions, probs, rewards, episodes, reasons)
+
+    def _times(self, number: int) -> NDArray[np.int64]:
+        """Return the times of the steps of a run."""
+        clock, streams = self._mapping.clock, self._plan.streams
+        if clock.topic is not None:
+            found: NDArray[np.int64] = np.unique(_run(streams[clock.topic], number).times_ns)
+            return found
+        assert clock.rate_hz is not None, "the mapping was validated"
+        runs = [_run(each, number).times_ns for each in streams.values()]
+        runs = [times_ns for times_ns in runs if len(times_ns)]
+        if not runs:
+            return np.empty(0, np.int64)
+        first, last = min(int(t[0]) for t in runs), max(int(t[-1]) for t in runs)
+        # A period that fits a whole number of times is not lost to rounding.
+        count = int((last - first) * clock.rate_hz / NS_PER_S + 1e-6) + 1
+        if count > _MAX_STEPS:
+            raise UsageError(
+                f"{self._plan.place.of('clock', 'rate_hz')}: {count} steps between {first} and"
+                f" {last} ns: use another `time` or a lower rate"
+            )
+        since_ns = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz))
+        return np.add(since_ns.astype(np.int64), first, dtype=np.int64)
+
+    def _values(
+        self,
+        wanted: Wanted,
+        number: int,
+        times_ns: NDArray[np.int64],
+        ends_ns: NDArray[np.int64] | None = None,
+    ) -> Values:
+        stream = self._plan.streams[wanted.source.topic]
+        run = _run(stream, number)
+        with self._plan.place.named(*wanted.keys):
+            return values_of(
+                wanted.quantity, wanted.source, stream, run, times_ns, self._transforms, ends_ns
+            )
+
+    def _actions(
+        self, number: int, times_ns: NDArray[np.int64], ends_ns: NDArray[np.int64]
+    ) -> Actions:
+        action = self._mapping.action
+        ends = ends_ns if action.align == "during" else None
+        found = [self._values(wanted, number, times_ns, ends) for wanted in self._plan.commands]
+        missing = np.logical_or.reduce([each.missing for each in found])
+        with self._plan.place.named("action"):
+            return actions_of(action, [each.values for each in found], missing)
+
+    def _conditions(
+        self,
+        keys: tuple[str, ...],
+        expressions: dict[str, Expression],
+        columns: dict[str, NDArray[Any]],
+        following: NDArray[np.int64],
+    ) -> dict[str, NDArray[np.bool_]]:
+        found = {}
+        for name, expression in expressions.items():
+            with self._plan.place.named(*keys, name):
+                values = expression.evaluate(columns, following).astype(np.float64)
+            # A missing number fulfills no condition.
+            found[name] = np.nan_to_num(values, nan=0.0) != 0
+        return found
+
+    def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
+        """Return the steps whose observations are present and not older than a gap."""
+        usable = np.ones(count, bool)
+        for name, quantity in self._mapping.observation.items():
+            if quantity.missing is None or quantity.image is not None:
+                values = quantities[name]
+                with np.errstate(invalid="ignore"):
+                    is_stale = np.abs(values.age_s) > self._mapping.episodes.gap_s
+                usable &= ~values.missing & ~is_stale
+        return usable
+
+
+def _run(stream: TopicStream, number: int) -> Run:
+    """Return a run of a topic, which is empty if the topic has no messages."""
+    return stream.runs[min(number, len(stream.runs) - 1)]
+
+
+def _ends(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the ends of the steps: the next step, and for the last one its usual duration."""
+    if len(times_ns) < 2:
+        return times_ns + NS_PER_S
+    return np.append(times_ns[1:], times_ns[-1] + int(np.median(np.diff(times_ns))))

@@ -1,0 +1,88 @@
+"""What a mapping finds in a bag, and what it leaves out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class FieldReport:
+    """Facts of a quantity at the steps of the clock.
+
+    Attributes:
+        topic: Topic of its messages.
+        missing: Share of the steps without a value.
+        median_age_s: Median age of the value at its step, seconds; NaN if there is none.
+        max_age_s: Largest age, seconds; NaN if there is none.
+    """
+
+    topic: str
+    missing: float
+    median_age_s: float
+    max_age_s: float
+
+    @classmethod
+    def of(cls, topic: str, missing: NDArray[np.bool_], ages_s: NDArray[np.float64]) -> FieldReport:
+        """Summarize a quantity's steps (N,)."""
+        known = np.abs(ages_s[np.isfinite(ages_s)])
+        median, largest = (np.nan, np.nan)
+        if len(known):
+            median, largest = float(np.median(known)), float(known.max())
+        return cls(topic, float(missing.mean()) if len(missing) else 1.0, median, largest)
+
+
+@dataclass(frozen=True)
+class MappingReport:
+    """Result of reading a bag by a mapping.
+
+    Attributes:
+        clock_steps: Number of steps of the clock.
+        steps: Number of transitions.
+        episodes: Number of episodes.
+        dropped: Numbers of transitions of the episodes that were too short.
+        ends: Number of episodes by the reason of their end; `condition` is a condition of the
+            mapping.
+        clock_resets: Number of times that the clock went back by more than a gap.
+        fields: Facts of each quantity, by name.
+        missing_actions: Share of the steps of the clock without an action.
+        far_actions: Share of the transitions whose command is far from every named action, or
+            beyond the limits of the Box.
+        action_counts: Number of transitions of each discrete action, by name or number.
+    """
+
+    clock_steps: int
+    steps: int
+    episodes: int
+    dropped: list[int]
+    ends: dict[str, int]
+    clock_resets: int
+    fields: dict[str, FieldReport]
+    missing_actions: float
+    far_actions: float
+    action_counts: dict[str, int]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report as JSON types; unknown ages are None."""
+        found = asdict(self)
+        for field in found["fields"].values():
+            for name in ("median_age_s", "max_age_s"):
+                field[name] = field[name] if np.isfinite(field[name]) else None
+        return found
+
+    def why_empty(self) -> str:
+        """Return why there are no episodes, in one line."""
+        worst = max(self.fields, key=lambda name: self.fields[name].missing)
+        share = self.fields[worst].missing
+        if not self.clock_steps:
+            return "the topics have no messages"
+        if self.missing_actions == 1.0:
+            return "no step has an action"
+        if share == 1.0:
+            return f"{worst} ({self.fields[worst].topic}) has no value at any step"
+        if self.dropped:
+            return f"the longest of {len(self.dropped)} episodes has {max(self.dropped)} steps"
+        return f"no episode begins; {worst} is missing at {share:.0%} of {self.clock_steps} steps"
