@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
-from mcaprl.recorder.bags.bag import open_bag
+from mcaprl.recorder.bags.bag import Bag, open_bag
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.mapping.actions import Actions
 from mcaprl.recorder.mapping.assemble import assembled
@@ -58,18 +58,25 @@ def read_bag(
     if not isinstance(mapping, Mapping):
         mapping, place = load_mapping(mapping)
     with closing(open_bag(data)) as bag:
-        plan = Plan(bag, mapping, place, trust_code=trust_code)
-        reader = StepReader(plan)
-        runs = [reader.read(number) for number in range(run_count(plan.streams))]
-        least = mapping.episodes.min_steps
-        kept = [[each for each in run.episodes if each.length >= least] for run in runs]
-        report = _report(plan, runs, kept)
-        if not any(kept):
-            raise LogError(
-                f"{', '.join(map(str, bag.paths))}: no episode of {least} or more steps by this"
-                f" mapping: {report.why_empty()}"
-            )
-        return MappedBag(assembled(plan, runs, kept), report)
+        return read_open_bag(bag, mapping, place, trust_code=trust_code)
+
+
+def read_open_bag(
+    bag: Bag, mapping: Mapping, place: Place | None = None, *, trust_code: bool = False
+) -> MappedBag:
+    """Read an open bag; see `read_bag`. Errors name the keys of the mapping by `place`."""
+    plan = Plan(bag, mapping, place or Place(), trust_code=trust_code)
+    reader = StepReader(plan)
+    runs = [reader.read(number) for number in range(run_count(plan.streams))]
+    least = mapping.episodes.min_steps
+    kept = [[each for each in run.episodes if each.length >= least] for run in runs]
+    report = _report(plan, runs, kept)
+    if not any(kept):
+        raise LogError(
+            f"{', '.join(map(str, bag.paths))}: no episode of {least} or more steps by this"
+            f" mapping: {report.why_empty()}"
+        )
+    return MappedBag(assembled(plan, runs, kept), report)
 
 
 def _report(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> MappingReport:

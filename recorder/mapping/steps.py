@@ -117,7 +117,8 @@ class StepReader:
                 f" {last} ns: use another `time` or a lower rate"
             )
         since_ns = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz))
-        return np.add(since_ns.astype(np.int64), first, dtype=np.int64)
+        found = first + since_ns.astype(np.int64)
+        return found
 
     def _values(
         self,

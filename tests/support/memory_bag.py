@@ -1,0 +1,66 @@
+"""A bag in memory, for tests of the mapping with numbers worked by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.bags.bag import Stream, TopicInfo
+
+SECOND_NS = 10**9
+
+
+class MemoryBag:
+    """Topics given as times in seconds and columns."""
+
+    paths = (Path("memory.bag"),)
+
+    def __init__(
+        self,
+        topics: Mapping[str, tuple[Sequence[float], Mapping[str, Any]]],
+        kinds: Mapping[str, str] | None = None,
+        types: Mapping[str, str] | None = None,
+    ) -> None:
+        """Store `(times_s, columns)` of each topic; lists of unequal parts become objects."""
+        self._times, self._columns = {}, {}
+        self.topics: dict[str, TopicInfo] = {}
+        for name, (times_s, columns) in topics.items():
+            times_ns = np.rint(np.array(times_s, np.float64) * SECOND_NS).astype(np.int64)
+            self._times[name] = times_ns
+            self._columns[name] = {key: _column(column) for key, column in columns.items()}
+            fields = {key: (kinds or {}).get(f"{name}.{key}", "float64") for key in columns}
+            ends = (int(times_ns.min()), int(times_ns.max())) if len(times_ns) else (0, 0)
+            kind = (types or {}).get(name, "memory")
+            self.topics[name] = TopicInfo(name, kind, "cdr", len(times_ns), *ends, fields, {})
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        return self._times[topic]
+
+    def read(
+        self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
+    ) -> Stream:
+        chosen = slice(None) if rows is None else rows
+        columns = {name: self._columns[topic][name][chosen] for name in fields}
+        return Stream(self._times[topic][chosen], columns)
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def _column(values: Any) -> NDArray[Any]:
+    if isinstance(values, np.ndarray):
+        return values
+    if values and isinstance(values[0], str | bytes | list | tuple) and not _is_vector(values):
+        column = np.empty(len(values), object)
+        column[:] = values
+        return column
+    return np.array(values, np.float64)
+
+
+def _is_vector(values: Sequence[Any]) -> bool:
+    lengths = {len(value) for value in values}
+    return len(lengths) == 1 and all(isinstance(part, int | float) for v in values for part in v)
