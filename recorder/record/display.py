@@ -4,7 +4,8 @@
                         and end; static ones when they differ from the previous episode's. A viewer
                         that seeks needs only the latest message of each topic
 /scene/tracks           tracks of the episodes so far, written at the ends of episodes
-/tf, /tf_static         frames: moving ones at each step; static ones as above
+/tf, /tf_static         frames: moving ones at each step, and at the moments within the step that
+                        the environment provides; static ones as above
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
 """
@@ -23,6 +24,7 @@ from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
 from mcaprl.recorder.record.scene import (
     DepthSource,
+    MotionSource,
     SceneSource,
     Shape,
     TelemetrySource,
@@ -93,6 +95,7 @@ class Display:
         self._bytes = 0
         self._scene = source if scene and isinstance(source, SceneSource) else None
         self._telemetry = source if scene and isinstance(source, TelemetrySource) else None
+        self._motion = source if scene and isinstance(source, MotionSource) else None
         if camera and not isinstance(source, DepthSource):
             warnings.warn("the environment has no depth camera to record", stacklevel=3)
         camera = camera or bool(log.image_leaves)
@@ -141,6 +144,7 @@ class Display:
             self._pending = (time_ns, self._scene.scene())
             if step % self._steps_per_scene == 0:
                 self._draw_pending()
+            self._emit_motion(time_ns)
             frames = self._scene.frames()
             self._emit(TF, time_ns, transforms(frames, time_ns))
             if frames:
@@ -179,6 +183,13 @@ class Display:
             time_ns, shapes = self._pending
             self._emit(SCENE, time_ns, marker_array(shapes))
             self._pending = None
+
+    def _emit_motion(self, end_ns: int) -> None:
+        """Add the frames within the step that ends at the log_time `end_ns`."""
+        if self._motion is not None:
+            for left_s, frames in self._motion.motion():
+                time_ns = end_ns - round(left_s * 1e9)
+                self._emit(TF, time_ns, transforms(frames, time_ns))
 
     def _emit_tracks(self, summary: EpisodeSummary) -> None:
         """Write the tracks so far, unless short episodes would make them most of the log."""

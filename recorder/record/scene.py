@@ -117,6 +117,18 @@ class SceneSource(Protocol):
 
 
 @runtime_checkable
+class MotionSource(Protocol):
+    """An environment that provides its moving frames within a step."""
+
+    def motion(self) -> Sequence[tuple[float, Sequence[Frame]]]:
+        """Return the moving frames at moments within the last step, in order of time.
+
+        Each element consists of the seconds before the end of the step, more than 0, and the
+        frames at that moment. There are none after `reset`.
+        """
+
+
+@runtime_checkable
 class TelemetrySource(Protocol):
     """An environment that provides numbers to plot."""
 

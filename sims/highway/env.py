@@ -14,6 +14,7 @@ from highway_env.envs.racetrack_env import RacetrackEnv, RacetrackEnvOval
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.follow_view import Body, FollowView
+from mcaprl.sims.drawing.motion import car_moments
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.drawing.shapes import car_frame
 from mcaprl.sims.highway import scene as highway_scene
@@ -21,7 +22,7 @@ from mcaprl.sims.highway.course import FLIP, Course, Place, courses_of
 from mcaprl.sims.highway.scene import Car
 from mcaprl.sims.highway.start import drawn_pose, pose_from_options
 from mcaprl.sims.vehicle.arguments import Pose, check_action, check_name
-from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode
+from mcaprl.sims.vehicle.env import RENDER_MODES, RenderedEnv, RenderMode, before_end
 
 Floats = NDArray[np.float64]
 
@@ -177,6 +178,8 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._last_action = 0
         self._reward = 0.0
         self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
+        # Car before the last step.
+        self._before: Car | None = None
         self._locate()
 
     @property
@@ -223,6 +226,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
             self._put(drawn_pose(self.np_random, self.courses, others, car.speed_m_s))
         self._progress_m, self._last_action, self._reward = 0.0, 0, 0.0
         self._trail_m.clear()
+        self._before = None
         return self._observe(), self._info()
 
     def step(
@@ -238,7 +242,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         # highway-env's angles are clockwise.
         share = -STEERING_RAD[action] / self._steering_range_rad
         _, reward, _, is_over, _ = self._inner.step(np.array([share]))
-        before_m = self._along_m
+        self._before, before_m = self._car, self._along_m
         self._locate()
         self._progress_m += self._moved_m(before_m)
         self._reward = float(reward)
@@ -339,7 +343,18 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     def frames(self) -> Sequence[Frame]:
         """Return the car's frame in the map."""
-        return (car_frame(self._car.x_m, self._car.y_m, self._car.yaw_rad),)
+        return (car_frame(*self._car.pose),)
+
+    def motion(self) -> list[tuple[float, Sequence[Frame]]]:
+        """Return the car's frame at moments within the last step, on the arc between its ends.
+
+        Each element consists of the seconds before the end of the step, and the frames; moments
+        are at most 0.05 s apart, in order of time. There are none after `reset`.
+        """
+        if self._before is None:
+            return []
+        moments = car_moments(self._before.pose, self._car.pose, self.step_duration_s)
+        return before_end(moments, self.step_duration_s)
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]

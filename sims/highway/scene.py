@@ -44,6 +44,11 @@ class Car(NamedTuple):
     length_m: float
     width_m: float
 
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """Position x and y in meters, and yaw in radians."""
+        return self.x_m, self.y_m, self.yaw_rad
+
     def to_body_frame(self, point_m: tuple[float, float]) -> tuple[float, float]:
         """Transform a map point into this car's frame: (forward, left), meters."""
         dx_m, dy_m = point_m[0] - self.x_m, point_m[1] - self.y_m

@@ -190,7 +190,13 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     def frames(self) -> Sequence[Frame]:
         """Return the car's frame in the map."""
-        return (car_frame(self.car.x_m, self.car.y_m, self.car.yaw_rad),)
+        return _frames_of(self.car)
+
+    def _state(self) -> Car:
+        return self.car
+
+    def _moments(self, before: Any, action: int) -> list[Sequence[Frame]]:
+        return [_frames_of(car) for car in self.fleet.substeps(before, action)]
 
     def _open_view(self, render_mode: RenderMode) -> FollowView:
         frames_per_s = self.metadata["render_fps"]
@@ -210,3 +216,7 @@ class BatchedLaneKeepingEnv(BatchedEnv):
     """Vectorized environment of N cars; arguments as in `LaneKeepingEnv`."""
 
     fleet_type = LaneFleet
+
+
+def _frames_of(car: Car) -> tuple[Frame]:
+    return (car_frame(car.x_m, car.y_m, car.yaw_rad),)

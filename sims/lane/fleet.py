@@ -14,7 +14,7 @@ from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
 from mcaprl.sims.geometry.compiled import ready
 from mcaprl.sims.lane.block import car_info, step_cars, step_only_car
 from mcaprl.sims.lane.camera import IMAGE_SHAPE, CarCamera
-from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, step_classic
+from mcaprl.sims.lane.classic import CLASSIC_DECISION_S, CLASSIC_SUBSTEPS, step_classic
 from mcaprl.sims.lane.course import COURSE, NEXT_TURN
 from mcaprl.sims.lane.rays import RAY_OBSERVATION_LIMIT, RAY_OBSERVATION_NAMES, observe_all_rays
 from mcaprl.sims.lane.rules import (
@@ -23,7 +23,9 @@ from mcaprl.sims.lane.rules import (
     OBSERVATION_LIMIT,
     OBSERVATION_NAMES,
     REASONS,
+    SUBSTEPS,
     Car,
+    drive,
     observe,
     store_car,
 )
@@ -86,6 +88,15 @@ class LaneFleet(Fleet):
     def car(self, i: int) -> Car:
         """Return the state of a car."""
         return Car._make(self._cars[i, :STARTED_AT].tolist())
+
+    def substeps(self, before: Car, action: int) -> list[Car]:
+        """Return a car after each 0.05 s of a decision; the last one is the result of the step."""
+        if not self._classic:
+            return [drive(before, action, 1 + k) for k in range(SUBSTEPS)]
+        cars = [before]
+        for _ in range(CLASSIC_SUBSTEPS):
+            cars.append(drive(cars[-1], action, 1))
+        return cars[1:]
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start car i; see "Starting State" of `LaneKeepingEnv`."""

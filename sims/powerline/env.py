@@ -175,6 +175,12 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         """Return the drone's level frame in the map, and the body's frame in the level frame."""
         return powerline_scene.drone_frames(self.flight.drone)
 
+    def _state(self) -> Flight:
+        return self.flight
+
+    def _moments(self, before: Flight, action: int) -> list[Sequence[Frame]]:
+        return [powerline_scene.drone_frames(drone) for drone in self.fleet.drones_from(before)]
+
     def _open_view(self, render_mode: RenderMode) -> PowerlineView:
         from mcaprl.sims.powerline.view import PowerlineView
 

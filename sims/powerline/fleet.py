@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.depth import encode_depth, encode_nearness
+from mcaprl.sims.geometry.vectors import plus
 from mcaprl.sims.powerline.camera import CAMERAS, IMAGE_SHAPE, DroneCamera
 from mcaprl.sims.powerline.classic import (
     CLASSIC_DECISION_S,
@@ -16,9 +17,10 @@ from mcaprl.sims.powerline.classic import (
     CLASSIC_VELOCITY_STEP_M_S,
     step_classic,
 )
-from mcaprl.sims.powerline.quadrotor import PLANTS
+from mcaprl.sims.powerline.quadrotor import PLANTS, Drone, fly
 from mcaprl.sims.powerline.rules import (
     ACTION_MEANINGS,
+    CHECK_S,
     DECISION_S,
     FIRST_COMMAND_M_S,
     FLIGHT_SIZE,
@@ -99,6 +101,23 @@ class PowerlineFleet(Fleet):
     def flight(self, i: int) -> Flight:
         """Return the state of a drone, NED."""
         return flight_at(self._flights[i])
+
+    def drones_from(self, before: Flight) -> list[Drone]:
+        """Return the only drone after each 0.05 s of its last decision, which began at `before`.
+
+        The last one is its current state. A drone whose episode ended within the decision stays at
+        its place for the rest of it.
+        """
+        after = self.flight(0)
+        wind_m_s = plus(after.wind_m_s, after.gust_m_s)
+        drones, drone = list[Drone](), before.drone
+        for _ in range(round(self.step_duration_s / CHECK_S)):
+            for part_s in (CHECK_S / 2, CHECK_S):
+                has_ended = drone == after.drone
+                going = (self._plant, drone, after.command_m_s, wind_m_s, part_s)
+                drones.append(drone if has_ended else fly(*going))
+            drone = drones[-1]
+        return drones
 
     def begin(self, i: int, random: np.random.Generator, options: dict[str, Any] | None) -> None:
         """Start drone i; see "Starting State" of `PowerlineEnv`."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.drawing.motion import car_moments
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.racer import scene as racer_scene
 from mcaprl.sims.racer.car import Car
@@ -168,6 +169,14 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     def frames(self) -> Sequence[Frame]:
         """Return the car's frame in the map."""
         return (racer_scene.car_frame(self.car),)
+
+    def _state(self) -> Car:
+        return self.car
+
+    def _moments(self, before: Car, action: int) -> list[Sequence[Frame]]:
+        # The rules turn a car at once and then move it; a viewer shows an arc.
+        start, end = racer_scene.pose_of(before), racer_scene.pose_of(self.car)
+        return car_moments(start, end, self.step_duration_s)
 
     def _open_view(self, render_mode: RenderMode) -> RacerView:
         from mcaprl.sims.racer.view import RacerView

@@ -96,7 +96,12 @@ def moving_shapes(
     )
 
 
+def pose_of(car: Car) -> tuple[float, float, float]:
+    """Return the car's x, y and yaw in the map, meters and radians."""
+    height_px = IMAGE_HEIGHT_PX - car.y_px
+    return METERS_PER_PX * car.x_px, METERS_PER_PX * height_px, -car.heading_rad
+
+
 def car_frame(car: Car) -> Frame:
     """Return the car's frame in the map."""
-    x_m, y_m = METERS_PER_PX * car.x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - car.y_px)
-    return shapes.car_frame(x_m, y_m, -car.heading_rad)
+    return shapes.car_frame(*pose_of(car))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Sequence
 from operator import index
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -26,6 +27,8 @@ class View(Protocol):
         """Close the window, if there is one."""
 
 
+Frames = Sequence[Any]
+"""Moving frames at one moment, each a `mcaprl.sims.drawing.scene.Frame`."""
 AnyFleet = TypeVar("AnyFleet", bound=Fleet)
 AnyView = TypeVar("AnyView", bound=View)
 
@@ -95,6 +98,9 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
+        # State after the last step, and the state before it with its action, while watched.
+        self._now: Any = None
+        self._last_step: tuple[Any, int] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -108,6 +114,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
             super().reset(seed=seed)
         self.fleet.begin(0, self.np_random, options)
         self._trail.clear()
+        self._last_step = None
         if self._is_watched:
             self._watch()
         return self.fleet.observation(0), self.fleet.info(0)
@@ -129,6 +136,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
         observation, reward, end, info = self._step_one(number)
         if self._is_watched:
+            self._last_step = (self._now, number)
             self._watch()
         if end == GOING_ON:
             return observation, reward, False, False, info
@@ -144,13 +152,52 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
     @property
     def trail(self) -> list[tuple[float, ...]]:
         """Last positions of the vehicle, at least one, recorded since the first read."""
-        self._is_watched = True
         if not self._trail:
+            self._is_watched = True
             self._trail.append(self.place)
+            self._now, self._last_step = self._state(), None
         return list(self._trail)
 
+    def motion(self) -> list[tuple[float, Frames]]:
+        """Return the moving frames within the last step, at most 0.05 s apart, in order of time.
+
+        Each element consists of the seconds before the end of the step, and the frames at that
+        moment. There are none after `reset`, and before the first read of `trail`.
+        """
+        if self._last_step is None:
+            return []
+        return before_end(self._moments(*self._last_step), self.step_duration_s)
+
+    @abstractmethod
+    def _state(self) -> Any:
+        """Return a copy of the state of the vehicle."""
+
+    @abstractmethod
+    def _moments(self, before: Any, action: int) -> list[Frames]:
+        """Return the moving frames at equal intervals within the last step and at its end.
+
+        Args:
+            before: State of the vehicle before the step.
+            action: Action of the step.
+        """
+
     def _watch(self) -> None:
-        """Append the vehicle's position to the trail, and show it in mode `human`."""
+        """Keep the vehicle's position and state, and show it in mode `human`."""
         self._trail.append(self.place)
+        self._now = self._state()
         if self.render_mode == "human":
             self.render()
+
+
+def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
+    """Return the frames within a step with the time that is left; drop those at its end.
+
+    Args:
+        moments: Frames at equal intervals of the step, the last at its end.
+        duration_s: Duration of the step.
+
+    Returns:
+        Seconds before the end of the step, and the frames at that moment, in order of time.
+    """
+    count = len(moments)
+    return [(duration_s * (count - 1 - k) / count, moments[k]) for k in range(count - 1)]
