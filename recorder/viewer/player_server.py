@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.topics import EPISODE_TOPIC, LOG_TOPIC
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 from mcaprl.recorder.viewer.playback import Played, Player
 from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
@@ -19,6 +21,11 @@ from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 _PERIOD_S = 1 / 30
 # Range of speeds that a viewer may request; others are ignored.
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
+# Viewers drop all that they have when the time goes back, so it has to arrive before the picture;
+# the server has separate queues for times and messages.
+_TICKS_AFTER_SEEK = 2
+# Topics whose messages are events; a viewer that receives one twice shows it twice.
+_EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
 
 
 class LiveServer(ViewerServer):
@@ -55,8 +62,15 @@ class LiveServer(ViewerServer):
         self._player, self._prefixes = player, prefixes
         self._starts_ns = tuple(episode_starts_ns)
         self._lock = threading.Lock()
-        self._looked_at = False
-        self._newly_subscribed = self._seeked = False
+        self._looked_at = self._seeked = False
+        self._ticks_to_picture = 0
+        # Number of subscribers by channel, and the channels with a new one.
+        self._subscribers: Counter[int] = Counter()
+        self._joined: set[int] = set()
+        # Viewers have all events up to this time.
+        self._sent_ns = -1
+        # The first picture includes the messages at the start.
+        player.seek(player.start_ns)
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)
         )
@@ -75,50 +89,53 @@ class LiveServer(ViewerServer):
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the messages that are due."""
+        """Send the messages that are due, after the current picture to those who need one."""
+        # The lock is held until all is sent, so that no message from before a seek follows the
+        # response to the seek.
         with self._lock:
-            restarts = self._player.ended and self._player.loops and self._player.playing
-            if restarts:
-                self._player.seek(self._player.start_ns)
-            fresh = restarts or self._newly_subscribed or self._seeked
-            self._newly_subscribed = self._seeked = False
-            was_playing = self._player.playing
-            due = self._player.current_messages() if fresh else []
-            due += self._player.advance(elapsed_s)
-            time_ns, stopped = self._player.time_ns, was_playing and not self._player.playing
-            state = self._state(did_seek=restarts)
-            # The lock is held until all is sent, so that no message from before a seek follows the
-            # response to the seek.
-            if restarts:
-                # Clear the display of viewers without a seek bar.
-                self._server.clear_session()
-            for message in due:
+            player = self._player
+            if player.ended and player.loops and player.playing:
+                self._seek(player.start_ns)
+                self._server.broadcast_playback_state(self._state(did_seek=True))
+            if self._ticks_to_picture:
+                self._ticks_to_picture -= 1
+                self._server.broadcast_time(player.time_ns)
+                return
+            picture, was_playing = self._picture(), player.playing
+            due = player.advance(elapsed_s)
+            self._server.broadcast_time(player.time_ns)
+            for message in picture + due:
                 self._send(message)
-            self._server.broadcast_time(time_ns)
-            if restarts or stopped:
-                self._server.broadcast_playback_state(state)
+            self._sent_ns = player.time_ns
+            if was_playing and not player.playing:
+                self._server.broadcast_playback_state(self._state(did_seek=False))
 
     def on_playback_control_request(self, request: Any) -> Any:
         """Play, pause, change the speed, or seek."""
         with self._lock:
-            player = self._player
+            player, seek_ns = self._player, request.seek_time
             if MIN_SPEED <= request.playback_speed <= MAX_SPEED:
                 player.speed = request.playback_speed
-            if request.seek_time is not None:
-                player.seek(request.seek_time)
-                self._seeked = True
+            if seek_ns is not None:
+                self._seek(seek_ns)
             player.playing = request.playback_command == self._ws.PlaybackCommand.Play
             if player.playing and player.ended:
-                player.seek(player.start_ns)
-                self._seeked = True
-            return self._state(did_seek=self._seeked, request_id=request.request_id)
+                seek_ns = player.start_ns
+                self._seek(seek_ns)
+            return self._state(did_seek=seek_ns is not None, request_id=request.request_id)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Send the current state with the next tick, and start the clock on the first call."""
+        """Send the topic's latest message with the next tick; the first call starts the clock."""
         with self._lock:
             if not self._looked_at:
                 self._looked_at = self._player.playing = True
-            self._newly_subscribed = True
+            self._subscribers[channel.id] += 1
+            self._joined.add(channel.id)
+
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+        """Count the topic's subscribers."""
+        with self._lock:
+            self._subscribers[channel.id] -= 1
 
     def on_get_parameters(self, client: Any, names: list[str], request_id: Any = None) -> list[Any]:
         """Return the requested parameters, or all if no name is given."""
@@ -144,10 +161,35 @@ class LiveServer(ViewerServer):
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
         """Do nothing."""
 
+    def _picture(self) -> list[Played]:
+        """Return the current messages that viewers lack after a seek or a new subscription."""
+        seeked, joined = self._seeked, self._joined
+        self._seeked, self._joined = False, set()
+        if not (seeked or joined):
+            return []
+        current = self._player.current_messages()
+        return [message for message in current if self._is_lacking(message, joined, seeked)]
+
+    def _is_lacking(self, message: Played, joined: set[int], seeked: bool) -> bool:
+        """Return whether viewers lack a current message, and none gets an event twice."""
+        channel_id = self._channels[message.track, message.channel_id].id()
+        topic = self._reader(message.track).channels[message.channel_id].topic
+        if topic not in _EVENT_TOPICS:
+            return seeked or channel_id in joined
+        first_ns = self._player.start_ns
+        is_first = channel_id in joined and self._subscribers[channel_id] == 1
+        if not is_first and self._player.time_ns >= self._sent_ns:
+            # A seek forward leaves viewers the events that they have.
+            first_ns = max(first_ns, self._sent_ns + 1)
+        return (seeked or is_first) and message.time_ns >= first_ns
+
+    def _seek(self, time_ns: int) -> None:
+        self._player.seek(time_ns)
+        self._seeked, self._ticks_to_picture = True, _TICKS_AFTER_SEEK
+
     def _jump(self, episode: int) -> None:
         if 0 <= episode < len(self._starts_ns):
-            self._player.seek(self._starts_ns[episode])
-            self._seeked = True
+            self._seek(self._starts_ns[episode])
             self._server.broadcast_playback_state(self._state(did_seek=True))
 
     def _parameters(self) -> list[Any]:

@@ -1,5 +1,5 @@
 // Connects to a live server as a viewer does, does what it is printed, and prints what it got as JSON.
-// usage: node viewer.mjs URL '[["seek", "NANOSECONDS"], ["play", 2.0, COUNT], ["episode", K], ...]'
+// usage: node viewer.mjs URL '[["seek", "NANOSECONDS"], ["play", 2.0, COUNT], ["episode", K], ["loop", 2.0, ROUNDS], ...]'
 import protocol from "@foxglove/ws-protocol";
 import { createHash } from "node:crypto";
 import WebSocket from "ws";
@@ -9,7 +9,7 @@ const socket = new WebSocket(url, ["foxglove.sdk.v1"]);
 const client = new protocol.FoxgloveClient({ ws: socket });
 const seen = { server: undefined, topics: {}, steps: [], parameters: [] };
 const byId = new Map();
-let now = { messages: [], states: [] };
+let now = { messages: [], states: [], wire: [] };
 const PLAYBACK_STATE = 5;
 
 // The library is older than playback control: it would call its messages an error.
@@ -23,6 +23,7 @@ socket.onmessage = (event) => {
     speed: view.getFloat32(10, true),
     seeked: view.getUint8(14) === 1,
   });
+  now.wire.push([now.states.at(-1).seeked ? "seeked" : "state", now.states.at(-1).time]);
 };
 
 client.on("error", (error) => {
@@ -31,6 +32,10 @@ client.on("error", (error) => {
 });
 client.on("serverInfo", (info) => {
   seen.server = info;
+  now.wire.push(["session", info.sessionId]);
+});
+client.on("time", ({ timestamp }) => {
+  now.wire.push(["time", String(timestamp)]);
 });
 client.on("advertise", (channels) => {
   for (const channel of channels) {
@@ -43,6 +48,7 @@ client.on("advertise", (channels) => {
 client.on("message", ({ subscriptionId, timestamp, data }) => {
   const sha256 = createHash("sha256").update(new Uint8Array(data.buffer, data.byteOffset, data.byteLength)).digest("hex");
   now.messages.push({ topic: byId.get(subscriptionId), time: String(timestamp), sha256 });
+  now.wire.push([byId.get(subscriptionId), String(timestamp)]);
 });
 client.on("parameterValues", ({ parameters }) => {
   seen.parameters.push(parameters);
@@ -77,12 +83,19 @@ for (const [kind, value, count] of JSON.parse(plan)) {
   control(false, 1);
   await until(() => now.states.length > 0);
   await quiet();
-  now = { messages: [], states: [] };
+  seen.start ??= now.wire;
+  now = { messages: [], states: [], wire: [] };
   if (kind === "seek") control(false, 1, value);
   if (kind === "play") control(true, value);
   if (kind === "episode") client.setParameters([{ name: "episode", value }], "p");
+  if (kind === "loop") {
+    client.setParameters([{ name: "loop", value: true }], "p");
+    control(true, value);
+    const restarts = () => now.states.filter((state) => state.seeked).length;
+    await until(() => restarts() >= count);
+  }
   await until(() => now.states.length > 0 && now.messages.length >= (count ?? 1));
-  if (kind !== "play") await quiet();
+  if (kind !== "play" && kind !== "loop") await quiet();
   seen.steps.push({ kind, value, ...now });
 }
 client.close();

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import shutil
-import subprocess
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -24,9 +22,8 @@ from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.viewer.live_stream import Pace
-from tests.conftest import need
 from tests.support.learner_topic import read_learner
-from tests.support.paths import NODE
+from tests.support.watcher import Watcher
 
 SHORT: dict[str, Any] = {
     "steps": 400,
@@ -85,24 +82,6 @@ def test_the_frame_rate_is_limited() -> None:
             pace.end()
         clock.now_s += 0.001
     assert shown == pytest.approx(100, abs=2)
-
-
-class Watcher:
-    """A viewer of the Foxglove protocol that takes whatever comes."""
-
-    def __init__(self, url: str) -> None:
-        need(shutil.which("node") is not None, "node is not installed")
-        installed = (NODE / "node_modules" / "@foxglove" / "ws-protocol").exists()
-        need(installed, "run `npm ci` in tests/node")
-        self._process = subprocess.Popen(
-            ["node", str(NODE / "watch.mjs"), url], stdout=subprocess.PIPE, text=True
-        )
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline() == "watching\n"
-
-    def seen(self) -> Any:
-        """All that came, once the server has said goodbye."""
-        return json.loads(self._process.communicate(timeout=30)[0])
 
 
 def watched(task: Task, out: Path, **options: Any) -> Any:
