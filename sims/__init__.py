@@ -23,7 +23,7 @@ from mcaprl.sims.spec import SimCatalog, SimSpec
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""
 
-# The attribute that recorders look for.
+# Recorders read the module from this attribute.
 _ENV_MODULE: Final = "env_module"
 
 
@@ -79,7 +79,7 @@ def make_sims(
 
 
 def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
-    """Let logs of environments name the module whose import registers them."""
+    """Set `env_module`, so that logs name the module that registers the environments."""
     module = env_id.rpartition(":")[0]
     for env in envs:
         if module and not hasattr(env.unwrapped, _ENV_MODULE):
@@ -87,7 +87,7 @@ def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
 
 
 def _resolve(name: str) -> tuple[str, SimSpec | None]:
-    """Return the Gymnasium id of a short name or id, and the description if it is a sim."""
+    """Return the Gymnasium id for a name, and the sim's description, None if it is not a sim."""
     env_id = SIMS.get(name, name)
     is_known_to_gymnasium = env_id in gym.registry or ":" in env_id
     return env_id, SIMS.find(env_id, loads=not is_known_to_gymnasium)
@@ -95,7 +95,7 @@ def _resolve(name: str) -> tuple[str, SimSpec | None]:
 
 @contextlib.contextmanager
 def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> Iterator[None]:
-    """Convert the errors that making a sim raises to errors of this package."""
+    """Context manager that converts errors during `gym.make` to errors of this package."""
     if spec is not None and spec.engine:
         import_extra(spec.engine, "sims")
     try:
@@ -126,7 +126,7 @@ __all__ = [
     "rollout",
 ]
 
-# Imported on first use.
+# These names are imported on first use.
 __getattr__ = lazy_attributes(
     __name__,
     {

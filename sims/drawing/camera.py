@@ -62,7 +62,7 @@ def level_axes(yaw_rad: float) -> Floats:
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the (T, 4) planes of triangles: the front's unit normal and the offset."""
+    """Return the (T, 4) planes of triangles: the front's unit normal n, and n p for a corner p."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -92,7 +92,7 @@ def draw(
     middles, left_u, right_u = np.empty((3, inverse_z.shape[0]))
     for row in range(len(middles)):
         middles[row] = row + 0.5
-    # Half of the image's width and height at z = 1; a corner on the border is inside.
+    # Half the width and height of the view at z = 1. A corner on the border counts as inside.
     wide, high = 0.5 * inverse_z.shape[1] / focal_px, 0.5 * inverse_z.shape[0] / focal_px
     for face in range(len(mesh)):
         before_m = planes[face, 0] * eye_m[0] + planes[face, 1] * eye_m[1]
@@ -125,7 +125,7 @@ def draw(
 
 
 class _Plane(NamedTuple):
-    """Points p with x p_x + y p_y + z p_z = offset, negative if the camera is in front."""
+    """Plane x p_x + y p_y + z p_z = offset; the offset is negative if the camera is in front."""
 
     x: float
     y: float
@@ -154,7 +154,7 @@ def _difference(corners: Floats, i: int) -> tuple[float, float, float]:
 
 @compiled
 def _clip_near(corners: Floats, polygon: Floats) -> int:
-    """Clip a triangle at the near plane into `polygon`, and return the number of its corners."""
+    """Clip a triangle at the near plane; write the corners to `polygon` and return their number."""
     count = 0
     for i in range(3):
         j = (i + 1) % 3
@@ -188,8 +188,8 @@ def _spans(
     """Compute the leftmost and rightmost u of a convex polygon on each row of the image.
 
     Adjacent polygons list their common edge in opposite directions. Since each edge is evaluated
-    from its upper end, both compute the same bits. The loop over edges is the outer one, so that
-    the loop over rows can be vectorized.
+    from its upper end, both polygons get bit-identical results. The loop over rows is the inner
+    loop, so that the compiler can vectorize it.
 
     Args:
         polygon: (4, 3) u and v of the corners.
@@ -232,9 +232,9 @@ def _fill(
 ) -> None:
     """Fill a convex polygon that lies in a plane.
 
-    A pixel is filled if its middle is inside; a middle on an edge belongs to the polygon to the
-    right of the edge or below. Points p = z (u/f, v/f, 1) of the plane have
-    1/z = (x u/f + y v/f + z) / offset, with u and v from the middle of the image.
+    A pixel is filled if its middle is inside. If the middle is on an edge, the pixel belongs to the
+    polygon to the right of the edge or below it. In the plane, the inverse depth at a pixel (u, v),
+    relative to the middle of the image, is (x u/f + y v/f + z) / offset with focal length f.
 
     Args:
         rows: First row that the polygon covers, and the row after the last one.
@@ -253,7 +253,7 @@ def _fill(
         at_v = plane.y / focal_px * (row + 0.5 - middle_v) + plane.z
         at_zero = at_v / plane.offset + step * (0.5 - middle_u)
         for column in range(start, end):
-            # Without a branch, so that the loop can be vectorized.
+            # `max` instead of a branch lets the compiler vectorize the loop.
             inverse_z[row, column] = max(inverse_z[row, column], at_zero + step * column)
 
 
@@ -266,10 +266,10 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires into `inverse_z`, (height, width) 1/m, where nothing is nearer.
+    """Draw straight wires into `inverse_z`, (height, width) 1/m, behind nearer surfaces.
 
-    A wire is one pixel wide at any distance: it covers one pixel of each column that it crosses,
-    or of each row if it is steeper than 45 degrees in the image.
+    A wire is one pixel wide at any distance. It covers one pixel in each column that it crosses. If
+    it is steeper than 45 degrees in the image, it covers one pixel in each row instead.
 
     Args:
         wires: (S, 2, 3) ends of the wires.
@@ -300,7 +300,7 @@ def draw_wires(
 
 @compiled
 def _cut_near(ends: Floats) -> bool:
-    """Clip a wire at the near plane, in place; return whether a part of it is in front."""
+    """Clip a wire at the near plane, in place; return whether any of it lies beyond the plane."""
     if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
         return False
     for i in range(2):

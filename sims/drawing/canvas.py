@@ -1,4 +1,4 @@
-"""Image drawn with pygame, and the window that shows it."""
+"""Canvas that draws images with pygame and can show them in a window."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SMOOTH = 2
 
 
 class Canvas:
-    """Canvas for a sequence of images, which mode `human` shows in a window.
+    """Canvas for a sequence of images. In mode `human`, a window shows them.
 
     For each image, call `polygon` any number of times, then `flatten`, then the methods that draw
     text and other elements without smoothing, then `finish`.
@@ -31,7 +31,7 @@ class Canvas:
         caption: str,
         images_per_s: int,
     ) -> None:
-        """Prepare an empty image with a width and a height; mode `human` opens a window.
+        """Prepare an empty image of the given size; open a window in mode `human`.
 
         Raises:
             MissingExtraError: Pygame is not installed.
@@ -61,27 +61,27 @@ class Canvas:
         self._image = self.pygame.transform.smoothscale(self._large, self._size_px)
 
     def rectangle(self, box_px: tuple[int, int, int, int], color: Rgb, edge_px: int = 0) -> None:
-        """Draw a rectangle (left, top, width, height): filled, or its outline if it has an edge."""
+        """Draw a rectangle (left, top, width, height); fill it if `edge_px` is 0."""
         self.pygame.draw.rect(self._image, color, box_px, edge_px)
 
     def arrowhead(self, middle_px: tuple[int, int], toward: tuple[int, int], color: Rgb) -> None:
-        """Draw a triangle of 16 pixels that points in a direction: right is (1, 0), down (0, 1)."""
+        """Draw a 16-pixel triangle that points right for (1, 0), down for (0, 1)."""
         (x, y), (dx, dy) = middle_px, toward
         tip, left, right = (dx, dy), (dy - dx, -dx - dy), (-dy - dx, dx - dy)
         corners = [(x + 8 * part[0], y + 8 * part[1]) for part in (tip, left, right)]
         self.pygame.draw.polygon(self._image, color, corners)
 
     def text(self, text: str, at_px: tuple[int, int], height_px: int, color: Rgb) -> None:
-        """Draw text from (left, top)."""
+        """Draw text whose left top corner is at `at_px`."""
         if height_px not in self._fonts:
             self._fonts[height_px] = self.pygame.font.Font(None, height_px)
         self._image.blit(self._fonts[height_px].render(text, True, color), at_px)
 
     def strip(self, box_px: tuple[int, int, int, int], color: Rgb) -> Any:
-        """Fill a part of the image (left, top, width, height) with a background color.
+        """Fill the rectangle (left, top, width, height) with a background color.
 
         Returns:
-            Pygame surface that shares its pixels with this part of the image.
+            Pygame surface that shares memory with this rectangle of the image.
         """
         part = self._image.subsurface(box_px)
         part.fill(color)

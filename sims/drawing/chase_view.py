@@ -1,8 +1,8 @@
 """Perspective view of a scene from behind a body, drawn with pygame from back to front.
 
-Faces that lie flat on the ground are drawn first, in the order of their heights, then all others,
-the farthest first. The order uses the distances of the faces' middles and can be wrong for a large
-face beside a small one. For depth images, see `sims.drawing.camera`.
+Faces that lie flat on the ground are drawn first, the lowest first. Then all others are drawn, the
+farthest first. A face's distance is that of its middle, so the order can be wrong for a large face
+beside a small one. For depth images, see `sims.drawing.camera`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Pose(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Polygon, or stroke between two points, in the map."""
+    """Polygon, stroke between two points, or text, in map coordinates."""
 
     corners_m: Floats
     """(K, 3) corners."""
@@ -59,7 +59,7 @@ class _Piece(NamedTuple):
 
 
 class ChaseView:
-    """Renderer of a sequence of images; static shapes are prepared once."""
+    """Renderer that prepares the static shapes once and then draws any number of images."""
 
     def __init__(self) -> None:
         """Prepare an empty image.
@@ -81,8 +81,8 @@ class ChaseView:
         """Render one image, (height, width, 3).
 
         Args:
-            static: Static shapes; those in the map are prepared again only if this is another list
-                object than in the last call.
+            static: Static shapes. If this is the same list object as in the last call, the shapes
+                in the frame `map` are not prepared again.
             moving: Shapes that change.
             frames: All frames.
             follow: Frame of the body; if empty, the camera faces the map's origin.
@@ -111,7 +111,7 @@ class ChaseView:
         self._canvas.close()
 
     def _visible_in_map(self, static: Sequence[Shape], eye: Pose) -> list[_Piece]:
-        """Return the pieces of the map that are near enough to be drawn."""
+        """Return the static pieces in the frame `map` that are closer than `FAR_M`."""
         if self._prepared is None or self._prepared[0] is not static:
             pieces = [p for s in static if s.frame == "map" for p in _pieces(s, {})]
             middles = np.array([p.corners_m.mean(axis=0) for p in pieces]).reshape(-1, 3)
@@ -150,7 +150,7 @@ def poses_of(frames: Iterable[Frame]) -> dict[str, Pose]:
             return found[name]
         if name not in by_name:
             return Pose(np.eye(3), np.zeros(3))
-        # Popped, so that a cycle of frames terminates.
+        # Removing the frame ends the recursion if its parents form a cycle.
         frame = by_name.pop(name)
         parent = place(frame.parent)
         axes = parent.axes @ rotation_matrix(frame.rotation)
@@ -175,7 +175,7 @@ def rotation_matrix(xyzw: tuple[float, float, float, float]) -> Floats:
 
 
 def chase_eye(body: Pose) -> Pose:
-    """Return the pose of the camera behind a body: x right and level, y down, z along the view."""
+    """Return the pose of the camera behind a body; x is right and level, y down, z forward."""
     forward = body.axes[:, 0] * [1.0, 1.0, 0.0]
     length = float(np.linalg.norm(forward))
     forward = forward / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
@@ -204,7 +204,7 @@ def _pieces(shape: Shape, poses: Mapping[str, Pose]) -> list[_Piece]:
 
 
 def _outlines(shape: Shape) -> tuple[list[Floats], float]:
-    """Return a shape's polygons (K, 3), or its strokes (2, 3) and their width, before placement."""
+    """Return polygons (K, 3) and 0, or strokes (2, 3) and their width, in the shape's own axes."""
     points, size = shape.points, shape.size
     match shape.kind:
         case "box":
@@ -239,7 +239,7 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
 
 
 def _seen(piece: _Piece, eye: Pose) -> Floats | None:
-    """Return a piece as a polygon of the image; None if it is behind the camera or edge-on."""
+    """Project a piece to a polygon in the image; return None if none of it is in front."""
     corners = _before_eye((piece.corners_m - eye.at_m) @ eye.axes, closed=piece.width_m == 0)
     if len(corners) < 2:
         return None
@@ -272,7 +272,7 @@ def _projected(corners: Floats) -> Floats:
 
 
 def _stroke(ends: Floats, widths_px: Floats) -> Floats:
-    """Return a line between two points as a polygon with the width of each end, or as a dot."""
+    """Return a polygon for a stroke whose ends have different widths; a short stroke is a dot."""
     along = ends[1] - ends[0]
     length = float(np.hypot(*along))
     half_px = np.clip(widths_px, 1.0, _WIDEST_PX)[:, None] / 2
@@ -284,12 +284,12 @@ def _stroke(ends: Floats, widths_px: Floats) -> Floats:
 
 
 def _lit(piece: _Piece) -> Color:
-    """Return the color of a face, shaded by its angle to the sun."""
+    """Return the color of a piece; faces are shaded by their angle to the sun."""
     if piece.width_m:
         return piece.color
     corners = piece.corners_m
     (ax, ay, az), (bx, by, bz) = (corners[1:3] - corners[0]).tolist()
-    # Written out, since NumPy's cross product is slow for a single pair of vectors.
+    # NumPy's cross product is slow for a single pair of vectors.
     normal = (ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     length = math.hypot(*normal)
     light = (

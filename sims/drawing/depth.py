@@ -78,10 +78,10 @@ def shrink(
 ) -> None:
     """Downsample an image of inverse distances to a smaller image of distances.
 
-    If at least half of a new pixel's area is covered by surfaces, the pixel's inverse distance is
-    the mean over that part of the area; otherwise the distance is infinite. Thus the sky does not
-    affect distances. Since inverse depth is linear on a plane, the mean is the distance of the
-    plane near the middle of the area.
+    If surfaces cover at least half of a new pixel, its inverse distance is the mean over the
+    covered part. Otherwise, its distance is infinite. Thus the sky does not affect distances. On a
+    plane, inverse depth is linear in image coordinates, so the mean gives the distance near the
+    middle of the covered part.
 
     Args:
         inverse: (H, W) 1/m, 0 where there is no surface.
@@ -153,7 +153,7 @@ class DepthCamera:
         return inverse
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Render the small image: (h, w) meters along each ray, infinity without a surface."""
+        """Render the small image: (h, w) meters along each ray, infinity where it hits nothing."""
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
         if len(self._wires):

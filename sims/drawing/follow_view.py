@@ -32,7 +32,7 @@ class Body(NamedTuple):
 
 
 class FollowView:
-    """Renderer of one image for each step, which mode `human` shows in a window."""
+    """Renderer that draws one image for each step. In mode `human`, a window shows the images."""
 
     def __init__(
         self,
@@ -43,9 +43,9 @@ class FollowView:
         frames_per_s: int,
         floor: Iterable[Shape] = (),
     ) -> None:
-        """Prepare the static shapes; those of `floor` are drawn below all others.
+        """Prepare the static shapes. Shapes in `floor` are drawn below all others.
 
-        `width_m` is the width of the ground in the image.
+        The image shows `width_m` meters of the ground from left to right.
 
         Raises:
             MissingExtraError: Pygame is not installed.
@@ -61,7 +61,7 @@ class FollowView:
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
         """Draw the body, its surroundings, and a line of text at the bottom.
 
-        The caller may add to `canvas` before `show`.
+        Before it calls `show`, the caller may draw more on `canvas`.
         """
         lifted = [
             patch._replace(top_m=patch.top_m + body.height_m) if patch.frame != "map" else patch
@@ -82,7 +82,7 @@ class FollowView:
         self.canvas.close()
 
     def _near(self, body: Body) -> list[Patch]:
-        """Return the static patches that are on the body or near enough to be in the image."""
+        """Return the static patches that are fixed to the body or overlap the visible ground."""
         here, half_m = np.array([body.x_m, body.y_m]), self._width_m / 2
         seen = np.all((self._low - here <= half_m) & (self._high - here >= -half_m), axis=1)
         return [self._static[i] for i in np.flatnonzero(seen | self._on_body)]

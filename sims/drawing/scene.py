@@ -25,7 +25,7 @@ Kind = Literal[
 
 
 def no_points() -> NDArray[np.float64]:
-    """Return an empty (0, 3) array, the `points` of a shape without points."""
+    """Return an empty (0, 3) array, for a shape that has no points."""
     return np.empty((0, 3))
 
 
@@ -33,9 +33,9 @@ def no_points() -> NDArray[np.float64]:
 class Shape:
     """Element of a scene.
 
-    `box`, `sphere`, `cylinder` (axis along z) and `text` are at `position`, rotated by `yaw_rad`,
-    with edges `size`. The others are drawn through `points`, which `yaw_rad` rotates and `position`
-    translates.
+    A `box`, `sphere`, `cylinder` (axis along z) or `text` has its center at `position` and edge
+    lengths `size`, and is rotated by `yaw_rad`. The other kinds are drawn through `points`, which
+    are rotated by `yaw_rad` and then translated by `position`.
     """
 
     name: str
@@ -79,11 +79,11 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
-    """Return positions as the points of a line; a single position is repeated."""
+    """Return the `points` of a line through positions; repeat a single position."""
     return np.array(points if len(points) > 1 else [*points, *points])
 
 
 def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
-    """Return points (..., 2) as (N, 3) points at one height."""
+    """Add a height to points (..., 2); return (N, 3) points."""
     flat = points_m.reshape(-1, 2)
     return np.column_stack([flat, np.full(len(flat), z_m)])

@@ -40,17 +40,17 @@ def label(text: str, color: Color, height_m: float, frame: str = "car") -> Shape
 
 
 def trail(places_m: Sequence[tuple[float, ...]], width_m: float) -> Shape:
-    """Return the line through a car's last positions, (x, y) in the map; at least one."""
+    """Return a line through the car's last positions; at least one (x, y) in the map."""
     return Shape("trail", "line", TRAIL, raised(path(places_m), 0.06), size=(width_m, 0.0, 0.0))
 
 
 def lookahead(points_m: NDArray[np.float64]) -> Shape:
-    """Return points of the path ahead (N, 2), which the agent observes."""
+    """Return a shape that marks the path points (N, 2) in the agent's observation."""
     return Shape("lookahead", "points", LOOK, raised(points_m, 0.3), size=(0.6, 0.6, 0.6))
 
 
 def steering_arrow(axle_m: float, wheel_rad: float) -> Shape:
-    """Return an arrow above the front axle in the direction of the front wheels."""
+    """Return an arrow above the front axle that points where the front wheels point."""
     axle = np.array([axle_m, 0.0, 1.0])
     tip = axle + 2.0 * np.array([math.cos(wheel_rad), math.sin(wheel_rad), 0.0])
     ends = np.array([axle, tip])
@@ -60,19 +60,19 @@ def steering_arrow(axle_m: float, wheel_rad: float) -> Shape:
 def car_part(
     name: str, color: Color, size_m: Vector, middle_m: Vector, kind: Kind = "box"
 ) -> Shape:
-    """Return a solid that is a part of a car."""
+    """Return a solid shape that is fixed to a car."""
     return Shape(f"car_{name}", kind, color, size=size_m, position=middle_m, frame="car")
 
 
 def car_frame(x_m: float, y_m: float, yaw_rad: float) -> Frame:
-    """Return the frame `car` at a pose in the map."""
+    """Return the frame `car` for a car's pose in the map."""
     return Frame("car", (x_m, y_m, 0.0), yaw_rotation(yaw_rad))
 
 
 def wheels(
     color: Color, front_m: float, rear_m: float, side_m: float, radius_m: float, width_m: float
 ) -> list[Shape]:
-    """Return the four wheels of a car with axles at x = `front_m` and `rear_m`, y = +-`side_m`."""
+    """Return the four wheels of a car, with hubs at x = `front_m` or `rear_m`, y = +-`side_m`."""
     return [
         _wheel(f"{end}_{side}", color, (x_m, y_m, radius_m), radius_m, width_m)
         for end, x_m in (("front", front_m), ("rear", rear_m))

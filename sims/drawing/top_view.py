@@ -30,7 +30,7 @@ class Patch(NamedTuple):
 
 
 def patches(shapes: Iterable[Shape]) -> list[Patch]:
-    """Return the patches of shapes, the lowest first; `text` has none."""
+    """Return the patches of all shapes except `text`, the lowest first."""
     flat = [
         Patch(_top(shape), shape.color, corners, shape.frame)
         for shape in shapes
@@ -75,7 +75,7 @@ def _outlines(shape: Shape) -> list[Floats]:
 
 
 def _stroke(start: Floats, end: Floats, width_m: float) -> Floats:
-    """Return a line as a rectangle (4, 2), extended by half its width at each end."""
+    """Return a rectangle (4, 2) for a line; it extends half a width beyond each end."""
     along = end - start
     length_m = float(np.hypot(along[0], along[1]))
     yaw_rad = math.atan2(along[1], along[0])

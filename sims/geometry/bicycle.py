@@ -22,7 +22,7 @@ class Motion(NamedTuple):
 
 @inlined
 def moving(x_m: float, y_m: float, yaw_rad: float, speed_m_s: float) -> Motion:
-    """Return the motion of a car, its heading computed from its yaw."""
+    """Return the motion of a car; compute the heading from the yaw."""
     return Motion(x_m, y_m, yaw_rad, speed_m_s, heading_of(yaw_rad))
 
 
@@ -36,8 +36,8 @@ def roll(
 ) -> Motion:
     """Advance a bicycle by one explicit Euler step, which turns it by at most 90 degrees.
 
-    With slip angle beta, half the wheelbase l and speed v: x' = v cos(yaw + beta),
-    y' = v sin(yaw + beta), yaw' = v sin(beta) / l, v' = acceleration. Polack, Altche,
+    Let beta be the slip angle, l half the wheelbase and v the speed. Then x' = v cos(yaw + beta),
+    y' = v sin(yaw + beta), yaw' = v sin(beta) / l, and v' = acceleration. Polack, Altche,
     d'Andrea-Novel and de La Fortelle, "The kinematic bicycle model: a consistent model for planning
     feasible trajectories for autonomous vehicles?", IEEE IV 2017, eq. 1. cos(yaw + beta) and
     sin(yaw + beta) are expanded into products, since only the sine of beta is given.
@@ -57,7 +57,7 @@ def roll(
 
 @inlined
 def slip_of(steering_rad: float) -> float:
-    """Return sin(beta) for an angle of the front wheels of at most 45 degrees.
+    """Return sin(beta) for a steering angle from -45 to 45 degrees.
 
     tan(beta) = tan(steering) / 2, so sin(beta) = sin(steering) / sqrt(4 - 3 sin^2(steering)).
     """
@@ -67,16 +67,16 @@ def slip_of(steering_rad: float) -> float:
 
 @inlined
 def steering_of(slip_sine: float) -> float:
-    """Return the front wheels' angle, radians, for sin(beta): the inverse of `slip_of`."""
+    """Return the steering angle, radians, for sin(beta); inverts `slip_of`."""
     return math.atan2(2.0 * slip_sine, math.sqrt(1.0 - slip_sine * slip_sine))
 
 
 @inlined
 def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
-    """Return sin(beta) of the turn that causes a lateral acceleration at a speed.
+    """Return sin(beta) for a turn with the given lateral acceleration and speed.
 
-    The radius of the turn is l / sin(beta), so v^2 sin(beta) / l = lateral. At low speed, no
-    turn reaches that acceleration, and the result is 1.
+    The radius of the turn is l / sin(beta), so the lateral acceleration is v^2 sin(beta) / l. If
+    the speed is too low for this acceleration, the result is 1.
     """
     least = 0.5 * wheelbase_m * lateral_m_s2
     return least / max(speed_m_s * speed_m_s, least)

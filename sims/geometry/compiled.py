@@ -19,10 +19,11 @@ def compiled(function: AnyFunction) -> AnyFunction:
 
     `fastmath` is off, so that sums keep their written order and equal inputs produce identical
     results. A division by 0 returns inf or NaN, as in NumPy, because a check before each division
-    would prevent vectorization. For a type checker, the function keeps its signature.
+    would prevent vectorization. Type checkers see the original signature.
 
-    The cache is `$NUMBA_CACHE_DIR` if that is set, else `__pycache__` beside the source, else, if
-    that cannot be written, the user's cache folder. Without a cache, each process compiles.
+    If `NUMBA_CACHE_DIR` is set, that folder is the cache. Otherwise it is `__pycache__` beside the
+    source, or the user's cache folder if `__pycache__` cannot be written. If no folder can be
+    written, each process compiles again.
 
     Only an edit of the function's own file invalidates the cache. After an edit of a function that
     other files call, delete the `__pycache__` folder.
@@ -33,8 +34,8 @@ def compiled(function: AnyFunction) -> AnyFunction:
 def inlined(function: AnyFunction) -> AnyFunction:
     """Compile a function and inline it into each compiled function that calls it.
 
-    Loops over vehicles can then be vectorized. Without this decorator, the compiler inlines short
-    functions only.
+    Loops over vehicles can then be vectorized. With `compiled` instead, the compiler inlines only
+    short functions.
     """
     return _compiled(function, forceinline=True)
 
@@ -42,16 +43,16 @@ def inlined(function: AnyFunction) -> AnyFunction:
 def ready(
     function: Callable[..., Result], *arguments: Any, examples: tuple[Any, ...] = ()
 ) -> Callable[..., Result]:
-    """Bind a compiled function to arguments that stay the same objects: arrays and constants.
+    """Bind the first arguments of a compiled function, arrays or constants, for faster calls.
 
-    A normal call first inspects the type of each argument, which for a single vehicle takes as long
-    as the step itself. This function inspects them once. The arrays' contents may change; their
-    shape and memory may not.
+    A normal call inspects the type of each argument. For a single vehicle, this takes as long as
+    the step itself. This function inspects the types once. The contents of the bound arrays may
+    change, but not their shape or memory.
 
     Args:
         function: Compiled function.
-        *arguments: First arguments, which are bound.
-        examples: Values with the types of the remaining arguments, which each call passes.
+        *arguments: First arguments, which each call reuses.
+        examples: Examples of the remaining arguments, which each call passes.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)
@@ -71,7 +72,7 @@ def _compiled(function: AnyFunction, **options: Any) -> AnyFunction:
 
 
 class _Announcer(event.Listener):  # type: ignore[misc]
-    """Listener that reports the first compilation of a sim, since the user has to wait for it."""
+    """Listener that announces the first compilation, so that the user knows what takes long."""
 
     lasts: ClassVar[str] = "once"
     is_silent: ClassVar[bool] = False

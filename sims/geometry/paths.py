@@ -112,14 +112,14 @@ class Heading(NamedTuple):
 def heading_of(yaw_rad: float) -> Heading:
     """Return the direction of a yaw angle, accurate to about one bit.
 
-    Has no branches or calls, as `sine`. The angle is reduced to its remainder from the nearest
-    quarter turn; the number of quarter turns selects the order and the signs of the remainder's
-    cosine and sine.
+    Like `sine`, the function has no branches or calls. It splits the angle into quarter turns and
+    a remainder of at most 45 degrees, and computes the sine and cosine of the remainder. The number
+    of quarter turns determines their order and signs.
     """
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
     sin, cos = sine(rest_rad), cosine(rest_rad)
-    # quarters modulo 4
+    # This is `quarters` modulo 4.
     quarter = quarters - 4.0 * np.floor(0.25 * quarters)
     is_odd = (quarter == 1.0) | (quarter == 3.0)
     size_of_cos, size_of_sin = (sin, cos) if is_odd else (cos, sin)
@@ -164,7 +164,7 @@ def spot_at(path: Path, along_m: float) -> Spot:
 
 @compiled
 def further(path: Path, spot: Spot, ahead_m: float) -> Spot:
-    """Return the position `ahead_m` (at least 0) further along the path."""
+    """Return the position that is `ahead_m` further along the path; `ahead_m` is at least 0."""
     leg, rest_m = spot.leg, spot.rest_m + ahead_m
     length_m = path.along_m[leg + 1] - path.along_m[leg]
     while rest_m >= length_m:
@@ -198,7 +198,7 @@ def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> P
     """Return the nearest path point between two distances along the path.
 
     Where the path crosses itself, the window [from_m, to_m] selects the vehicle's branch. The
-    window may begin on any lap and contains the result's `along_m`.
+    window may begin on any lap. The result's `along_m` is within the window.
     """
     leg, rest_m = spot_at(path, from_m)
     leg_start_m = from_m - rest_m
@@ -227,5 +227,5 @@ def in_body_frame(dx_m: float, dy_m: float, cos_yaw: float, sin_yaw: float) -> t
 
 
 def scattered(index: int, low: float, high: float) -> float:
-    """Return element `index` of a low-discrepancy sequence, multiples of the golden ratio."""
+    """Return element `index` of a golden-ratio sequence that covers `low` to `high` evenly."""
     return low + (high - low) * (index * 0.6180339887498949 % 1.0)

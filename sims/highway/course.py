@@ -1,4 +1,4 @@
-"""Courses of a highway-env road, which join consecutive lanes, in ROS axes.
+"""Courses along a highway-env road: chains of consecutive lanes, in ROS axes.
 
 In highway-env's images, y points down. Here y and all angles have the opposite sign, so that z is
 up, angles are counter-clockwise, and left is positive.
@@ -95,7 +95,8 @@ def courses_of(network: Any) -> tuple[Course, ...]:
 def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
     """Yield start node, end node and lanes of each edge, in the direction of travel.
 
-    Begin at the node without a predecessor, or on a closed road at its first node.
+    The first start node is the one without a predecessor. A closed road has no such node; there it
+    is the first node of the graph.
     """
     reached = {end for ends in graph.values() for end in ends}
     first = next((node for node in graph if node not in reached), next(iter(graph)))
