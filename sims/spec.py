@@ -1,4 +1,4 @@
-"""Catalog of sims: built-in ones, and those that installed packages add by entry points."""
+"""Catalog of built-in sims, and of sims that installed packages add by entry points."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ GROUP: Final = "mcaprl.sims"
 class SimSpec:
     """Description of a sim: its names, environment classes and pilot.
 
-    A package adds a sim to `mcaprl` with an entry point in its `pyproject.toml`. The entry point's
-    name is the sim's short name; its object is a `SimSpec`, or a function without arguments that
-    returns one:
+    A package adds a sim to `mcaprl` with an entry point in its `pyproject.toml`. The entry point
+    has the sim's short name. It refers to a `SimSpec`, or to a function that returns a `SimSpec`
+    and takes no arguments:
 
         [project.entry-points."mcaprl.sims"]
         boat = "boats.sim:SPEC"
@@ -44,7 +44,7 @@ class SimSpec:
     """Class or function, or its `module:name`, that accepts the unwrapped environment and returns
     its scripted policy (`mcaprl.sims.evaluation.rollout.Policy`)."""
     engine: str | None = None
-    """Module of the extra `sims` that the sim requires."""
+    """Module that the sim requires and that the extra `sims` installs."""
 
     def register(self) -> None:
         """Register the environment with Gymnasium, unless its id is registered already.
@@ -61,7 +61,7 @@ class SimSpec:
             )
 
     def make_pilot(self, env: gym.Env[Any, Any]) -> Any:
-        """Return the scripted policy of an unwrapped environment; the sim must have one."""
+        """Return a scripted policy for an unwrapped environment of a sim that has a pilot."""
         pilot: Any = self.pilot
         if isinstance(pilot, str):
             module, _, attribute = pilot.partition(":")
@@ -72,8 +72,8 @@ class SimSpec:
 class SimCatalog(Mapping[str, str]):
     """Mapping from short names to Gymnasium ids.
 
-    Built-in sims are registered with Gymnasium when the catalog is created. An installed package is
-    imported, and its sim registered, when the name or an unregistered id is looked up.
+    Built-in sims are registered with Gymnasium when the catalog is created. Sims of other packages
+    are imported and registered when their short name or an unregistered id is looked up.
     """
 
     def __init__(self, own: Iterable[SimSpec]) -> None:
@@ -92,7 +92,7 @@ class SimCatalog(Mapping[str, str]):
         return self._spec(name).env_id
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the built-in sims, then of the others."""
+        """Iterate over the names of the built-in sims, then over the other names."""
         return iter([*self._specs, *(name for name in _installed() if name not in self._specs)])
 
     def __len__(self) -> int:
@@ -100,16 +100,16 @@ class SimCatalog(Mapping[str, str]):
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is a sim of this name; import nothing."""
+        """Return whether there is a sim of this name, without importing it."""
         return name in self._specs or name in _installed()
 
     def find(self, env_id: str, *, loads: bool = True) -> SimSpec | None:
-        """Return the description of the sim that has an id; None for any other environment.
+        """Return the description of the sim with this id, or None if no sim has it.
 
         Args:
             env_id: Gymnasium id.
-            loads: Whether to import the installed sims if no registered sim has the id; a failed
-                import causes a warning.
+            loads: If no registered sim has the id, whether to import the sims of other packages. A
+                failed import causes a warning.
         """
         specs = self._specs
         if loads and all(spec.env_id != env_id for spec in specs.values()):
@@ -139,7 +139,7 @@ def _load(found: EntryPoint) -> SimSpec:
     """Load the sim of an entry point.
 
     Raises:
-        UsageError: The entry point cannot be loaded, or has no sim of its name.
+        UsageError: The entry point cannot be loaded, or the sim has another name.
     """
     package = f" of package '{found.dist.name}'" if found.dist else ""
     place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"

@@ -266,7 +266,7 @@ def draw_wires(
     focal_y_px: float,
     inverse_z: Floats,
 ) -> None:
-    """Draw straight wires into `inverse_z`, (height, width) 1/m, behind nearer surfaces.
+    """Draw straight wires into `inverse_z`, (height, width) 1/m; nearer surfaces hide them.
 
     A wire is one pixel wide at any distance. It covers one pixel in each column that it crosses. If
     it is steeper than 45 degrees in the image, it covers one pixel in each row instead.

@@ -80,7 +80,7 @@ class Course(NamedTuple):
 
 
 def courses_of(network: Any) -> tuple[Course, ...]:
-    """Join the consecutive lanes of a road; return one course per parallel lane.
+    """Return the courses of a road: one for each parallel lane.
 
     Args:
         network: A `highway_env.road.road.RoadNetwork` without forks.
@@ -110,7 +110,7 @@ def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, l
 def _course(lanes: list[Any], is_closed: bool) -> Course:
     points: list[Floats] = []
     for lane in lanes:
-        # A lane may overlap the previous lane; sampling continues at the end of that lane.
+        # A lane may overlap the previous lane. Its samples begin where the previous lane ends.
         first_m = lane.local_coordinates(points[-1] * FLIP)[0] if points else 0.0
         count = int(np.ceil((lane.length - first_m) / SAMPLE_M))
         sampled = np.linspace(max(0.0, first_m), lane.length, count + 1)

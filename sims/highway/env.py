@@ -62,15 +62,15 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     ## Description
 
-    The agent steers a car whose speed is fixed. Roads, cars and rewards are those of highway-env:
-    `lane-keeping-v0`, where a car with tire slip follows a straight and then a winding road, 480 m
-    in total; and two closed racetracks with several lanes and a slower car. Edouard Leurent, "An
-    environment for autonomous driving decision-making",
+    The agent steers a car whose speed is fixed. Roads, cars and rewards are those of highway-env.
+    In `lane-keeping-v0`, a car with tire slip follows a road of 480 m that is first straight and
+    then winding. The two closed racetracks have several lanes and a slower car. Edouard Leurent,
+    "An environment for autonomous driving decision-making",
     https://github.com/Farama-Foundation/HighwayEnv, 2018.
 
     A decision lasts 0.1 s of simulated time, or 0.2 s on racetracks. Results are bit-identical for
-    the same seed and actions. Axes are right-handed with z up, x and y in meters; y and angles have
-    the opposite sign of highway-env's, so left is positive.
+    the same seed and actions. Axes are right-handed with z up; x and y are in meters. y and angles
+    have the opposite sign from highway-env, so left is positive.
 
     ## Action Space
 
@@ -103,23 +103,23 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     ## Rewards
 
-    Those of highway-env. Lane keeping: 1 - (d / 10 m)^2 at distance d from the middle of the lane
-    to follow. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for full steering, scaled to 0 to 1; 0
-    off the road.
+    The rewards are those of highway-env; d is the distance from the middle of the lane. Lane
+    keeping: 1 - (d / 10 m)^2 for the lane to follow. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for
+    full steering, scaled to the range 0 to 1. Off a racetrack, the reward is 0.
 
     ## Starting State
 
     `start="line"`: the starting state of highway-env, which is constant in lane keeping.
-    `start="anywhere"`: a random position on the road, except the last 60 m of an open road and 20 m
-    around another car, with an offset of up to 1.5 m and 0.2 rad.
-    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
-    number, starts at that pose.
+    `start="anywhere"`: a random position on the road with an offset of up to 1.5 m and 0.2 rad. It
+    is at least 20 m from other cars, and 60 m from the end of an open road.
+    `reset(options={"pose": (x_m, y_m, yaw_rad)})` starts at that pose; the speed in m/s may follow
+    as a fourth number.
 
     ## Episode End
 
     Terminated with `info["reason"]` = `off_lane` (the car's center is on no lane), `collision`, or
-    `finished` (5 m before the end of an open road). Truncated after 700 steps, and on racetracks
-    with `time_limit` after highway-env's limit of 300 s.
+    `finished` (5 m before the end of an open road). Truncated after 700 steps. Racetracks are also
+    truncated, with the reason `time_limit`, after highway-env's limit of 300 s.
 
     `info` contains lateral_offset_m, heading_error_rad, speed_m_s and progress_m (distance along
     the road since the start; on a racetrack along its first lane, over all laps).
@@ -216,7 +216,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         self._inner.reset(seed=seed)
-        # This list of all states would otherwise grow without limit.
+        # The inner environment keeps all states in this list, which would grow without limit.
         getattr(self._inner, "trajectory", []).clear()
         self._locate()
         car, others = self._car, self.others
@@ -253,7 +253,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         return self._observe(), self._reward, bool(reason), bool(is_over and not reason), info
 
     def _reason(self) -> str:
-        """Return the reason of a termination; empty if the episode continues."""
+        """Return the reason why the episode terminates; empty if it continues."""
         if self._inner.vehicle.crashed:
             return "collision"
         if abs(self._place.offset_m) > self.course.half_width_m:
@@ -262,14 +262,14 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         return "finished" if not self.course.is_closed and left_m < LOOKAHEADS_M[0] else ""
 
     def _locate(self) -> None:
-        """Update the car, its nearest course (the lane), and its position on the course."""
+        """Read the inner environment's car; find the nearest course and the position on it."""
         self._car = _car_of(self._inner.vehicle)
         places = [course.nearest(self._car.x_m, self._car.y_m) for course in self.courses]
         self._lane = int(np.argmin([abs(place.offset_m) for place in places]))
         self._place, self._along_m = places[self._lane], places[0].along_m
 
     def _moved_m(self, before_m: float) -> float:
-        """Return the distance along the first lane since the position `before_m`."""
+        """Return the distance that the car has moved along the first lane since `before_m`."""
         moved_m, length_m = self._along_m - before_m, self.courses[0].length_m
         if self.courses[0].is_closed:
             moved_m = (moved_m + length_m / 2) % length_m - length_m / 2
@@ -284,7 +284,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._locate()
 
     def _observe(self) -> NDArray[np.float32]:
-        """Return the observation; append to the trail, and render in mode `human`."""
+        """Append the position to the trail, render in mode `human`, and return the observation."""
         self._trail_m.append((self._car.x_m, self._car.y_m))
         if self.render_mode == "human":
             self.render()
@@ -320,13 +320,13 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         }
 
     def telemetry(self) -> dict[str, float]:
-        """Return the state of the car by name; names include the units."""
+        """Return the state of the car as named numbers; each name ends in its unit."""
         steering_rad = float(STEERING_RAD[self._last_action])
         place = {"x_m": self._car.x_m, "y_m": self._car.y_m, "yaw_rad": self._car.yaw_rad}
         return {**place, **self._info(), "steering_rad": steering_rad}
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that never change; those of the car are in the frame `car`."""
+        """Return the shapes that never change; the car's shapes are in the frame `car`."""
         return highway_scene.static_shapes(self._inner.road.network, self.courses)
 
     def scene(self) -> Sequence[Shape]:
@@ -338,7 +338,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         )
 
     def static_frames(self) -> Sequence[Frame]:
-        """Return no frames: there is no sensor frame."""
+        """Return an empty tuple, because the car has no sensors."""
         return ()
 
     def frames(self) -> Sequence[Frame]:

@@ -36,7 +36,7 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
         return int(np.argmin(np.abs(STEERING_RAD - wanted_rad)))
 
     def _free_course(self) -> Course:
-        """Return the current lane if it has enough free space, else the lane with the most."""
+        """Return the current lane if it is free for 30 m, else the lane with the most space."""
         own = self.sim.course
         if self._room_m(own) >= ROOM_M:
             return own

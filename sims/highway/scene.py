@@ -1,7 +1,7 @@
 """Scene of the highway-lane sim: asphalt, lines, cars, and the agent's observations.
 
-Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's center, x
-forward, y left).
+The frame `map` has x and y on the ground and z up. The frame `car` has its origin on the ground
+under the car's center, x forward and y left.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STRIPED, CONTINUOUS = 1, 2
 
 
 class Car(NamedTuple):
-    """State and size of a car; the position is that of its center."""
+    """State and size of a car; x and y are the position of its center."""
 
     x_m: float
     y_m: float
@@ -57,7 +57,7 @@ class Car(NamedTuple):
 
 
 def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
-    """Return the shapes that never change: the world in `map`, the car's parts in `car`.
+    """Return the shapes that never change: world in the frame `map`, parts of the car in `car`.
 
     `network` is a `highway_env.road.road.RoadNetwork`.
     """
@@ -72,11 +72,11 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
 
 def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
-    """Yield each lane, and its left and right edges: (N, 2) map points about 1 m apart."""
+    """Yield each lane with its left and right edge, as (N, 2) map points about 1 m apart."""
     for lane in network.lanes_list():
         along_m = np.linspace(0.0, lane.length, 2 + int(lane.length))
         half_m = [lane.width_at(each) / 2 for each in along_m]
-        # In highway-env, left is the negative side.
+        # In highway-env, lateral distances to the left are negative.
         sides = [
             np.array([lane.position(s, sign * h) for s, h in zip(along_m, half_m, strict=True)])
             for sign in (-1.0, 1.0)
@@ -125,7 +125,7 @@ def moving_shapes(
     aims_m: Sequence[tuple[float, float]],
     steering_rad: float,
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step; `aims_m` are the observed points ahead."""
+    """Return the shapes that change with each step; the agent observes the points `aims_m`."""
     return (
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(np.array(aims_m)),

@@ -1,4 +1,4 @@
-"""Starting states of the highway-lane sim that differ from those of highway-env."""
+"""Starting states that the highway-lane sim adds to those of highway-env."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def drawn_pose(
 def pose_from_options(
     options: dict[str, Any], courses: Sequence[Course], others: Sequence[Car], own: Car
 ) -> Pose:
-    """Return the pose in the options of `reset`; the speed defaults to the car's current speed.
+    """Return the pose from the options of `reset`, with the car's current speed as a default.
 
     Raises:
         UsageError: An option is unknown, or the pose is malformed, occupied, or not on a lane.

@@ -27,7 +27,7 @@ IMAGE_SHAPE = (84, 84)
 
 @functools.cache
 def lane_mesh() -> NDArray[np.float64]:
-    """Return the surfaces of the course as (T, 3, 3) triangles, meters; do not modify them."""
+    """Return (T, 3, 3) triangles of all surfaces, meters. Callers must not modify the array."""
     solids = [
         box_mesh((box.x_m, box.y_m, box.height_m / 2), (box.length_m, box.width_m, box.height_m))
         for box in (*rails(), *buildings())
@@ -43,7 +43,7 @@ class CarCamera:
         self._camera = DepthCamera(lane_mesh(), LENS, IMAGE_SHAPE)
 
     def image_m(self, car: Car) -> NDArray[np.float32]:
-        """Return (84, 84) distances along each ray, meters; infinity without a surface."""
+        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
         x_m = car.x_m + CAMERA_FORWARD_M * math.cos(car.yaw_rad)
         y_m = car.y_m + CAMERA_FORWARD_M * math.sin(car.yaw_rad)
         return self._camera.image_m((x_m, y_m, CAMERA_HEIGHT_M), level_axes(car.yaw_rad))

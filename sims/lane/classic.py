@@ -1,7 +1,7 @@
 """Published rules of the lane sim, including the faults that `LaneKeepingEnv` lists.
 
-The published text and code differ: in the text, an episode ends if the car is too slow; in the
-code, if the car hits an obstacle.
+The published text and code differ. In the text, an episode ends if the car is too slow. In the
+code, it ends if the car hits an obstacle.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ STRAIGHT = 1
 
 @compiled
 def classic_distance(x_m: float, y_m: float) -> float:
-    """Return the distance to the nearest of the infinite lines through the legs, meters."""
+    """Return the distance to the nearest leg, meters; each leg counts as an infinite line."""
     nearest_m = math.inf
     for leg in range(len(COURSE.yaw_rad)):
         dx, dy = x_m - COURSE.points_m[leg, 0], y_m - COURSE.points_m[leg, 1]
@@ -81,7 +81,7 @@ def classic_end(distance_m: float, speed_m_s: float, action: int, hit: bool, by_
 
 @compiled
 def classic_decide(car: Car, action: int) -> tuple[Car, bool]:
-    """Drive for a second; return the car, and whether its body touched an obstacle.
+    """Drive for one second; return the new state, and whether the body touched an obstacle.
 
     Obstacles do not stop the car.
     """

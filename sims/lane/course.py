@@ -1,9 +1,9 @@
 """Course of the lane sim: its path, its streets, and the rails and houses beside them.
 
-The path consists of two squares of about 130 m that share a leg, 1,026 m in total: the first square
-is driven clockwise, the second counter-clockwise. Coordinates are right-handed with z up; y has the
-opposite sign of y in the published course, so that right turns remain right turns. The course is
-deterministic and identical on every machine.
+The path is 1,026 m long. It consists of two squares of about 130 m that share a leg; the first is
+driven clockwise, the second counter-clockwise. Coordinates are right-handed with z up. The sign of
+y is opposite to the published course, so that right turns remain right turns. The course is the
+same on every machine.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ class Box(NamedTuple):
 
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the two ends (2,) of each leg, meters; the shared leg occurs once."""
+    """Return both ends (2,) of each leg, meters; the leg that both squares share occurs once."""
     legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 
 
 def street_bounds(half_width_m: float) -> NDArray[np.float64]:
-    """Return (K, 4) rectangles x0, y0, x1, y1 around the streets, square ends included; meters."""
+    """Return the streets as (K, 4) rectangles x0, y0, x1, y1, meters, including their ends."""
     ends = np.array(streets())
     return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
 
@@ -73,10 +73,10 @@ def street_bounds(half_width_m: float) -> NDArray[np.float64]:
 def pavement(
     half_width_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Divide the union of the streets into cells along the lines through the edges of streets.
+    """Divide the ground into a grid whose lines pass through the edges of all streets.
 
     Returns:
-        (M + 1,) x and (N + 1,) y of the cell borders, and a mask (M, N) of the cells on a street.
+        (M + 1,) x and (N + 1,) y of the grid lines, and a mask (M, N) of the cells on a street.
     """
     bounds = street_bounds(half_width_m)
     x_m, y_m = np.unique(bounds[:, [0, 2]]), np.unique(bounds[:, [1, 3]])
@@ -89,7 +89,7 @@ def pavement(
 
 
 def outline(half_width_m: float) -> NDArray[np.float64]:
-    """Return the outline of the streets' union as segments (M, start and end, x and y), meters."""
+    """Return the outline of all streets as segments (M, start and end, x and y), meters."""
     x_m, y_m, paved = pavement(half_width_m)
     padded = np.pad(paved, 1)
     across_x = np.argwhere(padded[1:, 1:-1] != padded[:-1, 1:-1])
@@ -117,10 +117,10 @@ def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:
 def _house(
     index: int, at: NDArray[np.float64], forward: NDArray[np.float64], left: NDArray[np.float64]
 ) -> Box:
-    """Return a house, whose number determines its size and its distance from the street.
+    """Return a house; `index` determines its size and its distance from the street.
 
-    Its front begins beside a point (2,) of the center line; `forward` is the unit vector along the
-    street, `left` the one from the street to the house.
+    The house's front begins beside the point `at` (2,) on the center line. `forward` is the unit
+    vector along the street, and `left` is the unit vector from the street to the house.
     """
     front_m, deep_m = scattered(index, 8.0, 18.0), scattered(3 * index, 8.0, 15.0)
     garden_m = scattered(5 * index, 7.5, 11.5)

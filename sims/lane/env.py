@@ -27,13 +27,14 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     ## Description
 
-    The agent drives a car along a course of streets with sharp corners: two squares that share a
-    leg, 1,026 m in total, the first driven clockwise and the second counter-clockwise, between
-    guard rails and houses. The car is a kinematic bicycle with a wheelbase of 2.7 m. One decision
-    lasts 0.25 s of simulated time. Results are bit-identical for the same seed and actions.
+    The agent drives a car along streets with sharp corners, between guard rails and houses. The
+    course is 1,026 m long. It consists of two squares that share a leg; the first is driven
+    clockwise, the second counter-clockwise. The car is a kinematic bicycle with a wheelbase of
+    2.7 m. One decision lasts 0.25 s of simulated time. Results are bit-identical for the same seed
+    and actions.
 
-    Axes are right-handed with z up, x and y in meters. Angles are counter-clockwise, so left is
-    positive.
+    Axes are right-handed with z up; x and y are in meters. Angles are counter-clockwise, so left
+    is positive.
 
     ## Action Space
 
@@ -68,9 +69,9 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     `observation="depth"`: `Box` of (84, 84, 1) uint8, the front camera's depth, encoded by
     `mcaprl.sims.drawing.depth.encode_depth`; 255 where there is no surface.
 
-    `observation="dashboard"`: a `Dict` of `depth`, the same image, and `motion`, 3 float32: rows
-    2 and 3 of the table, and the direction of the next turn, 1 left or -1 right. A single image
-    shows neither the speed nor the direction of the next turn.
+    `observation="dashboard"`: a `Dict` with two entries. `depth` is the same image. `motion` has 3
+    float32: speed and steering as in rows 2 and 3 of the table, and the direction of the next turn,
+    1 left or -1 right. A single image shows neither the speed nor the direction of the next turn.
 
     `observation="rays"`: `Box` of 20 float32.
 
@@ -82,14 +83,14 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     | 18, 19 | path point 20 m ahead: forward, left of the car | 20 m | 4 |
 
     The rays start at the car's center, in the directions 0, 10, -10, 20, -20, 30, -30, 45, -45, 60,
-    -60, 90, -90, 135, -135 and 180 degrees; left is positive. A distance of d meters is observed as
+    -60, 90, -90, 135, -135 and 180 degrees; left is positive. A distance d is encoded as
     ln(1 + d / 1 m) / ln(101), and as 1 beyond 100 m. At a crossing, the path point
     indicates the street to take.
 
     ## Rewards
 
-    ds / 7.5 m (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from the
-    path; -5 for leaving the lane or stalling.
+    The reward is ds / 7.5 m (1 - (d / 3.5 m)^2 / 2), where ds is the progress along the path and d
+    the distance from it. A step that leaves the lane or stalls has the reward -5.
 
     ## Starting State
 
@@ -97,8 +98,8 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     with an offset of up to 1.5 m and 0.2 rad, at 0 to 10 m/s.
     `start="line"`: 2 m from the start of the course, with an offset of up to 0.3 m and 0.05 rad, at
     rest.
-    `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
-    number, starts at that pose.
+    `reset(options={"pose": (x_m, y_m, yaw_rad)})` starts at that pose; the speed in m/s may follow
+    as a fourth number.
 
     ## Episode End
 
@@ -110,22 +111,23 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     ## Classic Rules
 
-    `rules="classic"` and `"classic-code"` are the published rules. A decision lasts one second. The
-    reward is (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5) at v m/s, with the distance d to the
-    nearest of the *infinite* lines through the legs, and -3 beyond 3.5 m. An episode terminates
-    if the reward is below -1 (`off_lane` beyond 3.5 m, else `low_reward`). In the published text
-    (`"classic"`), it also terminates at 5 m/s or less without braking (`slow`); in the published
-    code (`"classic-code"`), if the car touches a rail or a house during action 1, straight
-    (`collision`). It starts on the start line, after one second straight ahead. `depth` is encoded
-    by `encode_nearness`. Known faults:
+    `rules="classic"` and `"classic-code"` are the published rules. A decision lasts one second. Let
+    v be the speed in m/s, and d the distance in meters to the nearest of the *infinite* lines
+    through the legs. The reward is (exp(-3 d) - 0.5) + ((v - 10) / (300 - 10) - 0.5), but -3 beyond
+    3.5 m. An episode terminates if the reward is below -1 (`off_lane` beyond 3.5 m, else
+    `low_reward`). In the published text (`"classic"`), it also terminates at 5 m/s or less without
+    braking (`slow`). In the published code (`"classic-code"`), it also terminates if the car
+    touches a rail or a house during action 1, straight (`collision`). An episode starts on the
+    start line, after one second straight ahead. `depth` is encoded by `encode_nearness`. Known
+    faults:
 
-    - Speed is scaled by 300 m/s, so that its term is always near -0.5: the reward is near 0 for a
-      fast car in the middle of the lane, and below -0.5 per second at an offset of 0.3 m. The
-      return of a whole lap is far below -3, the return of leaving the road at once.
-    - A reward below -1 defines a second lane: 1.1 m to each side at rest, wider with increasing
-      speed, and unlimited from 10 m/s.
-    - The lines are infinite: leaving the course along the extension of a leg has the same reward as
-      following it.
+    - Speed is divided by about 300 m/s, so its term is always near -0.5. The reward is near 0 for a
+      fast car in the middle of the lane, and below -0.5 per second at an offset of 0.3 m. A whole
+      lap has a return far below -3, but leaving the road at once has a return of only -3.
+    - The limit of -1 on the reward is a second limit on the distance: 1.1 m at rest, more at higher
+      speed, and none from 10 m/s.
+    - The lines are infinite. A car that leaves the course along the extension of a leg gets the
+      same reward as on the course.
     - Standing still with the brake never ends an episode, and costs less than most driving.
     - In the published code, a collision ends an episode only during the action straight.
     - A second is too long for corrections: at 15 m/s, any steering action leaves the lane.
@@ -162,7 +164,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
         return car.x_m, car.y_m
 
     def telemetry(self) -> dict[str, float]:
-        """Return the state of the car by name; names include the units."""
+        """Return the state of the car as named numbers; each name ends in its unit."""
         car = self.car
         return {
             "x_m": car.x_m,
@@ -173,11 +175,11 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
         }
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return the front camera's (84, 84) distances along each ray, meters, or infinity."""
+        """Return the front camera's image: (84, 84) distances along each ray, meters."""
         return self.fleet.depth_image_m(0)
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes that never change; those of the car are in the frame `car`."""
+        """Return the shapes that never change; the car's shapes are in the frame `car`."""
         return lane_scene.static_shapes()
 
     def scene(self) -> Sequence[Shape]:
@@ -213,7 +215,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
 
 class BatchedLaneKeepingEnv(BatchedEnv):
-    """Vectorized environment of N cars; arguments as in `LaneKeepingEnv`."""
+    """Vectorized environment of N cars; takes the same arguments as `LaneKeepingEnv`."""
 
     fleet_type = LaneFleet
 

@@ -42,7 +42,7 @@ MOTION = slice(2, 4)
 
 
 class LaneFleet(Fleet):
-    """N cars on the course; arguments as in `LaneKeepingEnv`."""
+    """N cars on the course; takes the same arguments as `LaneKeepingEnv`."""
 
     reasons: ClassVar[tuple[str, ...]] = REASONS
     truncates: ClassVar[tuple[bool, ...]] = (False,) * len(REASONS)
@@ -73,7 +73,7 @@ class LaneFleet(Fleet):
         )
         self._cars = np.zeros((count, STARTED_AT + 1))
         self._draws = Draws(count, 4)
-        # Random numbers of a single start.
+        # `begin` writes the random numbers for one start into this array.
         self._shares = np.zeros(4)
         self._states = np.zeros((count, len(OBSERVATION_NAMES)), dtype=np.float32)
         self._rays = np.zeros((count, len(RAY_OBSERVATION_NAMES)), dtype=np.float32)
@@ -129,7 +129,7 @@ class LaneFleet(Fleet):
                 self._depth_m.pop(i, None)
 
     def advance(self) -> None:
-        """Advance all cars by a decision."""
+        """Advance each car by one decision."""
         self._step()
         if self.has_rays:
             observe_all_rays(self._cars, self._rays)
@@ -137,13 +137,13 @@ class LaneFleet(Fleet):
             self._depth_m.clear()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car; if possible, in one compiled call for reward, end and `info`."""
+        """Advance the only car. If possible, one compiled call returns reward, end and `info`."""
         if not self._has_fast_step:
             return super().step_one(action)
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
         if self._depth_m:
             self._depth_m.clear()
-        # Faster than `zip` of `CAR_INFO`.
+        # A literal is faster than `dict(zip(CAR_INFO, ...))`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -161,7 +161,7 @@ class LaneFleet(Fleet):
         kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
         return ready(start_car, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
-    # Functions for a fleet of one car.
+    # A fleet of one car uses the next function.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:
@@ -184,14 +184,14 @@ class LaneFleet(Fleet):
         return {"depth": depth, "motion": self._motions()} if self._has_dashboard else depth
 
     def _motions(self) -> NDArray[np.float32]:
-        """Return (N, 3) speed, last steering command and next turn of all cars."""
+        """Return an (N, 3) array: speed, last steering command and direction of the next turn."""
         along_m = self._cars[:, ALONG] % COURSE.length_m
         legs = np.searchsorted(COURSE.along_m, along_m, side="right") - 1
         turns = NEXT_TURN[np.minimum(legs, len(NEXT_TURN) - 1)]
         return np.column_stack([self._states[:, MOTION], turns]).astype(np.float32)
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Return car i's (84, 84) distances along each ray, meters, or infinity."""
+        """Return the image of car i: (84, 84) distances along each ray, meters."""
         if i not in self._depth_m:
             if self._camera is None:
                 self._camera = CarCamera()

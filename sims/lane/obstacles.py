@@ -28,8 +28,8 @@ _HUGE = 1e12
 def touches(car: Car) -> bool:
     """Return whether the car's body touches a rail or a house.
 
-    Separating axis theorem: two rectangles are disjoint if and only if an edge of either rectangle
-    has a direction on which their projections are disjoint.
+    By the separating axis theorem, two rectangles are disjoint if and only if their projections
+    onto the direction of some edge are disjoint.
     """
     cos, sin = math.cos(car.yaw_rad), math.sin(car.yaw_rad)
     x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
@@ -52,7 +52,7 @@ def touches(car: Car) -> bool:
 def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
     """Return the distance from a point to the nearest obstacle in a direction, at most 100 m.
 
-    Slab method: a ray is inside a box where it is between both pairs of parallel sides.
+    This is the slab method: inside a box, a ray is between both pairs of parallel sides.
     """
     per_x, per_y = _per_meter(math.cos(angle_rad)), _per_meter(math.sin(angle_rad))
     nearest_m = FAR_M
@@ -68,5 +68,5 @@ def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
 
 @compiled
 def _per_meter(share: float) -> float:
-    """Return the signed ray length per meter along an axis, from the direction's component."""
+    """Return 1 / share; if that is too large, return `_HUGE` with the same sign."""
     return 1.0 / share if abs(share) * _HUGE > 1.0 else math.copysign(_HUGE, share)

@@ -1,7 +1,7 @@
-"""Branch-free geometry of the lane sim's course that the compiler can vectorize over cars.
+"""Branch-free geometry of the lane sim's course, so that loops over cars can be vectorized.
 
-`mcaprl.sims.geometry.paths` supports any path, with searches and loops of variable length. This
-module assumes the lane sim's course: eight legs, each longer than the lookahead distance.
+`mcaprl.sims.geometry.paths` supports any path, but its loops have variable lengths. This module
+supports only the lane sim's course: eight legs, each longer than the lookahead distance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LENGTH_M: Final = COURSE.length_m
 _LAST_LEG: Final = 7.0
 assert len(COURSE.yaw_rad) == _LAST_LEG + 1
 Eight = tuple[float, float, float, float, float, float, float, float]
-# Tuples of numbers are compile-time constants; arrays are not.
+# These are tuples because numba treats tuples, but not arrays, as compile-time constants.
 _ALONG_M: Final[Eight] = tuple(COURSE.along_m[:-1].tolist())
 _LEG_M: Final[Eight] = tuple(np.diff(COURSE.along_m).tolist())
 _X_M: Final[Eight] = tuple(COURSE.points_m[:-1, 0].tolist())
@@ -39,7 +39,7 @@ class CourseSpot(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """Straight leg of the course: start, direction as a unit vector, and length."""
+    """Straight leg of the course: start point, unit vector along the leg, and length."""
 
     x_m: float
     y_m: float
@@ -78,7 +78,7 @@ def course_next(leg: float) -> float:
 def course_point_ahead(
     leg: Leg, following: Leg, rest_m: float, ahead_m: float
 ) -> tuple[float, float]:
-    """Return the point (x, y), meters, `ahead_m` < `LONGEST_LOOK_M` after a position on a leg."""
+    """Return the point (x, y), meters, `ahead_m` (less than `LONGEST_LOOK_M`) after a position."""
     on_leg_m = rest_m + ahead_m
     is_beyond = on_leg_m >= leg.length_m
     on_leg_m = on_leg_m - leg.length_m if is_beyond else on_leg_m
@@ -91,7 +91,8 @@ def course_point_ahead(
 def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
     """Return the nearest point of the course between two distances along the course.
 
-    Equivalent to `paths.project`; the distances must differ by less than `LONGEST_LOOK_M`.
+    The result equals that of `paths.project`. The distances must differ by less than
+    `LONGEST_LOOK_M`.
     """
     here = course_spot_at(from_m)
     leg, after = course_leg(here.leg), course_next(here.leg)
@@ -115,7 +116,8 @@ def _on_leg(
     """Return the point nearest to (x_m, y_m) on a part of a leg.
 
     Returns:
-        Distance along the leg, squared distance from (x_m, y_m), and its signed offset to the left.
+        Distance along the leg, squared distance from (x_m, y_m), and the offset of (x_m, y_m) to
+        the left of the leg's line.
     """
     dx, dy = x_m - leg.x_m, y_m - leg.y_m
     along_m = min(max(dx * leg.cos + dy * leg.sin, first_m), last_m)
@@ -125,7 +127,7 @@ def _on_leg(
 
 @inlined
 def _of(leg: float, numbers: Eight) -> float:
-    """Return `numbers[leg]`; the compiler cannot vectorize an array lookup over cars."""
+    """Return `numbers[leg]` without an array lookup, which the compiler cannot vectorize."""
     number = numbers[1] if leg >= 1.0 else numbers[0]
     number = numbers[2] if leg >= 2.0 else number
     number = numbers[3] if leg >= 3.0 else number

@@ -1,4 +1,4 @@
-"""Pilot of the lane sim: pure pursuit that slows down for corners, with a short search."""
+"""Pilot of the lane sim: pure pursuit that brakes before corners, and a short search."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 PURSUIT_M = 8.0
 PURSUIT_S = 0.4
-"""Pursuit distance along the path: 8 m plus 0.4 s times the speed."""
+"""The car aims at the path point ahead at a distance of 8 m plus 0.4 s times the speed."""
 CORNER_SPEED_M_S = 7.0
 CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
 """The car brakes with at most 1.5 m/s^2 and has the corner speed 2 m before a corner."""
 HORIZON = 12
-"""Number of decisions (3 s by default) that a plan must survive."""
+"""Number of decisions (3 s by default) for which a plan must not end the episode."""
 
 
 @compiled
@@ -65,7 +65,7 @@ def pursue(car: Car) -> int:
 
 @compiled
 def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
-    """Return the number of decisions that pursuit survives, plus 0.1 times the total reward."""
+    """Return the number of decisions until pursuit fails, plus 0.1 times the total reward."""
     total = 0.0
     for survived in range(HORIZON):
         after = drive(car, pursue(car), substeps)
@@ -78,7 +78,7 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose the pursuit action if following it is safe; else search for two actions before it.
+    """Choose the pursuit action if pursuit stays safe; else search for two other actions first.
 
     Args:
         car: State of the car.

@@ -33,7 +33,7 @@ RAY_OBSERVATION_LIMIT = np.array([1] * (RAYS + 2) + [WAY_LIMIT] * 2, dtype=np.fl
 
 @compiled
 def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
-    """Write the 20 observed numbers; see the table of `LaneKeepingEnv`."""
+    """Write the 20 observed numbers, as listed in "Observation Space" of `LaneKeepingEnv`."""
     for i in range(RAYS):
         observation[i] = log_code(ray_length(car.x_m, car.y_m, car.yaw_rad + RAYS_RAD[i]))
     observation[RAYS] = car.speed_m_s / MAX_SPEED_M_S
@@ -47,7 +47,7 @@ def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
 
 @compiled
 def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
-    """Write the observations (N, 20) of N cars; the rows (N, 10) begin with a `Car`."""
+    """Write (N, 20) observations; each of the (N, 10) rows of `cars` begins with a `Car`."""
     for i in range(len(cars)):
         observe_rays(car_at(cars[i]), observations[i])
 

@@ -70,12 +70,12 @@ OBSERVATION_NAMES = (
     *(f"ahead_{ahead:.0f}m_{axis}" for ahead in LOOKAHEADS_M for axis in ("forward", "left")),
 )
 OBSERVATION_LIMIT = np.array([4, 2, 1, 1] + [4] * 8, dtype=np.float32)
-# A tuple is a compile-time constant.
+# Numba treats a tuple, but not an array, as a compile-time constant.
 _LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
 
 class Car(NamedTuple):
-    """State of one car on the course; a row of a (cars, 9) array."""
+    """State of one car on the course. Fleets store it as 9 numbers in an array's row."""
 
     x_m: float
     y_m: float
@@ -111,8 +111,9 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 def slip(steering: float, speed_m_s: float) -> float:
     """Return the sine of the car's slip angle for a steering command at a speed.
 
-    The maximum steering angle is 100 % at rest, 90 % at 20 km/h, 80 % at 60 km/h and 70 % at
-    120 km/h; the slip is limited to a lateral acceleration of 9 m/s^2.
+    The maximum steering angle falls from 40 degrees at rest to 90 % of that at 20 km/h, 80 % at
+    60 km/h and 70 % at 120 km/h. The slip angle is limited so that the lateral acceleration is at
+    most 9 m/s^2.
     """
     # The curve is convex, so it is the maximum of its straight lines.
     share = max(
@@ -134,7 +135,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Return the car with this motion; search its position on the path around `near_m`."""
+    """Return the car with this motion. Its position on the path is searched near `near_m`."""
     place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,
@@ -153,7 +154,7 @@ def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Ca
 def driven(motion: Motion, steering: float, is_braking: bool) -> Motion:
     """Advance a motion by a substep of 0.05 s.
 
-    Branch-free, so that the compiler can vectorize over cars.
+    The function has no branches, so that the compiler can vectorize loops over cars.
     """
     speed_m_s = motion.speed_m_s
     throttle_m_s2 = THROTTLE_M_S2 * (1.0 - speed_m_s * (1.0 / MAX_SPEED_M_S))
@@ -170,7 +171,7 @@ def steering_for(action: int, last: float) -> float:
 
 @compiled
 def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
-    """Return the car after an action that lasts `substeps` of 0.05 s."""
+    """Return the car after an action that lasts `substeps` times 0.05 s."""
     motion = moving(car.x_m, car.y_m, car.yaw_rad, car.speed_m_s)
     steering = steering_for(action, car.steering)
     for _ in range(substeps):
@@ -180,7 +181,7 @@ def drive(car: Car, action: int, substeps: int = SUBSTEPS) -> Car:
 
 @inlined
 def arrived(before: Car, motion: Motion, steering: float, substeps: int) -> Car:
-    """Return the car's state after `substeps` substeps, with the pose and speed in `motion`."""
+    """Return the car after `substeps` substeps; `motion` is its new pose and speed."""
     slow_s = before.slow_s + substeps * SUBSTEP_S if motion.speed_m_s < STALL_SPEED_M_S else 0.0
     return located(motion, steering, before.along_m, slow_s)
 
@@ -196,8 +197,8 @@ def end_of(car: Car) -> int:
 def reward_of(before: Car, after: Car) -> float:
     """Return the reward of a decision.
 
-    ds / (30 m/s 0.25 s) (1 - (d / 3.5 m)^2 / 2) for progress ds along the path at distance d from
-    the path; -5 for a failure.
+    The reward is ds / 7.5 m (1 - (d / 3.5 m)^2 / 2), where ds is the progress along the path, d the
+    distance from the path, and 7.5 m the progress at 30 m/s. A failure has the reward -5.
     """
     progress = (after.along_m - before.along_m) / (MAX_SPEED_M_S * DECISION_S)
     paid = progress * (1.0 - 0.5 * (after.offset_m / LANE_HALF_WIDTH_M) ** 2)
@@ -244,7 +245,7 @@ def seen_from(car: Car) -> Numbers:
 def _ahead(
     car: Car, heading: Heading, leg: Leg, after: Leg, rest_m: float, lookahead_m: float
 ) -> tuple[float, float]:
-    """Return the path point at a lookahead distance in the car's frame, as fractions of it."""
+    """Return the path point at a lookahead distance: forward and left, divided by the distance."""
     x_m, y_m = course_point_ahead(leg, after, rest_m, lookahead_m)
     forward_m, left_m = in_body_frame(x_m - car.x_m, y_m - car.y_m, heading.cos, heading.sin)
     forward, left = forward_m / lookahead_m, left_m / lookahead_m

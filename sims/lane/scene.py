@@ -1,7 +1,8 @@
 """Scene of the lane sim: streets, rails, houses, the car and its observations.
 
-Frames: `map` (x and y on the ground, z up), `car` (on the ground under the middle of the wheelbase,
-x forward, y left) and `camera` (ROS optical axes: x right, y down, z along the view).
+The frame `map` has x and y on the ground and z up. The frame `car` has its origin on the ground
+under the middle of the wheelbase, x forward and y left. The frame `camera` has ROS optical axes: x
+right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ DASH_M = 3.0
 
 
 def _asphalt() -> NDArray[np.float64]:
-    """Return two triangles for each paved cell, (6 cells, 3)."""
+    """Return the corners of two triangles for each paved cell, (6 times the cells, 3)."""
     x_m, y_m, paved = course.pavement(course.RAIL_OFFSET_M)
     corners = []
     for i, j in np.argwhere(paved):
@@ -51,7 +52,7 @@ def _asphalt() -> NDArray[np.float64]:
 
 
 def _dashes() -> NDArray[np.float64]:
-    """Return the dashes of the center line as pairs of points, (N, 3)."""
+    """Return the dashes of the center line; the points (N, 3) are start, end, start, end, ..."""
     pairs = []
     for start, end in course.streets():
         length_m = float(np.hypot(*(end - start)))
@@ -103,14 +104,14 @@ def _car() -> list[Shape]:
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Return the shapes that never change: the world in `map`, the car's parts in `car`."""
+    """Return the shapes that never change: world in the frame `map`, parts of the car in `car`."""
     return (*_road(), *_surroundings(), *_car())
 
 
 def moving_shapes(
     car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step, with rays if the agent observes them."""
+    """Return the shapes that change with each step; include the rays if `has_rays`."""
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
     link = np.array([(car.x_m, car.y_m), nearest])

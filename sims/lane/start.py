@@ -42,7 +42,7 @@ def start_on_line(shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
-    """Return a car on the path; four random numbers set position, offset, heading and speed."""
+    """Return a car near the path; the four numbers set its position, offset, heading and speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
     leg = 0
     while _CLEAR_M[leg + 1] <= clear_m:
@@ -54,7 +54,7 @@ def start_anywhere(shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def beside(along_m: float, offset_m: float, error_rad: float, speed_m_s: float) -> Car:
-    """Return a car at an offset from a path point, left positive, and an angle to the path."""
+    """Return a car beside a path point, with an offset and a heading error; left is positive."""
     leg = leg_at(COURSE, along_m)
     rest_m = along_m - COURSE.along_m[leg]
     cos, sin = COURSE.forward[leg]
@@ -81,7 +81,7 @@ def start_car(
         shares: (4,) random numbers from 0 to 1.
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
-        cars: (N, 10) output: the `Car`, and its initial distance along the path.
+        cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
         rewards: (N,) output: 0.
         ends: (N,) output: DRIVING.
         observations: (N, 12) output.
@@ -108,9 +108,10 @@ def start_cars(
     ends: NDArray[np.int64],
     observations: NDArray[np.float32],
 ) -> None:
-    """Start the cars with the indices `chosen` (K,); other arguments as in `start_car`.
+    """Start the cars with the indices `chosen` (K,).
 
-    `numbers` and `used` are those of a `Draws` with 4 numbers per start.
+    `numbers` and `used` are attributes of a `Draws` with 4 numbers per start. The other arguments
+    are the same as in `start_car`.
     """
     for i in chosen:
         shares = take(numbers, used, i)

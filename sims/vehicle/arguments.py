@@ -14,7 +14,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 
 
 class Pose(NamedTuple):
-    """Requested start of a ground vehicle, in the map."""
+    """Pose and speed, in the map, at which a ground vehicle is to start."""
 
     x_m: float
     y_m: float
@@ -26,7 +26,7 @@ def check_name(argument: str, value: object, allowed: Sequence[object]) -> None:
     """Validate that a value is allowed.
 
     Raises:
-        UnknownNameError: The value is not allowed; the message lists the allowed ones.
+        UnknownNameError: The value is not allowed. The message lists the allowed values.
     """
     if value not in allowed:
         raise UnknownNameError(argument, str(value), [str(name) for name in allowed])
@@ -36,7 +36,7 @@ def check_range(argument: str, value: float, low: float, high: float) -> None:
     """Validate that a number is in [low, high].
 
     Raises:
-        UsageError: The number is outside, or NaN.
+        UsageError: The number is outside this range, or NaN.
     """
     if not low <= value <= high:
         raise UsageError(f"{argument} must be {low:g} to {high:g}, not {value}")
@@ -61,7 +61,7 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
     """Validate the actions of many vehicles and return them as int64.
 
     Raises:
-        UsageError: An action is not 0 to count - 1, or there is not one integer for each vehicle.
+        UsageError: There is not one integer for each vehicle, or one is not 0 to count - 1.
     """
     numbers = np.asarray(actions)
     if numbers.shape != (vehicles,) or numbers.dtype.kind not in "iu":
@@ -70,7 +70,7 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
             f" not {numbers.dtype} of shape {numbers.shape}"
         )
     numbers = numbers.astype(np.int64, copy=False)
-    # As unsigned integers, negative actions exceed `count`, too.
+    # In the unsigned view, a negative action is larger than `count`.
     does_not_exist = numbers.view(np.uint64) >= count
     if does_not_exist.any():
         wrong = numbers[does_not_exist][0]
@@ -87,7 +87,7 @@ def read_pose(options: dict[str, Any], names: Sequence[str], least: int) -> list
         least: Number of required values; the others default to 0.
 
     Raises:
-        UsageError: There is another option, or the pose has a wrong length or is not finite.
+        UsageError: There is an option other than `pose`, or the pose is malformed or not finite.
     """
     if set(options) != {"pose"}:
         raise UsageError(f"reset accepts only the option 'pose', not {sorted(set(options))}")

@@ -21,19 +21,19 @@ Bools = NDArray[np.bool_]
 
 
 class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
-    """N vehicles of one sim, stepped together.
+    """Vector environment that steps N vehicles of one sim together.
 
-    Vehicle i behaves as a single environment of the sim that is seeded with `seed + i` and wrapped
-    in a TimeLimit: observations, rewards, ends and infos are identical. Infos have
-    Gymnasium's vector format: an array for each key, and a mask `_key` of the environments that
-    have the key.
+    Vehicle i has the same observations, rewards, ends and infos as the sim's single environment
+    would have with the seed `seed + i` and a TimeLimit wrapper. Infos have Gymnasium's vector
+    format: for each key, an array and a mask `_key` of the environments that have the key.
 
-    `reset` accepts the options of the sim's single environment, for all vehicles; a `pose` of shape
-    (N, K) has one row for each vehicle. `reset_mask`, (N,) bools, selects the vehicles to reset.
+    `reset` accepts the options of the sim's single environment. They apply to all vehicles, but a
+    `pose` of shape (N, K) has one row for each vehicle. The option `reset_mask`, an array of N
+    bools, selects the vehicles to reset.
 
     The autoreset modes are Gymnasium's. `NextStep` resets in the step after an episode's end and
-    ignores the action of that step. `SameStep` resets immediately and returns the last observation
-    in `final_obs` and its info in `final_info`. With `Disabled`, the caller resets.
+    ignores the action of that step. `SameStep` resets immediately; it returns the last observation
+    in `final_obs` and the last info in `final_info`. With `Disabled`, the caller resets.
     """
 
     fleet_type: ClassVar[type[Fleet]]
@@ -78,7 +78,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # An episode that is still running has no reason for its end.
+        # The reason for `GOING_ON` is None.
         self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -133,7 +133,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
                 " disabled: reset(options={'reset_mask': terminated | truncated}) first"
             )
-        # The episodes that ended in an earlier step, which this step resets.
+        # This step resets the episodes that have ended before.
         fresh, fleet = self._ended.copy(), self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():
@@ -161,7 +161,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
             self._steps[chosen], self._ended[chosen] = 0, False
 
     def _infos(self, has_reason: Bools) -> dict[str, Any]:
-        """Return the infos of a step; in mode `SameStep`, reset the ended episodes first."""
+        """Return the infos of a step. In mode `SameStep`, first reset the episodes that ended."""
         ended = self._ended.copy()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not ended.any():
             return self._infos_of(np.ones_like(ended), has_reason)
@@ -210,7 +210,7 @@ def _seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int |
 
 
 def _mask_of(mask: Any, count: int) -> Bools:
-    """Return a mask of the vehicles to reset: all by default."""
+    """Validate `reset_mask`; None selects all vehicles."""
     if mask is None:
         return np.ones(count, dtype=np.bool_)
     chosen = np.asarray(mask)
@@ -222,7 +222,7 @@ def _mask_of(mask: Any, count: int) -> Bools:
 
 
 def _starts_of(options: dict[str, Any], count: int) -> list[dict[str, Any] | None]:
-    """Return the options of each vehicle: the same for all, except a pose of shape (N, K)."""
+    """Return the options for each vehicle; split a pose of shape (N, K) into its rows."""
     poses: Any = options.get("pose")
     if np.ndim(poses) != 2:
         return [options] * count

@@ -1,4 +1,4 @@
-"""Random numbers for the starts of episodes, drawn in advance."""
+"""Random numbers for starting states, drawn for many episodes at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _AHEAD = 32
 
 @compiled
 def take(numbers: NDArray[np.float64], used: NDArray[np.int64], i: int) -> NDArray[np.float64]:
-    """Return the next (size,) numbers of generator i from the arrays of a `Draws`.
+    """Return the next (size,) numbers of generator i; both arrays are attributes of a `Draws`.
 
     Call `draw_ahead` first.
     """
@@ -30,14 +30,15 @@ def spread(share: float, most: float) -> float:
 
 
 class Draws:
-    """Numbers from 0 to 1 of N generators, each in the order of its generator.
+    """Random numbers from 0 to 1, drawn in advance from N generators.
 
-    A generator call takes a microsecond even for a few numbers, so one call draws the numbers of
-    many starts.
+    A generator call takes a microsecond even for a few numbers. Therefore one call draws the
+    numbers for many starts. The numbers of each generator are used in the order in which it
+    draws them.
 
     Attributes:
-        numbers: (N, ahead, size) numbers drawn in advance.
-        used: (N,) number of used draws.
+        numbers: (N, starts, size) numbers drawn in advance.
+        used: (N,) number of starts whose numbers have been used.
     """
 
     def __init__(self, count: int, size: int) -> None:
@@ -47,19 +48,19 @@ class Draws:
         self._generators: list[Any] = [None] * count
 
     def use_generator(self, i: int, generator: np.random.Generator) -> None:
-        """Assign a generator to vehicle i; numbers drawn from another generator are dropped."""
+        """Assign a generator to vehicle i. If it is a new one, drop the numbers of the old one."""
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 
     def one(self, i: int, numbers: NDArray[np.float64]) -> None:
-        """Write the next numbers of generator i into a (size,) array; draw none in advance."""
+        """Write the next numbers of generator i into a (size,) array, without drawing ahead."""
         if self.used.item(i) == _AHEAD:
             self._generators[i].random(out=numbers)
         else:
             numbers[:] = take(self.numbers, self.used, i)
 
     def draw_ahead(self, chosen: NDArray[np.int64]) -> None:
-        """Draw numbers for `take` from those of these (K,) generators that have none left."""
+        """Draw numbers for `take` from each of the `chosen` generators (K,) that has none left."""
         for i in chosen[self.used[chosen] == _AHEAD].tolist():
             self._generators[i].random(out=self.numbers[i])
             self.used[i] = 0

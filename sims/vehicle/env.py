@@ -1,4 +1,4 @@
-"""Base class of environments with one vehicle: a fleet of one, and its rendering."""
+"""Base class of environments with one vehicle: a fleet of one vehicle, and its rendering."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
 
     @abstractmethod
     def _open_view(self, render_mode: RenderMode) -> AnyView:
-        """Create the renderer of the sim; this imports pygame."""
+        """Import pygame and create the renderer of the sim."""
 
     @abstractmethod
     def _draw(self, view: AnyView) -> NDArray[np.uint8]:
         """Render the vehicle in its current state as an (H, W, 3) image."""
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Render the sim: return (H, W, 3) uint8 in mode `rgb_array`, show it in mode `human`."""
+        """Render the sim. Mode `rgb_array` returns (H, W, 3) uint8, mode `human` shows a window."""
         if self._render_mode is None:
             return None
         if self._view is None:
@@ -71,7 +71,7 @@ class RenderedEnv(gym.Env[Any, Any], Generic[AnyView]):
 
 
 class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
-    """Environment of one vehicle; all sims share its seeding, steps, ends and rendering."""
+    """Environment of one vehicle, with the seeding, steps and rendering that sims share."""
 
     fleet_type: type[AnyFleet]
     trail_length: int = 40
@@ -93,7 +93,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        # Attributes of this object are faster to look up than the fleet's.
+        # Attributes of this object are found faster than attributes of the fleet.
         self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
@@ -130,7 +130,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # Raises the error; calling this in every step would be slower.
+            # This call raises the error. It is too slow for every step.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -151,7 +151,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @property
     def trail(self) -> list[tuple[float, ...]]:
-        """Last positions of the vehicle, at least one, recorded since the first read."""
+        """Last positions of the vehicle, at least one. Recording begins at the first read."""
         if not self._trail:
             self._is_watched = True
             self._trail.append(self.place)
@@ -167,6 +167,21 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         if self._last_step is None:
             return []
         return before_end(self._moments(*self._last_step), self.step_duration_s)
+
+    def imitate(self, fleet: AnyFleet, j: int, action: int | None) -> None:
+        """Copy the state of vehicle j of a fleet, to show it; call this after each of its steps.
+
+        Args:
+            fleet: Fleet of this sim.
+            j: Index of the vehicle.
+            action: Action of its last step; None after a reset.
+        """
+        self.fleet.imitate(0, fleet, j)
+        self._is_watched = True
+        if action is None:
+            self._trail.clear()
+        self._last_step = None if action is None else (self._now, action)
+        self._watch()
 
     @abstractmethod
     def _state(self) -> Any:

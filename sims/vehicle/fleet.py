@@ -1,4 +1,4 @@
-"""N vehicles of one sim as arrays, shared by its single and its batched environment."""
+"""Base class of fleets, which single and batched environments use to step N vehicles."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Fleet(ABC):
         step_duration_s: Simulated time of one step.
         actions: (N,) valid actions of the next step.
         rewards: (N,) rewards of the last step; 0 after a start.
-        ends: (N,) `GOING_ON`, or the index in `reasons` of the reason why the episode ended.
-        noise: (N, K) standard normal numbers that the environment draws for the next step; K is 0
-            if steps are deterministic.
+        ends: (N,) indices in `reasons`; `GOING_ON` while the episode runs.
+        noise: (N, K) standard normal numbers that the environment draws for the next step. If steps
+            are deterministic, K is 0.
     """
 
     reasons: ClassVar[tuple[str, ...]]
@@ -71,22 +71,22 @@ class Fleet(ABC):
         """
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
-        """Start episodes of the vehicles with the indices `chosen` (K,), as `begin` does.
+        """Call `begin` for the vehicles with the indices `chosen` (K,).
 
-        `randoms` are the generators of all N vehicles.
+        `randoms` has one generator for each of the N vehicles.
         """
         for i in chosen.tolist():
             self.begin(i, randoms[i], None)
 
     @abstractmethod
     def advance(self) -> None:
-        """Advance each vehicle by one step with its action in `actions`."""
+        """Advance each vehicle by one step; `actions` contains the actions."""
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
         """Advance the only vehicle of a fleet of one, with a valid action.
 
         Returns:
-            Observation, reward, end as in `ends`, and `info`.
+            Observation, reward, element of `ends`, and `info`.
         """
         self.actions[0] = action
         self.advance()
@@ -94,24 +94,24 @@ class Fleet(ABC):
 
     @abstractmethod
     def _kernel(self) -> tuple[Any, ...]:
-        """Return the compiled function of a step and its arguments.
+        """Return the compiled function that advances the vehicles, and its arguments.
 
         The arguments stay the same objects for the lifetime of the fleet.
         """
 
     @cached_property
     def _step(self) -> Callable[[], None]:
-        """Machine code of `_kernel`, compiled on first use."""
+        """Function of `_kernel` with bound arguments, compiled on first use."""
         return ready(*self._kernel())
 
     @cached_property
     def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
-        """Copy the numbers that the only vehicle of a fleet of one observes."""
+        """Function that returns a copy of the first vehicle's observed numbers."""
         copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for copies, without cached properties: they refer to our arrays."""
+        """Return the state for a copy, without cached properties, which refer to these arrays."""
         kind = type(self)
         return {
             name: value
@@ -122,8 +122,8 @@ class Fleet(ABC):
     def imitate(self, i: int, other: Fleet, j: int) -> None:
         """Copy the state of vehicle j of another fleet of the same class into vehicle i.
 
-        The state is stored in arrays with one row for each vehicle, and in dicts of cached values
-        by the index of the vehicle.
+        A fleet stores state in arrays with one row for each vehicle, and in dicts that cache values
+        by the vehicle's index.
         """
         for name, theirs in vars(other).items():
             mine = getattr(self, name)

@@ -12,7 +12,7 @@ AnySim = TypeVar("AnySim")
 
 
 class ScriptedPilot(ABC, Generic[AnySim]):
-    """Policy that reads the full state of one environment and ignores its observations."""
+    """Policy that reads the full state of one environment instead of its observations."""
 
     name: ClassVar[str] = "pilot"
 
@@ -27,7 +27,7 @@ class ScriptedPilot(ABC, Generic[AnySim]):
             observations: Observations with a leading dimension of 1, or a dict of them.
 
         Raises:
-            ValueError: The observations are of more than one environment.
+            ValueError: There is not exactly one environment.
         """
         rows = next(iter(observations.values())) if isinstance(observations, dict) else observations
         if len(rows) != 1:
