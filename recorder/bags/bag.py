@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.recorder.bags.decoders import MessageDecoder, column_of, decoder_of, value_at
+from mcaprl.recorder.bags.files import find_bags, open_files
+from mcaprl.recorder.bags.mcap_file import McapFile
+from mcaprl.recorder.bags.rosbag_file import RosbagFile
+from mcaprl.recorder.bags.source import TopicSource
+
+_PUBLISH_TIME = "publish_time"
 
 
 class Stream(NamedTuple):
@@ -86,13 +97,138 @@ class Bag(Protocol):
         """Close the files."""
 
 
+class _Topic:
+    """A topic of all files of a bag."""
+
+    def __init__(self, name: str, sources: Sequence[TopicSource]) -> None:
+        self.name = name
+        used = [each for each in sources if len(each.times_ns)] or list(sources[:1])
+        # Files of a split bag follow each other in time.
+        self._sources = sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
+        self._definition = self._sources[0].definition
+        self._decoder: MessageDecoder | None = None
+        self.info = self._info()
+
+    @cached_property
+    def times_ns(self) -> NDArray[np.int64]:
+        return np.concatenate([each.times_ns for each in self._sources])
+
+    def _info(self) -> TopicInfo:
+        found, problem = self._definition, ""
+        kinds = {each.definition.type_name for each in self._sources}
+        try:
+            if len(kinds) > 1:
+                raise LogError(
+                    f"the topic has messages of several types: {', '.join(sorted(kinds))}"
+                )
+            self._decoder = decoder_of(
+                found.encoding,
+                found.type_name,
+                found.schema_encoding,
+                found.schema,
+                distribution=found.distribution,
+            )
+        except (LogError, UsageError) as error:
+            problem = str(error)
+        times_ns, decoder = self.times_ns, self._decoder
+        return TopicInfo(
+            name=self.name,
+            type_name=found.type_name,
+            encoding=found.encoding,
+            count=len(times_ns),
+            first_ns=int(times_ns.min()) if len(times_ns) else 0,
+            last_ns=int(times_ns.max()) if len(times_ns) else 0,
+            fields={} if decoder is None else decoder.fields,
+            constants={} if decoder is None else decoder.constants,
+            problem=problem,
+        )
+
+    def read(self, fields: Sequence[str], rows: NDArray[np.int64] | None) -> Stream:
+        times_ns = self.times_ns if rows is None else self.times_ns[rows]
+        if len(self._sources) == 1 and _PUBLISH_TIME not in fields:
+            columns = self._sources[0].columns(fields, rows)
+            if columns is not None:
+                return Stream(times_ns, {name: columns[name] for name in fields})
+        values: dict[str, list[Any]] = {name: [] for name in fields}
+        for publish_ns, message in self._messages(rows):
+            for name, column in values.items():
+                is_time = name == _PUBLISH_TIME
+                column.append(publish_ns if is_time else value_at(message, name))
+        kinds = {**self.info.fields, _PUBLISH_TIME: "time"}
+        columns = {name: column_of(column, kinds.get(name, "")) for name, column in values.items()}
+        return Stream(times_ns, columns)
+
+    def _messages(self, rows: NDArray[np.int64] | None) -> Iterator[tuple[int, Any]]:
+        """Yield time of publication and decoded message, in the order of `rows`."""
+        assert self._decoder is not None, "a topic with a problem is not read"
+        if rows is None:
+            yield from self._rising(np.arange(len(self.times_ns)), self._decoder)
+            return
+        wanted, places = np.unique(rows, return_inverse=True)
+        found = list(self._rising(wanted, self._decoder))
+        yield from (found[place] for place in places.tolist())
+
+    def _rising(
+        self, rows: NDArray[np.int64], decoder: MessageDecoder
+    ) -> Iterator[tuple[int, Any]]:
+        first = 0
+        for source in self._sources:
+            stop = first + len(source.times_ns)
+            mine = rows[(first <= rows) & (rows < stop)] - first
+            for raw in source.raw(mine):
+                try:
+                    yield raw.publish_ns, decoder.decode(raw.data)
+                except LogError as error:
+                    raise LogError(f"{self.name}: {error}") from error
+            first = stop
+
+
+class _FileBag:
+    """A bag of files."""
+
+    def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
+        self._opened = opened
+        self.paths = tuple(file.path for file in files)
+        names = dict.fromkeys(name for file in files for name in file.topics)
+        self._topics = {
+            name: _Topic(name, [each for file in files for each in file.topics.get(name, [])])
+            for name in sorted(names)
+        }
+        self.topics = {name: topic.info for name, topic in self._topics.items()}
+
+    def times(self, topic: str) -> NDArray[np.int64]:
+        return self._topic(topic).times_ns
+
+    def read(
+        self, topic: str, fields: Sequence[str], rows: NDArray[np.int64] | None = None
+    ) -> Stream:
+        found = self._topic(topic)
+        if found.info.problem:
+            raise LogError(f"{topic} cannot be read: {found.info.problem}")
+        return found.read(fields, rows)
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def _topic(self, name: str) -> _Topic:
+        if name not in self._topics:
+            raise UnknownNameError("topic", name, self._topics)
+        return self._topics[name]
+
+
 def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
-    """Open a bag.
+    """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
+
+    Files that rosbag2 compressed as a whole are decompressed to a temporary folder. Topics that
+    cannot be read have a `problem`; the others can be read nevertheless.
 
     Args:
-        data: MCAP file, rosbag2 folder, ROS 1 bag, or a glob or sequence of these.
+        data: A file, a folder, a glob, or a sequence of these; topics of several files are joined
+            in the order of time.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.
     """
-    raise NotImplementedError
+    with ExitStack() as opened:
+        files = [file for path in find_bags(data) for file in open_files(path, opened)]
+        return _FileBag(files, opened.pop_all())

@@ -1,0 +1,106 @@
+"""Topics of an MCAP file of any writer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.source import Definition, RawMessage, TopicSource
+from mcaprl.recorder.format.reading import MESSAGE_HEADER, McapReader, MessageRange, Topic
+
+# Kinds whose columns are decoded one by one: bytes stay bytes, and lists of messages objects.
+_ONE_BY_ONE = ("uint8[", "byte[", "octet[")
+
+
+class McapFile:
+    """One MCAP file.
+
+    Attributes:
+        path: Path of the file.
+        topics: Topics by name, one source for each channel with messages.
+    """
+
+    def __init__(self, path: Path, *, distribution: str = "") -> None:
+        """Open a file.
+
+        Args:
+            path: Path of the file.
+            distribution: ROS distribution that the folder of the bag names.
+
+        Raises:
+            LogError: The file is not an MCAP file, or damaged.
+        """
+        self.path = path
+        reader = McapReader(path)
+        self.topics: dict[str, list[TopicSource]] = {}
+        for channel in reader.channels.values():
+            sources = self.topics.setdefault(channel.topic, [])
+            sources.append(_McapTopic(reader, channel, distribution))
+
+    def close(self) -> None:
+        """Do nothing: the file is mapped into memory."""
+
+
+class _McapTopic:
+    """Messages of one channel."""
+
+    def __init__(self, reader: McapReader, channel: Channel, distribution: str) -> None:
+        self._reader, self._channel = reader, channel
+        schema = reader.schemas.get(channel.schema_id)
+        name, encoding, data = ("", "", b"")
+        if schema is not None:
+            name, encoding, data = schema.name, schema.encoding, schema.data
+        self.definition = Definition(name, channel.message_encoding, encoding, data, distribution)
+
+    @cached_property
+    def _ranges(self) -> list[MessageRange]:
+        return [part for part in self._reader.message_ranges(self._channel) if len(part)]
+
+    @cached_property
+    def times_ns(self) -> NDArray[np.int64]:
+        parts = [part.index["log_time"].astype(np.int64) for part in self._ranges]
+        return np.concatenate(parts) if parts else np.empty(0, np.int64)
+
+    def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
+        stops = np.cumsum([len(part) for part in self._ranges])
+        highs = np.searchsorted(rows, stops)
+        low = 0
+        for part, stop, high in zip(self._ranges, stops.tolist(), highs.tolist(), strict=True):
+            if high > low:
+                records = self._reader.records_of(part)
+                for entry in part.index[rows[low:high] - (stop - len(part))]:
+                    time_ns, offset = entry.tolist()
+                    data = self._reader.message(records, self._channel, time_ns, offset)
+                    head = np.frombuffer(records, MESSAGE_HEADER, 1, offset)
+                    yield RawMessage(int(head["publish_time"][0]), data)
+            low = high
+
+    def columns(
+        self, fields: Sequence[str], rows: NDArray[np.int64] | None
+    ) -> dict[str, NDArray[Any]] | None:
+        if self._channel.message_encoding != "cdr":
+            return None
+        topic = self._columnar
+        if topic is None or not set(fields) <= set(topic.fields) or topic.channels > 1:
+            return None
+        try:
+            return dict(topic.read(list(fields), rows))
+        # Arrays of different lengths become objects.
+        except LogError:
+            return None
+
+    @cached_property
+    def _columnar(self) -> Topic | None:
+        """The topic as columns; None if its type has none, or the topic has several channels."""
+        try:
+            found = Topic(self._reader, self._channel.topic)
+        except LogError:
+            return None
+        return found if found.channels == 1 else None

@@ -1,0 +1,104 @@
+"""Topics of rosbag2 databases and ROS 1 bags, read by rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.source import Definition, RawMessage, TopicSource
+
+_ENCODINGS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+
+
+class RosbagFile:
+    """A ROS 1 bag, a rosbag2 database, or a folder of them with `metadata.yaml`.
+
+    Attributes:
+        path: Path of the file or folder.
+        topics: Topics by name, one source for each connection.
+    """
+
+    def __init__(self, path: Path, *, distribution: str = "") -> None:
+        """Open a bag.
+
+        Raises:
+            LogError: The bag is damaged, or of an unknown form.
+        """
+        self.path = path
+        is_ros1 = path.suffix == ".bag"
+        try:
+            self._reader: Any = Reader1(path) if is_ros1 else Reader2(path)
+            self._reader.open()
+        # The library raises errors of many types for a damaged file.
+        except Exception as error:
+            raise LogError(f"{path} cannot be read as a bag: {error}") from error
+        self.topics: dict[str, list[TopicSource]] = {}
+        for connection in self._reader.connections:
+            sources = self.topics.setdefault(connection.topic, [])
+            sources.append(
+                _RosbagTopic(self._reader, path, connection, distribution, is_ros1=is_ros1)
+            )
+
+    def close(self) -> None:
+        """Close the files."""
+        self._reader.close()
+
+
+class _RosbagTopic:
+    """Messages of one connection."""
+
+    def __init__(
+        self,
+        reader: Any,
+        path: Path,
+        connection: Connection,
+        distribution: str,
+        *,
+        is_ros1: bool,
+    ) -> None:
+        self._reader, self._path, self._connection = reader, path, connection
+        found = connection.msgdef
+        known = "ros1msg" if is_ros1 else _ENCODINGS.get(found.format, "")
+        encoding = "ros1" if is_ros1 else "cdr"
+        text = found.data.encode()
+        self.definition = Definition(connection.msgtype, encoding, known, text, distribution)
+        # The position of the next message of the running pass over the file, and the pass.
+        self._next = 0
+        self._pass: Iterator[tuple[Connection, int, bytes]] = iter(())
+
+    @cached_property
+    def times_ns(self) -> NDArray[np.int64]:
+        return np.array([time_ns for _, time_ns, _ in self._messages()], np.int64)
+
+    def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
+        if len(rows) and (int(rows[0]) < self._next or self._next == 0):
+            self._next, self._pass = 0, self._messages()
+        for row in rows.tolist():
+            for _, time_ns, data in self._pass:
+                self._next += 1
+                if self._next > row:
+                    # Databases before Jazzy and ROS 1 bags store no time of publication.
+                    yield RawMessage(time_ns, data)
+                    break
+
+    def columns(
+        self, fields: Sequence[str], rows: NDArray[np.int64] | None
+    ) -> dict[str, NDArray[Any]] | None:
+        return None
+
+    def _messages(self) -> Iterator[tuple[Connection, int, bytes]]:
+        try:
+            yield from self._reader.messages(connections=[self._connection])
+        except Exception as error:
+            raise LogError(
+                f"{self._path}: messages of {self._connection.topic} cannot be read: {error}"
+            ) from error
