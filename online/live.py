@@ -1,13 +1,12 @@
-"""Live view of training: one of the environments, and the learner's values for it.
+"""Live view of training: episodes of one environment, and the learner's values for them.
 
-The view may drop frames, but training drops no steps; its results are bit-identical with and
-without viewers.
+The view skips episodes, but training skips nothing; its results are bit-identical with and without
+viewers.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, cast
@@ -28,22 +27,23 @@ from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.session import reason_of
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
-from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream, Pace
+from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED, LiveStep, LiveStream, Pace
 from mcaprl.sims import make_sim
 from mcaprl.sims.vehicle.batched import BatchedEnv
 from mcaprl.sims.vehicle.env import VehicleEnv
-from mcaprl.sims.vehicle.fleet import Fleet
 
-TRAINING_NAMES = (
-    "loss",
-    "epsilon",
-    "mean_q",
-    "mean_return",
-    "score",
-    "learning_rate",
-    "steps",
-    "updates",
-)
+TRAINING_LABELS = {
+    "mean_return": "mean return of the last 100 episodes",
+    "score": "score of the last evaluation",
+    "loss": "loss of the last update",
+    "epsilon": "epsilon, probability of a random action",
+    "mean_q": "mean Q-value of the last batch",
+    "learning_rate": "learning rate",
+    "steps": "steps of all environments",
+    "updates": "updates of the network",
+}
+"""Labels of the numbers in `/rl/training`, by name, the most important first."""
+TRAINING_NAMES = tuple(TRAINING_LABELS)
 """Names of the numbers in `/rl/training`."""
 WATCHED = 0
 """Index of the environment in the live view."""
@@ -58,6 +58,7 @@ class LiveTraining:
         *,
         port: int = DEFAULT_PORT,
         origins: Sequence[str] = (),
+        speed: float = DEFAULT_SPEED,
         pace: Pace | None = None,
     ) -> None:
         """Listen for viewers.
@@ -66,7 +67,8 @@ class LiveTraining:
             task: Task of the run.
             port: Port on 127.0.0.1; 0 selects a free one.
             origins: Origins of web pages that may connect, besides those of known viewers.
-            pace: Rate of frames.
+            speed: Simulated seconds per second in the episodes that are shown.
+            pace: Limit on the time that is spent on the view.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -79,10 +81,11 @@ class LiveTraining:
             self.stream = LiveStream(
                 LogMetadata.of_env(self._shown, policy=task.algo),
                 self._shown.unwrapped,
-                TRAINING_NAMES,
+                TRAINING_LABELS,
                 name=f"{task.algo} in {task.sim}",
                 port=port,
                 origins=origins,
+                speed=speed,
                 pace=pace,
             )
         except BaseException:
@@ -98,15 +101,22 @@ class LiveTraining:
         with closing(self._shown):
             self.stream.close()
 
-    def _source_of(self, batch: Any) -> Callable[[], object]:
-        """Return a function that returns an environment with the scene of the watched one."""
-        shown = self._shown.unwrapped
-        if isinstance(batch, BatchedEnv) and isinstance(shown, VehicleEnv):
-            mirror = _Mirror(batch.fleet, shown)
-            return mirror.update
+    def _source_of(self, batch: Any) -> Callable[[int | None], object]:
+        """Return a function that returns an environment with the scene of the watched one.
+
+        Its argument is the last action of the watched environment; None after a reset.
+        """
+        single = self._shown.unwrapped
+        if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
+
+            def imitate(action: int | None) -> object:
+                single.imitate(batch.fleet, WATCHED, action)
+                return single
+
+            return imitate
         if isinstance(batch, SyncVectorEnv):
-            return lambda: batch.envs[WATCHED].unwrapped
-        return lambda: None
+            return lambda action: batch.envs[WATCHED].unwrapped
+        return lambda action: None
 
 
 class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
@@ -123,15 +133,19 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         env: VectorEnv[Any, Any, Any],
         stream: LiveStream,
         algo: str,
-        source: Callable[[], object],
+        source: Callable[[int | None], object],
     ) -> None:
-        """Wrap `env`; `source` returns an object with the scene of the watched environment."""
+        """Wrap `env`; `source` returns an object with the scene of the watched environment.
+
+        The argument of `source` is the last action of that environment; None after a reset.
+        """
         super().__init__(env)
         self.model: BaseAlgorithm | None = None
         self.score = math.nan
         self.after_forward: Callable[[], None] = lambda: None
         self._stream, self._algo, self._source = stream, algo, source
         self._observations: Any = None
+        self._last_action: int | None = None
         self._episode = -1
         self._loss = self._mean_q = math.nan
         self._begin_episode()
@@ -143,66 +157,74 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return self._observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all environments, and show the watched transition if a frame is due."""
-        shown = self.model is not None and self._stream.due()
-        before = self._before_step(actions) if shown else {}
+        """Step all environments; show the watched transition if its episode is shown."""
+        stream, model = self._stream, self.model
+        if model is not None:
+            if self._step == 0:
+                self._is_shown = stream.begin_episode(self._episode, self._algo)
+            if stream.wants_metrics():
+                stream.show_metrics(self._metrics(model))
+        before = self._before_step(actions) if self._is_shown else {}
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
-        reward = float(rewards[WATCHED])
-        is_over = bool(terminated[WATCHED] or truncated[WATCHED])
-        if shown:
+        ends = bool(terminated[WATCHED]), bool(truncated[WATCHED])
+        if self._is_shown:
             step = LiveStep(
                 episode=self._episode,
                 step=self._step,
-                reward=reward,
-                terminated=bool(terminated[WATCHED]),
-                truncated=bool(truncated[WATCHED]),
+                reward=float(rewards[WATCHED]),
+                terminated=ends[0],
+                truncated=ends[1],
                 **before,
             )
-            self._stream.show(step)
-        self._observations = observations
+            self._is_shown = stream.show(step)
+        self._observations, self._last_action = observations, int(actions[WATCHED])
         self._step += 1
-        self._return_so_far += reward
-        if is_over:
-            self._show_end(bool(terminated[WATCHED]), bool(truncated[WATCHED]), infos)
+        self._return_so_far += float(rewards[WATCHED])
+        if any(ends):
+            if self._is_shown:
+                self._show_end(*ends, infos)
             self._begin_episode()
         return result
 
     def _begin_episode(self) -> None:
         self._episode, self._step, self._return_so_far = self._episode + 1, 0, 0.0
-        self._began_ns = time.time_ns()
+        self._last_action = None
+        self._is_shown = False
 
     def _before_step(self, actions: NDArray[Any]) -> dict[str, Any]:
         """Return the fields of a `LiveStep` that are known before the step."""
         model = self.model
         assert model is not None
-        self._stream.look(self._source(), self._return_so_far)
+        self._stream.look(self._source(self._last_action), self._return_so_far)
         values = _values(model, actions[WATCHED : WATCHED + 1])
-        epsilon = exploration(model)
         probability = behavior_probabilities(model, actions)[WATCHED]
         self.after_forward()
-        logged = model.logger.name_to_value
-        self._loss = logged.get("train/loss", logged.get("train/value_loss", self._loss))
-        self._mean_q = logged.get("train/mean_q", self._mean_q)
-        returns = [episode["r"] for episode in model.ep_info_buffer or ()]
-        training = {
-            "loss": self._loss,
-            "epsilon": epsilon,
-            "mean_q": self._mean_q,
-            "mean_return": float(np.mean(returns)) if returns else math.nan,
-            "score": self.score,
-            "learning_rate": model.policy.optimizer.param_groups[0]["lr"],
-            "steps": model.num_timesteps,
-            "updates": cast(Any, model)._n_updates,
-        }
+        self._stream.pause()
         return {
             "observation": _row(self._observations, WATCHED),
             "action": actions[WATCHED],
             "behavior_prob": float(probability),
-            "epsilon": epsilon,
+            "epsilon": exploration(model),
             "policy_version": cast(Any, model)._n_updates,
             "values": values,
-            "training": training,
+        }
+
+    def _metrics(self, model: BaseAlgorithm) -> dict[str, float]:
+        """Return the numbers of `/rl/training`."""
+        logged = model.logger.name_to_value
+        self._loss = logged.get("train/loss", logged.get("train/value_loss", self._loss))
+        self._mean_q = logged.get("train/mean_q", self._mean_q)
+        returns = [episode["r"] for episode in model.ep_info_buffer or ()]
+        return {
+            "mean_return": float(np.mean(returns)) if returns else math.nan,
+            "score": self.score,
+            "loss": self._loss,
+            "epsilon": exploration(model),
+            "mean_q": self._mean_q,
+            "learning_rate": model.policy.optimizer.param_groups[0]["lr"],
+            "steps": model.num_timesteps,
+            "updates": cast(Any, model)._n_updates,
         }
 
     def _show_end(self, terminated: bool, truncated: bool, infos: dict[str, Any]) -> None:
@@ -213,27 +235,14 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             total_reward=self._return_so_far,
             terminated=terminated,
             truncated=truncated,
-            start_time_ns=self._began_ns,
-            end_time_ns=time.time_ns(),
+            # The stream sets the times.
+            start_time_ns=0,
+            end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),
             policy=self._algo,
             epsilon=math.nan if self.model is None else exploration(self.model),
         )
         self._stream.end_episode(summary)
-
-
-class _Mirror:
-    """Single vehicle that copies the state of a fleet's vehicle, to draw its scene."""
-
-    def __init__(self, fleet: Fleet, single: VehicleEnv[Any, Any]) -> None:
-        self._fleet, self._single = fleet, single
-
-    def update(self) -> object:
-        """Copy the state, and return the environment."""
-        self._single.fleet.imitate(0, self._fleet, WATCHED)
-        # Frames are too far apart for a trail.
-        self._single._trail.clear()
-        return self._single
 
 
 def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:

@@ -1,12 +1,13 @@
-"""Live stream of a running environment to viewers, at a limited share of the run time.
+"""Live stream of a running environment to viewers: one episode after the other, slowed down.
 
 Viewers receive the topics of a log (see `log_writer` and `display`) and one more:
 
     /rl/training    mcaprl_msgs/msg/Telemetry...    metrics of the learner: loss, epsilon, ...
 
-Nothing is stored, and the environment never waits for a viewer. Timestamps are wall-clock times,
-because whole episodes can be skipped. Static shapes and frames are sent to each new viewer, and
-again when they change.
+An environment in training runs many times faster than real time. The stream therefore shows one
+whole episode at a given speed, and then the next one that begins: it encodes the messages while the
+environment runs, and a thread sends them at their times. The environment never waits for a viewer.
+Log times are wall-clock times. Nothing is stored.
 """
 
 from __future__ import annotations
@@ -14,19 +15,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.log_writer import LogTopics, MessageSink
+from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.rows import ImageRows, TopicRows
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC
 from mcaprl.recorder.record.display import (
     DEPTH,
     SCENE,
@@ -34,11 +37,13 @@ from mcaprl.recorder.record.display import (
     TELEMETRY,
     TF,
     TF_STATIC,
+    TRACKS,
     ShownTopics,
 )
 from mcaprl.recorder.record.layout import TRAINING_TOPIC, VALUES_TOPIC, layout_of
 from mcaprl.recorder.record.scene import (
     DepthSource,
+    MotionSource,
     SceneSource,
     TelemetrySource,
     depth_millimeters,
@@ -46,10 +51,15 @@ from mcaprl.recorder.record.scene import (
     transforms,
 )
 from mcaprl.recorder.record.step_rows import as_declared
+from mcaprl.recorder.record.tracks import Tracks
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
+from mcaprl.recorder.viewer.live_sink import LiveSink
 
-_STATIC_PERIOD_S = 10.0
-"""Time after which the static scene is checked for changes."""
+DEFAULT_SPEED = 4.0
+MAX_STEPS = 2_000
+"""Number of steps of an episode that are shown; messages take about 20 kB per step in memory."""
+# Topics whose latest message is sent to each new viewer.
+_KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
 _ROW = slice(1)
 """The only row that is reserved for each topic."""
 
@@ -70,7 +80,6 @@ class LiveStep:
         epsilon: Probability of a random action; NaN if unknown.
         policy_version: Number of updates of the policy so far.
         values: Fields of `schema.values_schema`; empty if unknown.
-        training: Metrics of the learner, by the names passed to `LiveStream`.
     """
 
     episode: int
@@ -84,7 +93,6 @@ class LiveStep:
     epsilon: float = math.nan
     policy_version: int = -1
     values: Mapping[str, Any] = field(default_factory=dict)
-    training: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass
@@ -125,17 +133,22 @@ class Pace:
 
 
 class LiveStream(ViewerServer):
-    """Frames of one environment; call `due`, `look`, `env.step` and `show` in this order."""
+    """Episodes of one environment, and metrics of its learner.
+
+    For an episode, call `begin_episode`, then `look`, `pause`, `env.step` and `show` for each step,
+    and then `end_episode`.
+    """
 
     def __init__(
         self,
         metadata: LogMetadata,
         source: object,
-        training: Sequence[str],
+        training: Mapping[str, str],
         *,
         name: str = "mcaprl",
         port: int = DEFAULT_PORT,
         origins: Sequence[str] = (),
+        speed: float = DEFAULT_SPEED,
         pace: Pace | None = None,
     ) -> None:
         """Announce the topics and listen.
@@ -144,11 +157,13 @@ class LiveStream(ViewerServer):
             metadata: Metadata of the environment.
             source: Unwrapped environment after a reset, which implements any of the protocols in
                 `scene.py`.
-            training: Names of the learner's metrics.
+            training: Labels of the learner's metrics, by name.
             name: Name of the server, as viewers display it.
             port: Port on 127.0.0.1; 0 selects a free port.
             origins: Additional origins of web pages that may connect.
-            pace: Limit on the time spent on frames.
+            speed: Simulated seconds per second.
+            pace: Limit on the time spent on an episode; its `period_s` is the shortest time between
+                two scenes, depth images or metrics.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -156,13 +171,17 @@ class LiveStream(ViewerServer):
             SpaceError: The log format does not support the spaces.
         """
         super().__init__()
-        self._pace = pace or Pace()
-        self._sink = _ViewerSink(self)
+        self._speed, self._pace = speed, pace or Pace()
+        self._metrics_pace = replace(self._pace)
+        self._step_ns = max(1, round(metadata.step_duration_ns / speed))
+        self._sink = LiveSink(self, _KEPT_TOPICS)
         self._log = log = LogTopics(metadata, self._sink)
-        self._training = tuple(training)
+        self._training = dict(training)
         self._shown = ShownTopics(log, source)
+        # The first message of an episode announces the topics of the log lines.
+        self._line_channel = log.begin_messages(0, "", 0)[0][0]
         self._topics = dict(self._shown.channels)
-        type_name, text = telemetry_schema(self._training)
+        type_name, text = telemetry_schema(tuple(training))
         self._topics[TRAINING_TOPIC] = log.sink.add_channel(TRAINING_TOPIC, type_name, text)
         # A row is reserved for each topic of fixed-size messages.
         self._depth: ImageRows | None = None
@@ -178,93 +197,126 @@ class LiveStream(ViewerServer):
             leaf: log.image_rows(leaf.topic, leaf.shape, leaf.encoding, 1)
             for leaf in log.image_leaves
         }
-        self._newcomers, self._static_at_s = True, -math.inf
         self._static_shapes: Sequence[Any] | None = None
-        self._static: list[tuple[str, bytes]] = []
-        if isinstance(source, SceneSource):
-            self._static_messages(source)
-        self._time_ns = 0
-        self._finished: list[EpisodeSummary] = []
+        self._tracks = Tracks()
+        self._start_ns = self._time_ns = self._next_ns = self._picture_ns = 0
+        self._steps_shown = 0
         self.start(name, port, origins)
+        self._sink.start()
 
-    def due(self) -> bool:
-        """Return whether there is time for a frame and a viewer is subscribed."""
-        if not self._pace.due():
+    def begin_episode(self, episode: int, policy: str) -> bool:
+        """Return whether to show the episode that begins now.
+
+        It is shown if a viewer subscribes, the previous one is over on screen, and there is time.
+        """
+        now_ns = time.time_ns()
+        if now_ns < self._next_ns or not self._pace.due() or not self._sink.has_viewers():
             return False
-        self._pace.begin()
-        if self._sink.has_viewers():
-            return True
-        self._pace.end()
-        return False
+        self._start_ns = self._next_ns = now_ns
+        self._steps_shown = self._picture_ns = 0
+        self._tracks.begin()
+        self._sink.write_messages(self._log.begin_messages(episode, policy, now_ns))
+        return True
 
     def look(self, source: object, return_so_far: float) -> None:
-        """Store the environment's display messages before a step, if a frame is due."""
-        self._time_ns = max(time.time_ns(), self._time_ns + 1)
-        seen = []
+        """Start the timer of the stream, and send the display messages before a step."""
+        self._pace.begin()
+        self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
+        self._next_ns = time_ns + self._step_ns
+        is_picture = time_ns - self._picture_ns >= self._pace.period_s * 1e9
+        if is_picture:
+            self._picture_ns = time_ns
         if isinstance(source, SceneSource) and SCENE in self._topics:
-            seen += self._static_messages(source)
-            seen += [
-                (SCENE, marker_array(source.scene())),
-                (TF, transforms(source.frames(), self._time_ns)),
-            ]
+            self._send_scene(source, is_picture=is_picture)
         if isinstance(source, TelemetrySource) and TELEMETRY in self._topics:
-            seen.append((TELEMETRY, self._shown.telemetry(source, return_so_far)))
-        if isinstance(source, DepthSource) and self._depth is not None:
+            self._emit(TELEMETRY, time_ns, self._shown.telemetry(source, return_so_far))
+        if is_picture and isinstance(source, DepthSource) and self._depth is not None:
             self._put_image(self._depth, depth_millimeters(source.depth_image_m()))
-        self._seen = seen
+            self._depth.write(_ROW, time_ns)
+
+    def pause(self) -> None:
+        """Stop the timer of the stream while the environment is stepped."""
         self._pace.pause()
 
-    def show(self, step: LiveStep) -> None:
-        """Send the messages that `look` stored, and then the step that followed `look`."""
+    def show(self, step: LiveStep) -> bool:
+        """Send the step that followed `look`; return whether to show the next one as well."""
         self._pace.begin()
-        time_ns, topics = self._time_ns, self._topics
-        self._sink.write_messages([(topics[t], time_ns, data) for t, data in self._seen])
-        if self._depth is not None:
-            self._depth.write(_ROW, time_ns)
         self._send_step(step)
-        numbers = [step.training.get(name, math.nan) for name in self._training]
-        training = (topics[TRAINING_TOPIC], time_ns, telemetry_message(numbers))
-        self._sink.write_messages([training])
         if self._values is not None and step.values:
             self._send(self._values, step.values)
-        finished, self._finished = self._finished, []
-        self._log.write_episodes(finished)
-        self._pace.end()
+        self._steps_shown += 1
+        goes_on = self._steps_shown < MAX_STEPS or step.terminated or step.truncated
+        if goes_on:
+            self._pace.pause()
+        else:
+            text = f"episode {step.episode} is shown up to step {step.step} only"
+            line = messages.log_message(self._next_ns, text, messages.WARN)
+            self._sink.write_messages([(self._line_channel, self._next_ns, line)])
+            self._pace.end()
+        return goes_on
 
     def end_episode(self, summary: EpisodeSummary) -> None:
-        """Send the summary of the latest finished episode with the next frame."""
-        self._finished = [summary]
+        """Send the end of the shown episode; its times are replaced by those of the stream."""
+        self._pace.begin()
+        summary = summary._replace(start_time_ns=self._start_ns, end_time_ns=self._next_ns)
+        self._log.write_episodes([summary])
+        self._sink.write_messages(self._log.end_messages(summary))
+        failed = self._log.metadata.is_failure(summary.reason)
+        self._tracks.end(summary.episode, summary.total_reward, failed=failed)
+        if TRACKS in self._topics:
+            self._emit(TRACKS, self._next_ns, marker_array(self._tracks.shapes()))
+        self._pace.end()
+
+    def wants_metrics(self) -> bool:
+        """Return whether there is time for metrics, and a viewer subscribes."""
+        return self._metrics_pace.due() and self._sink.has_viewers()
+
+    def show_metrics(self, metrics: Mapping[str, float]) -> None:
+        """Send metrics of the learner now, by name; missing ones are NaN."""
+        self._metrics_pace.begin()
+        data = telemetry_message([metrics.get(name, math.nan) for name in self._training])
+        self._sink.send(self._topics[TRAINING_TOPIC], time.time_ns(), data)
+        self._metrics_pace.end()
 
     def layout(self) -> dict[str, Any]:
         """Return the layout that shows these topics; see `layout.layout_of`."""
         return layout_of(
             self._log.metadata,
-            sorted(self._topics),
+            sorted((LOG_TOPIC, PHASE_TOPIC, *self._topics)),
             self._shown.telemetry_names,
             self._shown.follow_frame,
-            self._training,
+            tuple(self._training),
         )
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Send the static scene with the next frame, for the new viewer."""
-        self._newcomers = True
+        """Send the current scene again, for the new viewer."""
+        self._sink.welcome()
 
-    def _static_messages(self, source: SceneSource) -> list[tuple[str, bytes]]:
-        """Return the static scene if there are new viewers or a periodic check finds a change."""
-        age_s = time.monotonic() - self._static_at_s
-        if not (self._newcomers or age_s > _STATIC_PERIOD_S):
-            return []
-        shapes, self._static_at_s = source.static_scene(), time.monotonic()
-        if shapes is not self._static_shapes:
-            self._static_shapes = shapes
-            self._static = [
-                (SCENE_STATIC, marker_array(shapes)),
-                (TF_STATIC, transforms(source.static_frames(), 0)),
-            ]
-        elif not self._newcomers:
-            return []
-        self._newcomers = False
-        return self._static
+    def close(self) -> None:
+        """Send the messages that are due, and disconnect all viewers."""
+        self._sink.close()
+        super().close()
+
+    def _send_scene(self, source: SceneSource, *, is_picture: bool) -> None:
+        """Send frames and, if they are due, shapes; static ones if they have changed."""
+        time_ns = self._time_ns
+        if self._steps_shown == 0 and source.static_scene() is not self._static_shapes:
+            self._static_shapes = source.static_scene()
+            self._emit(SCENE_STATIC, time_ns, marker_array(self._static_shapes))
+            self._emit(TF_STATIC, time_ns, transforms(source.static_frames(), 0))
+        if isinstance(source, MotionSource):
+            for left_s, frames in source.motion():
+                moment_ns = time_ns - round(left_s / self._speed * 1e9)
+                self._emit(TF, moment_ns, transforms(frames, moment_ns))
+        frames = source.frames()
+        self._emit(TF, time_ns, transforms(frames, time_ns))
+        if frames:
+            self._tracks.add(frames[0].position)
+        if is_picture:
+            self._emit(SCENE, time_ns, marker_array(source.scene()))
+
+    def _emit(self, topic: str, time_ns: int, data: bytes) -> None:
+        self._sink.write_messages([(self._topics[topic], time_ns, data)])
 
     def _send_step(self, step: LiveStep) -> None:
         """Send the transition in the messages of a log."""
@@ -290,32 +342,3 @@ class LiveStream(ViewerServer):
         for name, value in columns.items():
             rows.put(name, _ROW, value)
         rows.write(_ROW, self._time_ns)
-
-
-class _ViewerSink(MessageSink):
-    """A sink that sends a log's messages to viewers."""
-
-    def __init__(self, viewers: ViewerServer) -> None:
-        self._viewers = viewers
-        self._channels: list[Any] = []
-
-    def has_viewers(self) -> bool:
-        return any(channel.has_sinks() for channel in self._channels)
-
-    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Do nothing: viewers do not use metadata."""
-
-    def add_channel(
-        self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
-    ) -> int:
-        self._channels.append(self._viewers.add_channel(topic, schema_name, schema_text.encode()))
-        return len(self._channels) - 1
-
-    def write_rows(self, rows: NDArray[Any]) -> None:
-        for row in rows:
-            channel = self._channels[int(row["channel_id"])]
-            channel.log(row["payload"].tobytes(), log_time=int(row["log_time"]))
-
-    def write_messages(self, messages: Sequence[tuple[int, int, bytes]]) -> None:
-        for channel_id, time_ns, data in messages:
-            self._channels[channel_id].log(data, log_time=time_ns)

@@ -1,0 +1,101 @@
+"""Messages of a running environment, sent to viewers at their times."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from mcaprl.recorder.format.log_writer import Message, MessageSink
+from mcaprl.recorder.viewer.foxglove_server import ViewerServer
+
+_PERIOD_S = 1 / 50
+
+
+class LiveSink(MessageSink):
+    """A sink whose thread sends each message to viewers at its log_time, in the order of writing.
+
+    The latest messages of the topics in `kept` are also sent to each new viewer.
+    """
+
+    def __init__(self, viewers: ViewerServer, kept: Sequence[str]) -> None:
+        """Create a sink without channels; `start` begins to send."""
+        self._viewers, self._kept = viewers, kept
+        self._channels: list[Any] = []
+        self._kept_ids: set[int] = set()
+        self._latest: dict[int, bytes] = {}
+        self._waiting: deque[Message] = deque()
+        self._has_newcomers = False
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        """Start to send messages."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Send what is due, and drop the rest."""
+        if self._thread.is_alive():
+            self._stop.set()
+            self._thread.join()
+        self._send_due()
+
+    def has_viewers(self) -> bool:
+        """Return whether a viewer subscribes to any topic."""
+        return any(channel.has_sinks() for channel in self._channels)
+
+    def welcome(self) -> None:
+        """Send the kept messages to all viewers, for a new one."""
+        self._has_newcomers = True
+
+    def send(self, channel_id: int, time_ns: int, data: bytes) -> None:
+        """Send a message now, before all that are waiting."""
+        self._channels[channel_id].log(data, log_time=time_ns)
+
+    def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
+        """Do nothing: viewers do not use metadata."""
+
+    def add_channel(
+        self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
+    ) -> int:
+        """Announce a topic and return its channel id."""
+        self._channels.append(self._viewers.add_channel(topic, schema_name, schema_text.encode()))
+        channel_id = len(self._channels) - 1
+        if topic in self._kept:
+            self._kept_ids.add(channel_id)
+        return channel_id
+
+    def write_rows(self, rows: NDArray[Any]) -> None:
+        """Send message records of one channel at their times."""
+        self.write_messages(
+            [
+                (int(row["channel_id"]), int(row["log_time"]), row["payload"].tobytes())
+                for row in rows
+            ]
+        )
+
+    def write_messages(self, messages: Sequence[Message]) -> None:
+        """Send messages at their times."""
+        with self._lock:
+            self._waiting.extend(messages)
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            self._send_due()
+
+    def _send_due(self) -> None:
+        now_ns = time.time_ns()
+        if self._has_newcomers:
+            self._has_newcomers = False
+            for channel_id, data in self._latest.items():
+                self.send(channel_id, now_ns, data)
+        while self._waiting and self._waiting[0][1] <= now_ns:
+            with self._lock:
+                channel_id, time_ns, data = self._waiting.popleft()
+            if channel_id in self._kept_ids:
+                self._latest[channel_id] = data
+            self.send(channel_id, time_ns, data)
