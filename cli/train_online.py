@@ -57,6 +57,13 @@ def _tuned() -> dict[str, dict[str, Any]]:
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
+@click.option(
+    "--live-speed",
+    default=4.0,
+    show_default=True,
+    type=click.FloatRange(0, min_open=True),
+    help="With --live: simulated seconds per second in the episodes that are shown.",
+)
 @integer_option(
     "--port",
     "With --live: port on 127.0.0.1; 0 for any free port.",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mcaprl.api.data import Data
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
-from mcaprl.api.ranges import check_least, check_port
+from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
 from mcaprl.errors import MissingExtraError, UsageError
 from mcaprl.progress import ProgressCallback
@@ -18,6 +18,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
+from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
 from mcaprl.runs import run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 
@@ -139,6 +140,7 @@ def train_online(
     sources: str | Path | Sequence[str | Path] = (),
     resume: bool = False,
     live: bool = False,
+    live_speed: float = DEFAULT_SPEED,
     port: int = DEFAULT_PORT,
     allow_origin: str | Sequence[str] = (),
     observation: str | None = None,
@@ -163,7 +165,8 @@ def train_online(
         sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
             the agents.
         resume: Whether training continues from the checkpoints in `out`.
-        live: Whether viewers can connect during training; slow viewers miss frames.
+        live: Whether viewers can connect during training, which shows one episode after the other.
+        live_speed: Simulated seconds per second in the episodes that are shown.
         port: Port on 127.0.0.1 for viewers; 0 for any free port.
         allow_origin: Origin, or several, of web pages that may connect, besides pages on this
             machine, Foxglove and Lichtblick.
@@ -194,6 +197,7 @@ def train_online(
 
     check_least(1, seeds=seeds, threads=threads)
     check_least(0, seed=seed)
+    check_positive(live_speed=live_speed)
     check_port(port)
     out = Path(out)
     options = all_options(observation, rules, sim_options)
@@ -203,7 +207,9 @@ def train_online(
         stack.enter_context(torch_threads(threads))
         viewers = None
         if live:
-            viewers = LiveTraining(task, port=port, origins=as_names(allow_origin))
+            viewers = LiveTraining(
+                task, port=port, origins=as_names(allow_origin), speed=live_speed
+            )
             stream = stack.enter_context(closing(viewers)).stream
             on_live(LiveAddress(stream.app_url, stream.url, out / LAYOUT_NAME))
         return train_agents(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import importlib.util
 import json
@@ -23,7 +24,10 @@ import mcaprl
 from mcaprl.errors import UsageError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
+from mcaprl.recorder.viewer.live_stream import LiveStep, LiveStream
 from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.playback import Played, Player, Track
 from mcaprl.recorder.viewer.prefix import prefixed_message, prefixes_of, side_by_side
@@ -334,6 +338,96 @@ def test_two_logs_are_played_side_by_side(log: Path, tmp_path: Path) -> None:
     assert {"/lane/rl/step", "/pilot/rl/step", "/pilot/scene"} <= seen["topics"].keys()
     times = {message["topic"]: message["time"] for message in seen["steps"][0]["messages"]}
     assert times["/lane/tf"] == times["/pilot/tf"] == str(START_NS + STEP_NS)
+
+
+class Channels:
+    """Channels of a server that keep what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, int]] = []
+
+    def add_channel(self, topic: str, type_name: str, definition: bytes) -> Channels:
+        return self
+
+    def has_sinks(self) -> bool:
+        return True
+
+    def log(self, data: bytes, log_time: int) -> None:
+        self.sent.append((data, log_time))
+
+
+def test_live_messages_are_sent_at_their_times() -> None:
+    from mcaprl.recorder.viewer.live_sink import LiveSink
+
+    viewers: Any = Channels()
+    sink = LiveSink(viewers, ["/scene"])
+    scene, numbers = (sink.add_channel(topic, "", "") for topic in ("/scene", "/telemetry"))
+    now_ns = time.time_ns()
+    late_ns = now_ns + 10**9
+    hour_ns = now_ns + 3600 * 10**9
+    sink.write_messages([(scene, now_ns, b"a"), (numbers, now_ns, b"b"), (scene, late_ns, b"c")])
+    sink.write_messages([(numbers, hour_ns, b"d")])
+    sink.start()
+    sink.send(numbers, now_ns + 1, b"at once")
+    time.sleep(0.3)
+    sink.welcome()
+    time.sleep(0.3)
+    first = [data for data, _ in viewers.sent]
+    assert sorted(first) == [b"a", b"a", b"at once", b"b"], "/scene again for the new viewer"
+    time.sleep(max(0.0, late_ns / 1e9 - time.time()) + 0.3)
+    sink.close()
+    assert viewers.sent[4:] == [(b"c", late_ns)]
+
+
+def test_an_episode_in_training_is_shown_at_its_speed() -> None:
+    viewer_is_there()
+    env = make_sim("lane")
+    observation, _ = env.reset(seed=0)
+    description = LogMetadata.of_env(env)
+    stream = LiveStream(description, env.unwrapped, {"loss": "loss"}, port=0, speed=5.0)
+    with closing(env), closing(stream):
+        assert not stream.begin_episode(0, "p"), "nobody looks"
+        viewer = Watcher(stream.url)
+        assert stream.begin_episode(1, "p")
+        for k in range(4):
+            stream.look(env.unwrapped, 0.0)
+            stream.pause()
+            after, reward, *_ = env.step(1)
+            assert stream.show(LiveStep(1, k, observation, 1, float(reward), False, k == 3))
+            observation = after
+        stream.end_episode(EpisodeSummary(1, 4, 0.0, False, True, 0, 0, "off_lane"))
+        assert not stream.begin_episode(2, "p"), "the first episode is still on screen"
+        time.sleep(0.5)
+    seen = viewer.seen()["messages"]
+    times: dict[str, list[int]] = {}
+    for message in seen:
+        times.setdefault(message["topic"], []).append(int(message["time"]))
+    steps = times["/rl/step"]
+    # A step of 0.25 s lasts 50 ms; scenes are at most 20 a second, frames are 10 ms apart.
+    assert len(steps) == len(times["/scene"]) == 4
+    gaps_ns = np.diff(steps)
+    assert (gaps_ns >= 50_000_000).all()
+    assert len(times["/tf"]) == 4 + 3 * 4
+    assert [time_ns - steps[1] for time_ns in times["/tf"][1:6]] == [
+        -40_000_000,
+        -30_000_000,
+        -20_000_000,
+        -10_000_000,
+        0,
+    ]
+    assert times["/rl/phase"][1] == times["/scene/tracks"][0] == steps[-1] + 50_000_000
+    end = messages.decode(bytes_of(seen, "/rl/episode"), messages.EPISODE_TYPE)
+    assert (end.start_time_ns, end.end_time_ns) == (times["/rosout"][0], times["/rosout"][1])
+    warning = messages.decode(bytes_of(seen, "/rosout"), messages.LOG_TYPE)
+    assert (warning.level, warning.msg) == (
+        messages.WARN,
+        "episode 1 ends after 4 steps: off_lane, return 0",
+    )
+
+
+def bytes_of(seen: list[Any], topic: str) -> bytes:
+    """Return the last message of a topic."""
+    return base64.b64decode([m["bytes"] for m in seen if m["topic"] == topic][-1])
 
 
 def test_a_port_in_use_is_refused(log: Path) -> None:
