@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from mcaprl._version import __version__
+from mcaprl.cli.convert import convert
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
@@ -41,6 +42,7 @@ _COMMANDS = (
     annotate,
     export,
     replay,
+    convert,
     info,
     check,
     recover,

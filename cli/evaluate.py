@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, json_option, sim_options
+from mcaprl.cli.options import integer_option, json_option, mapping_options, sim_options
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
 from mcaprl.progress import terminal_bar
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
 
-_OF_DATA = ("gamma", "epsilon", "updates", "threads")
+_OF_DATA = ("gamma", "epsilon", "updates", "threads", "mapping", "trust_code")
 
 
 @click.command()
@@ -53,6 +53,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads")
     type=click.IntRange(1),
     help="With --data: number of threads of PyTorch and of the reader.  [default: 1]",
 )
+@mapping_options
 @click.option("--behavior", metavar="DATA", help="Logs whose returns are shown for comparison.")
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, json_option, trust_option
+from mcaprl.cli.options import integer_option, json_option, mapping_options, trust_option
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
 from mcaprl.progress import terminal_bar
 from mcaprl.texts import counted
@@ -25,11 +25,12 @@ _WITH_LOSSES = 3
 @integer_option(
     "--threads", "Number of threads that decompress chunks; useful for large logs.", least=1
 )
+@mapping_options
 def info(
-    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, threads: int
+    data: tuple[str, ...], report: Path | None, strict: bool, as_json: bool, **request: Any
 ) -> int:
     """Show the contents and problems of DATA: files, folders or globs of logs."""
-    found = mcaprl.info(data, report=report, threads=threads)
+    found = mcaprl.info(data, report=report, **request)
     if as_json:
         print_json(found.to_json())
     else:
@@ -46,9 +47,10 @@ def info(
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @json_option
 @integer_option("--threads", "Number of threads that decompress chunks.", least=1)
-def check(files: tuple[str, ...], as_json: bool, threads: int) -> int:
+@mapping_options
+def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
     """Read FILE... completely and list all problems. Exits with 1 if there are any."""
-    found = mcaprl.check(files, threads=threads)
+    found = mcaprl.check(files, **request)
     if as_json:
         print_json(found.to_json())
         return int(not found.ok)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
@@ -22,6 +23,21 @@ origin_option = click.option(
     " repeatedly.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+def mapping_options(command: F) -> F:
+    """Add the options for bags of other robots."""
+    code = click.option(
+        "--trust-code",
+        is_flag=True,
+        help="Trust in the mapping: import the Python function that it names.",
+    )
+    return click.option(
+        "--mapping",
+        type=click.Path(path_type=Path),
+        metavar="FILE",
+        help="Mapping of another robot's bag; see docs/bags.md.",
+    )(code(command))
 
 
 def sim_options(command: F) -> F:

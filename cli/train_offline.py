@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option
+from mcaprl.cli.options import integer_option, mapping_options
 from mcaprl.cli.settings import SettingsCommand
 from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_progress
@@ -45,6 +45,7 @@ def _configs() -> list[Settings]:
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
 @click.option("--other-data", is_flag=True, help="With --resume: allow other DATA.")
+@mapping_options
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.
 

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING
 
 import mcaprl.sims  # noqa: F401  (registers the environments)
 from mcaprl._version import __version__
+from mcaprl.api.data import open_data as open
 from mcaprl.errors import McaprlError
 from mcaprl.lazy import lazy_attributes
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.episode import Episode
-from mcaprl.recorder.dataset.open import open_logs as open
 from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
     from mcaprl.api.annotate import annotate
+    from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, layout, recover
@@ -42,6 +43,7 @@ __all__ = [
     "__version__",
     "annotate",
     "check",
+    "convert",
     "estimate",
     "evaluate",
     "export",
@@ -54,6 +56,7 @@ __all__ = [
     "recover",
     "render",
     "replay",
+    "suggest_mapping",
     "train",
     "train_online",
     "verify",
@@ -64,6 +67,7 @@ __getattr__ = lazy_attributes(
     __name__,
     {f"mcaprl.api.{name}": [name] for name in ("annotate", "estimate", "evaluate", "record")}
     | {
+        "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.api.logs": ["check", "info", "layout", "recover"],
         "mcaprl.api.policies": ["export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],

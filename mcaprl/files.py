@@ -277,6 +277,13 @@ def write_atomically(
         unfinished.write_bytes(content)
 
 
+def size_of(path: Path) -> int:
+    """Return the bytes of a file, or of all files in a folder."""
+    if not path.is_dir():
+        return path.stat().st_size
+    return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+
+
 def parse_json(text: str | bytes) -> Any:
     """Parse JSON; refuse nesting that is deeper than any file of this package needs.
 

@@ -1,22 +1,102 @@
-"""Types of the log arguments of the public API."""
+"""Logs and bags as arguments of the public API."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.dataset.image_cache import Storage
+from mcaprl.recorder.dataset.open import Episodes, open_logs
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.mapping.read import MappedBag
 
 Paths = str | Path | Sequence[str | Path]
 """A file, a folder or a glob of logs, or several of them."""
+MAPPING_NAME = "mapping.json"
+"""Copy of the mapping in the folder of a run that learned by it."""
 Data = Dataset | Paths
 """A dataset, or paths of logs."""
+MappingFile = str | Path | Mapping[str, Any]
+"""Path of a mapping file, or its keys and values."""
 
 
-def opened(data: Data, *, threads: int = 1) -> Dataset:
-    """Return a dataset unchanged, or read it from paths."""
-    return data if isinstance(data, Dataset) else open_logs(data, threads=threads)
+def open_data(
+    data: Paths,
+    *,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+    columns: Sequence[str] | None = None,
+    episodes: Episodes | None = None,
+    images: Storage = "auto",
+    threads: int = 1,
+) -> Dataset:
+    """Read logs, or another robot's bag by a mapping.
+
+    The CRCs of all chunks that are read are checked. If a log was cut off or is still being
+    written, its finished episodes are read, with a warning. Of several logs, those without a
+    finished episode are skipped, with a warning.
+
+    Args:
+        data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
+            the same spaces; their episodes are concatenated in the order of the files. With a
+            mapping: MCAP files of any writer, rosbag2 folders and databases, or ROS 1 bags.
+        mapping: Mapping that says which topics and fields of a bag are observations, actions,
+            rewards and ends; see docs/bags.md. None for logs of this package.
+        trust_code: Whether the mapping may name a Python function, which is imported.
+        columns: Keys to read of a Dict observation space, nested keys as `joints/q`; the dataset's
+            observation space contains only these. An empty sequence reads no observations. Actions,
+            rewards and end flags are always read. Default: all keys.
+        episodes: Index, slice or indexes of the episodes to read, counted over all logs and
+            returned in the logs' order. Default: all episodes.
+        images: Storage of image observations: `memory`; `mapped`, which leaves images on disk and
+            reads them when they are indexed (from an uncompressed log, otherwise from an
+            uncompressed copy that is written once beside the log); or `auto`, which is `mapped` if
+            the images would take more than half of the free memory.
+        threads: Number of threads that read chunks of a file.
+
+    Raises:
+        LogError: A file is missing, not an MCAP file, damaged, or has no finished episode.
+        SpaceError: The logs' spaces differ.
+        UsageError: A column or an episode does not exist, or the mapping does not fit the bag.
+        MissingExtraError: A mapping needs the packages of the `bags` extra.
+    """
+    if mapping is None:
+        return open_logs(data, columns=columns, episodes=episodes, images=images, threads=threads)
+    if columns is not None or episodes is not None or images == "mapped":
+        raise UsageError("columns, episodes and mapped images are for logs, not for a mapping")
+    return mapped(data, mapping, trust_code=trust_code).dataset
+
+
+def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:
+    """Read a bag by a mapping; errors as in `open_data`."""
+    import_extra("pydantic", "bags")
+    from mcaprl.recorder.mapping.read import read_bag
+
+    return read_bag(data, mapping, trust_code=trust_code)
+
+
+def mapping_tree(mapping: MappingFile) -> dict[str, Any]:
+    """Return the keys and values of a mapping, with defaults, as JSON types."""
+    from mcaprl.recorder.mapping.config import load_mapping
+
+    return load_mapping(mapping)[0].model_dump(mode="json", by_alias=True)
+
+
+def opened(
+    data: Data,
+    *,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+    threads: int = 1,
+) -> Dataset:
+    """Return a dataset unchanged, or read it from paths; see `open_data`."""
+    if isinstance(data, Dataset):
+        return data
+    return open_data(data, mapping=mapping, trust_code=trust_code, threads=threads)
 
 
 def named(data: Data) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.api.data import Data, named, opened
+from mcaprl.api.data import Data, MappingFile, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
 from mcaprl.api.train import torch_threads
@@ -68,6 +68,8 @@ def estimate(
     updates: int = 10_000,
     seed: int = 1_000_000,
     threads: int = 1,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
     progress: ProgressBar = no_progress,
 ) -> LogEstimates:
     """Estimate the discounted returns of policies from logs, with each estimator.
@@ -81,6 +83,8 @@ def estimate(
         updates: Number of gradient steps of the model that FQE, DR and WDR use.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
+        mapping: Mapping of another robot's bag; see `open`.
+        trust_code: Whether the mapping may name a Python function.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -95,7 +99,7 @@ def estimate(
     check_fraction(gamma=gamma, epsilon=epsilon)
     check_least(1, updates=updates, threads=threads)
     check_least(0, seed=seed)
-    dataset = opened(data, threads=threads)
+    dataset = opened(data, mapping=mapping, trust_code=trust_code, threads=threads)
     found = _policies(as_names(policies), dataset)
     config = replace(FQEConfig(), gamma=gamma, updates=updates)
     evaluator = OffPolicyEvaluator(dataset, config, seed)

@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcaprl.api.data import Paths
+from mcaprl.api.data import MappingFile, Paths, mapped
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
-from mcaprl.files import write_json
+from mcaprl.files import size_of, write_json
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -116,27 +116,41 @@ class LogInfo:
         ]
 
 
-def info(data: Paths, *, report: str | Path | None = None, threads: int = 1) -> LogInfo:
+def info(
+    data: Paths,
+    *,
+    report: str | Path | None = None,
+    threads: int = 1,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+) -> LogInfo:
     """Return facts about logs, and their problems.
 
     Args:
         data: File, folder or glob of logs, or several of them.
         report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
+        mapping: Mapping of another robot's bag; see `open`.
+        trust_code: Whether the mapping may name a Python function.
 
     Raises:
         LogError: A log cannot be read.
         MissingExtraError: The packages of the `report` extra are not installed.
         ReportError: The report cannot be written.
     """
-    paths = find_logs(data)
     if report is not None:
         import_extra("matplotlib", "report")
         import_extra("jinja2", "report")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        dataset = open_logs(paths, threads=threads)
-    found = _describe(dataset, paths, [str(warning.message) for warning in caught])
+        if mapping is None:
+            dataset, noted = open_logs(data, threads=threads), []
+            paths: Sequence[Path] = find_logs(data)
+        else:
+            dataset, result = mapped(data, mapping, trust_code=trust_code)
+            paths, noted = dataset.sources, result.problems()
+    warned = [str(warning.message) for warning in caught]
+    found = _describe(dataset, paths, [*warned, *map(str, noted)], is_bag=mapping is not None)
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
 
@@ -147,7 +161,9 @@ def info(data: Paths, *, report: str | Path | None = None, threads: int = 1) -> 
     return found
 
 
-def _describe(dataset: Dataset, paths: Sequence[Path], warned: Sequence[str]) -> LogInfo:
+def _describe(
+    dataset: Dataset, paths: Sequence[Path], warned: Sequence[str], *, is_bag: bool
+) -> LogInfo:
     statistics, findings = dataset.statistics, lint(dataset)
     return LogInfo(
         sources=tuple(paths),
@@ -167,11 +183,11 @@ def _describe(dataset: Dataset, paths: Sequence[Path], warned: Sequence[str]) ->
         behavior_prob=calibration(dataset.behavior_probs, dataset.action_space),
         policies=sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         ends=dict(statistics.ends),
-        size_bytes=sum(path.stat().st_size for path in paths),
+        size_bytes=sum(size_of(path) for path in paths),
         storage=dataset.storage,
         problems=[*warned, *(str(one) for one in findings if one.severity == "problem")],
         findings=findings,
-        moments=[moment for path in paths for moment in moments_of(path)],
+        moments=[] if is_bag else [moment for path in paths for moment in moments_of(path)],
     )
 
 
@@ -209,18 +225,33 @@ class CheckResult:
         return {"ok": self.ok, "problems": [problem.to_json() for problem in self.problems]}
 
 
-def check(data: Paths, *, threads: int = 1) -> CheckResult:
+def check(
+    data: Paths,
+    *,
+    threads: int = 1,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
+
+    With a mapping, the bag is read by it; values that are missing, too old or far from the named
+    actions are problems.
 
     Args:
         data: File, folder or glob of logs, or several of them. A path without logs is
             reported as a problem.
         threads: Number of threads that decompress chunks.
+        mapping: Mapping of another robot's bag; see `open`.
+        trust_code: Whether the mapping may name a Python function.
 
     Raises:
-        UsageError: `data` is empty, or `threads` is below 1.
+        UsageError: `data` is empty, `threads` is below 1, or the mapping does not fit the bag.
+        LogError: A bag that is read by a mapping cannot be read.
     """
     check_least(1, threads=threads)
+    if mapping is not None:
+        found_bag, report = mapped(data, mapping, trust_code=trust_code)
+        return CheckResult(found_bag.sources, (), tuple(report.problems()))
     names: Sequence[str | Path] = [data] if isinstance(data, str | Path) else data
     if not names:
         raise UsageError("no data: the list of files is empty")

@@ -7,12 +7,13 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.api.data import Data
+from mcaprl.api.data import MAPPING_NAME, Data, MappingFile, mapping_tree, open_data
 from mcaprl.api.environments import all_options
 from mcaprl.api.policies import TrainedPolicy, as_names, is_policy, load_policies
 from mcaprl.api.ranges import check_least, check_port, check_positive
 from mcaprl.api.replay import LiveAddress
-from mcaprl.errors import MissingExtraError, UsageError
+from mcaprl.errors import MissingExtraError, TrainingError, UsageError
+from mcaprl.files import write_json
 from mcaprl.progress import ProgressCallback
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
@@ -39,6 +40,8 @@ def train(
     resume: bool = False,
     follow: bool = False,
     other_data: bool = False,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
     on_data: Callable[[str, Dataset], None] = lambda algo, dataset: None,
     progress: ProgressCallback = lambda now: None,
     **settings: Any,
@@ -61,6 +64,9 @@ def train(
         resume: Whether training continues from the checkpoints in `out`.
         follow: Whether episodes that another process adds to the logs are used.
         other_data: Whether `resume` accepts checkpoints trained on other data.
+        mapping: Mapping of another robot's bag, which is stored in `out`; see `open`. Paths then
+            have no weights.
+        trust_code: Whether the mapping may name a Python function.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
         **settings: Settings of the algorithm. Missing settings have the defaults of the algorithm
@@ -98,7 +104,11 @@ def train(
     config = type(defaults)(**settings)
     with torch_threads(threads):
         growing, weights = None, None
-        if isinstance(data, Dataset):
+        if mapping is not None and not isinstance(data, Dataset):
+            if follow:
+                raise UsageError("follow needs logs, not a bag with a mapping")
+            dataset = open_data(as_names(data), mapping=mapping, trust_code=trust_code)
+        elif isinstance(data, Dataset):
             if follow:
                 raise UsageError("follow needs the paths of logs, not a dataset")
             dataset = data
@@ -122,6 +132,8 @@ def train(
             device=device,
             progress=progress,
         )
+    if mapping is not None:
+        write_json(out / MAPPING_NAME, mapping_tree(mapping), TrainingError)
     with suppress(MissingExtraError):
         draw_curves(out)
     return summaries

@@ -122,4 +122,4 @@ def _binned(
         between = [f"{low} to {high}" for low, high in itertools.pairwise(limits)]
         parts = [f"below {limits[0]}", *between, f"from {limits[-1]}"] if limits else ["any"]
         names.append([f"{word} {part}" for part in parts])
-    return values, tuple(", ".join(parts) for parts in itertools.product(*names))
+    return values, tuple(" and ".join(parts) for parts in itertools.product(*names))

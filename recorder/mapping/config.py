@@ -264,15 +264,17 @@ class Place:
         return f"{where}: {'.'.join(map(str, keys))}" if keys else where
 
 
-def load_mapping(path: str | Path) -> tuple[Mapping, Place]:
-    """Read a mapping file, and return it with the positions of its keys.
+def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Place]:
+    """Read a mapping file, or validate its keys and values; return it with their positions.
 
     Raises:
         UsageError: The file cannot be read, is not YAML, or has an unknown key or a wrong value;
             the message names file, line and key.
         MissingExtraError: The packages of the `bags` extra are not installed.
     """
-    yaml = import_extra("ruamel.yaml", "bags")
+    if not isinstance(source, str | Path):
+        return parse_mapping(source), Place()
+    path, yaml = source, import_extra("ruamel.yaml", "bags")
     try:
         tree = yaml.YAML(typ="rt").load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:

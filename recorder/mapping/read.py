@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from collections.abc import Mapping as MappingOf
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -38,7 +39,7 @@ class MappedBag(NamedTuple):
 
 def read_bag(
     data: str | Path | Sequence[str | Path],
-    mapping: Mapping | str | Path,
+    mapping: Mapping | str | Path | MappingOf[str, Any],
     *,
     trust_code: bool = False,
 ) -> MappedBag:
@@ -46,7 +47,7 @@ def read_bag(
 
     Args:
         data: MCAP file, rosbag2 folder, ROS 1 bag, or several; see `bags.bag.open_bag`.
-        mapping: Mapping, or path of a mapping file.
+        mapping: Mapping, path of a mapping file, or its keys and values.
         trust_code: Whether `reward` may name a function of a Python module, which is imported.
 
     Raises:

@@ -116,9 +116,11 @@ class StepReader:
                 f"{self._plan.place.of('clock', 'rate_hz')}: {count} steps between {first} and"
                 f" {last} ns: use another `time` or a lower rate"
             )
-        since_ns = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz))
-        found = first + since_ns.astype(np.int64)
-        return found
+        since_ns: NDArray[np.int64] = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz)).astype(
+            np.int64
+        )
+        since_ns += first
+        return since_ns
 
     def _values(
         self,

@@ -8,6 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.problem import Problem
+from mcaprl.texts import counted
+
+_MUCH = 0.1
+"""Share of the steps from which something missing is a problem."""
+
 
 @dataclass(frozen=True)
 class FieldReport:
@@ -33,6 +39,19 @@ class FieldReport:
         if len(known):
             median, largest = float(np.median(known)), float(known.max())
         return cls(topic, float(missing.mean()) if len(missing) else 1.0, median, largest)
+
+    def __str__(self) -> str:
+        """Return the line of the table."""
+        age = (
+            ""
+            if np.isnan(self.median_age_s)
+            else (f", {self.median_age_s:.3f} s old (median), at most {self.max_age_s:.3f} s")
+        )
+        return f"{self.topic}, missing {self.missing:.1%}{age}"
+
+
+def _dropped(lengths: list[int]) -> str:
+    return f"{len(lengths)}, at most {max(lengths)} steps" if lengths else "none"
 
 
 @dataclass(frozen=True)
@@ -72,6 +91,46 @@ class MappingReport:
             for name in ("median_age_s", "max_age_s"):
                 field[name] = field[name] if np.isfinite(field[name]) else None
         return found
+
+    def problems(self) -> list[Problem]:
+        """Return what makes the transitions doubtful, or leaves much of the bag out."""
+        found = [
+            Problem(
+                f"{name} is missing at {field.missing:.0%} of the steps",
+                field.topic,
+                next="give it `missing` or a larger `tolerance_s`, or leave it out",
+            )
+            for name, field in self.fields.items()
+            if field.missing > _MUCH
+        ]
+        if self.missing_actions > _MUCH:
+            what = f"{self.missing_actions:.0%} of the steps have no action"
+            found.append(Problem(what, "action", next="check the topic and `align`"))
+        if self.far_actions > _MUCH:
+            what = f"{self.far_actions:.0%} of the commands are far from every named action"
+            found.append(Problem(what, "action", next="name more commands, or use `edges`"))
+        if sum(self.dropped) > _MUCH * (self.steps + sum(self.dropped)):
+            episodes = counted(len(self.dropped), "short episode")
+            what = f"{episodes} with {counted(sum(self.dropped), 'step')} left out"
+            found.append(Problem(what, "episodes", next="check `gap_s`, the ends and `min_steps`"))
+        return found
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the names and texts of the facts."""
+        ends = ", ".join(f"{count} {reason}" for reason, count in self.ends.items())
+        rows = [
+            ("steps", f"{self.steps} of {self.clock_steps} of the clock"),
+            ("episodes", str(self.episodes)),
+            ("ends", ends or "none"),
+            ("episodes left out", _dropped(self.dropped)),
+            ("resets of the clock", str(self.clock_resets)),
+        ]
+        rows += [(name, str(field)) for name, field in self.fields.items()]
+        rows.append(("steps without action", f"{self.missing_actions:.1%}"))
+        if self.action_counts:
+            actions = ", ".join(f"{count} {name}" for name, count in self.action_counts.items())
+            rows.append(("actions", actions))
+        return [*rows, ("far commands", f"{self.far_actions:.1%}")]
 
     def why_empty(self) -> str:
         """Return why there are no episodes, in one line."""

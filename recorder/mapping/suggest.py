@@ -1,0 +1,185 @@
+"""A mapping file to begin with, from the topics of a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.bag import Bag, TopicInfo
+
+_NS_PER_S = 1e9
+# Words in the names of topics and types that are probably commands.
+_COMMAND_WORDS = ("cmd", "command", "action", "target", "setpoint", "ackermann", "control")
+_MAX_RATE_HZ, _MIN_RATE_HZ = 20.0, 1.0
+_MAX_OBSERVED = 12
+_SIZES = (8, 16, 32, 64)
+_NUMBERS = {"float32", "float64", "bool", *(f"{u}int{bits}" for u in ("", "u") for bits in _SIZES)}
+_SKIPPED = ("/rosout", "/parameter_events", "/tf", "/tf_static", "/diagnostics", "/clock")
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_LIKELY = {
+    "nav_msgs/msg/Odometry": (
+        "twist.twist.linear.x",
+        "twist.twist.angular.z",
+        "pose.pose.position.x",
+        "pose.pose.position.y",
+    ),
+    "sensor_msgs/msg/Imu": ("angular_velocity.z", "linear_acceleration.x"),
+    "sensor_msgs/msg/LaserScan": ("ranges[::10]",),
+    "sensor_msgs/msg/JointState": ("position", "velocity"),
+}
+"""Fields of common types that a policy is likely to observe."""
+
+
+class _Entry(NamedTuple):
+    """A line of the mapping, and the remark behind it."""
+
+    name: str
+    path: str
+    remark: str
+
+
+def suggested(bag: Bag) -> str:
+    """Return the text of a mapping file with the likely observations and action of a bag.
+
+    Everything else that can be read is a comment, with type and rate.
+
+    Raises:
+        LogError: The bag has no topic with numbers.
+    """
+    usable = [info for info in bag.topics.values() if info.count and not info.problem]
+    command = _command(usable)
+    observed = list(_observations(usable, command))
+    if not observed and command is None:
+        raise LogError(
+            f"{', '.join(map(str, bag.paths))}: no topic has numbers; topics:"
+            f" {', '.join(bag.topics) or 'none'}"
+        )
+    lines = [
+        "# Mapping of a bag to observations, actions and rewards. Edit it, and look at the result:",
+        "#   mcaprl convert BAG --mapping THIS_FILE --dry-run",
+        "time: log_time  # or publish_time, or header",
+        f"clock: {{rate_hz: {_rate(usable):g}}}",
+        "observation:",
+        *(f"  {name}: {{field: {path}}}  # {remark}" for name, path, remark in observed),
+    ]
+    lines += [f"  # camera: {{image: {info.name}, resize: [84, 84]}}  # {_remark(info)}"
+              for info in usable if info.type_name in _IMAGES]  # fmt: skip
+    lines += [
+        f"  # other: {{field: {path}}}  # {remark}" for path, remark in _others(usable, observed)
+    ]
+    lines += ["action:", *_action_lines(command, usable)]
+    first = observed[0].name if observed else "name"
+    lines += [
+        f'reward: "0"  # for example "next({first}) - {first}"',
+        "episodes:",
+        "  gap_s: 2.0",
+        "  # max_steps: 1000",
+        f'  # terminated: "{first} > 1"',
+        f'  # begin: "{first} != 0"',
+    ]
+    unreadable = [info for info in bag.topics.values() if info.problem]
+    lines += [f"# {info.name} cannot be read: {info.problem}" for info in unreadable]
+    return "\n".join(lines) + "\n"
+
+
+def _observations(topics: Iterable[TopicInfo], command: TopicInfo | None) -> Iterator[_Entry]:
+    """Yield the likely observations, each with a name of its own."""
+    names: set[str] = set()
+    for info in topics:
+        if info is command or info.name in _SKIPPED or info.type_name in _IMAGES:
+            continue
+        fields = _LIKELY.get(info.type_name) or _numbers(info)[:3]
+        for field in fields:
+            plain = field.split("[")[0]
+            if plain not in info.fields or len(names) == _MAX_OBSERVED:
+                continue
+            name = _name(info.name, plain, names)
+            names.add(name)
+            # Missing ranges of a scan are beyond its reach.
+            yield _Entry(name, _quoted(f"{info.name}.{field}"), _remark(info))
+
+
+def _others(topics: Iterable[TopicInfo], observed: list[_Entry]) -> Iterator[tuple[str, str]]:
+    """Yield the paths of all other numbers, with their topic's type and rate."""
+    known = {entry.path.strip('"').split("[")[0] for entry in observed}
+    for info in topics:
+        if info.name not in _SKIPPED and info.type_name not in _IMAGES:
+            for field in _numbers(info):
+                path = f"{info.name}.{field}"
+                if path not in known:
+                    yield _quoted(path), f"{info.fields[field]}, {_remark(info)}"
+
+
+def _command(topics: Iterable[TopicInfo]) -> TopicInfo | None:
+    """Return the topic that is most likely the command: by its name, then by its type."""
+
+    def likelihood(info: TopicInfo) -> int:
+        text = f"{info.name} {info.type_name}".lower()
+        is_twist = info.type_name.endswith(("/Twist", "/TwistStamped", "/AckermannDriveStamped"))
+        return 2 * any(word in text for word in _COMMAND_WORDS) + is_twist
+
+    found = max(topics, key=likelihood, default=None)
+    return found if found is not None and likelihood(found) and _numbers(found) else None
+
+
+def _action_lines(command: TopicInfo | None, topics: list[TopicInfo]) -> list[str]:
+    if command is None:
+        names = ", ".join(info.name for info in topics[:8])
+        return [f"  field: /TOPIC.FIELD  # no topic looks like a command; topics: {names}"]
+    numbers = _numbers(command)
+    if len(numbers) == 1 and command.fields[numbers[0]].startswith(("int", "uint", "bool")):
+        return [f"  field: {command.name}.{numbers[0]}  # {_remark(command)}"]
+    used = [field for field in numbers if field.endswith(("linear.x", "angular.z"))] or numbers[:2]
+    paths = ", ".join(f"{command.name}.{field}" for field in used)
+    edges = ", ".join("[-0.1, 0.1]" for _ in used)
+    low, high = (", ".join(limit for _ in used) for limit in ("-1", "1"))
+    return [
+        f"  fields: [{paths}]  # {_remark(command)}",
+        f"  edges: [{edges}]  # three bins for each field",
+        "  # or named commands, of which the nearest is the action:",
+        f"  # actions: {{stop: [{', '.join('0' for _ in used)}]}}",
+        f"  # or continuous: box: {{low: [{low}], high: [{high}]}}",
+    ]
+
+
+def _numbers(info: TopicInfo) -> list[str]:
+    """Return the scalar numbers of a topic, without those of headers."""
+    return [
+        name
+        for name, kind in info.fields.items()
+        if kind in _NUMBERS and not name.startswith(("header.", "stamp.", "timestamp"))
+    ]
+
+
+def _rate(topics: Iterable[TopicInfo]) -> float:
+    """Return a rate of steps: that of the slowest topic, but from 1 to 20 Hz."""
+    rates = [_rate_of(info) for info in topics if info.name not in _SKIPPED and info.count > 1]
+    slowest = min((rate for rate in rates if rate >= _MIN_RATE_HZ), default=_MIN_RATE_HZ)
+    return float(f"{min(slowest, _MAX_RATE_HZ):.2g}")
+
+
+def _rate_of(info: TopicInfo) -> float:
+    span_s = (info.last_ns - info.first_ns) / _NS_PER_S
+    return (info.count - 1) / span_s if span_s > 0 else 0.0
+
+
+def _remark(info: TopicInfo) -> str:
+    return f"{info.type_name or info.encoding}, {info.count} messages, {_rate_of(info):.3g} Hz"
+
+
+def _name(topic: str, field: str, used: set[str]) -> str:
+    """Return a name from the last parts of topic and field that is not used yet."""
+    words = [*topic.strip("/").split("/"), *field.split(".")]
+    words = ["".join(c if c.isalnum() else "_" for c in word) for word in words]
+    for count in range(min(3, len(words)), len(words) + 1):
+        name = "_".join([words[0], *words[len(words) - count + 1 :]]).lower()
+        name = name if not name[:1].isdigit() else f"t_{name}"
+        if name not in used:
+            return name
+    return f"{'_'.join(words).lower()}_{len(used)}"
+
+
+def _quoted(path: str) -> str:
+    """Return a path that YAML reads as text: brackets would begin a list."""
+    return f'"{path}"' if "[" in path or ":" in path else path
