@@ -59,7 +59,7 @@ def _tuned() -> dict[str, dict[str, Any]]:
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
 @click.option(
     "--live-speed",
-    default=4.0,
+    default=2.0,
     show_default=True,
     type=click.FloatRange(0, min_open=True),
     help="With --live: simulated seconds per second in the episodes that are shown.",

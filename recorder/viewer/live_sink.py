@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mcaprl.recorder.format.log_writer import Message, MessageSink
 from mcaprl.recorder.viewer.foxglove_server import ViewerServer
 
-_PERIOD_S = 1 / 50
+_PERIOD_S = 1 / 30
 
 
 class LiveSink(MessageSink):

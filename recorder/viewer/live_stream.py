@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,7 @@ from mcaprl.recorder.record.tracks import Tracks
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT, ViewerServer
 from mcaprl.recorder.viewer.live_sink import LiveSink
 
-DEFAULT_SPEED = 4.0
+DEFAULT_SPEED = 2.0
 MAX_STEPS = 2_000
 """Number of steps of an episode that are shown; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
@@ -106,7 +106,7 @@ class Pace:
     """
 
     share: float = 0.025
-    period_s: float = 1 / 20
+    period_s: float = 1 / 10
     clock: Callable[[], float] = time.perf_counter
     _next_s: float = field(default=-math.inf, init=False)
     _began_s: float = field(default=0.0, init=False)
@@ -162,8 +162,8 @@ class LiveStream(ViewerServer):
             port: Port on 127.0.0.1; 0 selects a free port.
             origins: Additional origins of web pages that may connect.
             speed: Simulated seconds per second.
-            pace: Limit on the time spent on an episode; its `period_s` is the shortest time between
-                two scenes, depth images or metrics.
+            pace: Limit on the time spent on episodes and metrics; its `period_s` is the shortest
+                time between two scenes, depth images, or messages of metrics.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -172,7 +172,7 @@ class LiveStream(ViewerServer):
         """
         super().__init__()
         self._speed, self._pace = speed, pace or Pace()
-        self._metrics_pace = replace(self._pace)
+        self._metrics_at_s = -math.inf
         self._step_ns = max(1, round(metadata.step_duration_ns / speed))
         self._sink = LiveSink(self, _KEPT_TOPICS)
         self._log = log = LogTopics(metadata, self._sink)
@@ -201,6 +201,8 @@ class LiveStream(ViewerServer):
         self._tracks = Tracks()
         self._start_ns = self._time_ns = self._next_ns = self._picture_ns = 0
         self._steps_shown = 0
+        if isinstance(source, SceneSource):
+            self._send_static(source, time.time_ns())
         self.start(name, port, origins)
         self._sink.start()
 
@@ -218,8 +220,12 @@ class LiveStream(ViewerServer):
         self._sink.write_messages(self._log.begin_messages(episode, policy, now_ns))
         return True
 
-    def look(self, source: object, return_so_far: float) -> None:
-        """Start the timer of the stream, and send the display messages before a step."""
+    def look(self, source: object, return_so_far: float) -> bool:
+        """Start the timer of the stream, and send the display messages before a step.
+
+        Returns:
+            Whether shapes and images were due, and the learner's values are.
+        """
         self._pace.begin()
         self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
         self._next_ns = time_ns + self._step_ns
@@ -233,6 +239,7 @@ class LiveStream(ViewerServer):
         if is_picture and isinstance(source, DepthSource) and self._depth is not None:
             self._put_image(self._depth, depth_millimeters(source.depth_image_m()))
             self._depth.write(_ROW, time_ns)
+        return is_picture
 
     def pause(self) -> None:
         """Stop the timer of the stream while the environment is stepped."""
@@ -268,15 +275,19 @@ class LiveStream(ViewerServer):
         self._pace.end()
 
     def wants_metrics(self) -> bool:
-        """Return whether there is time for metrics, and a viewer subscribes."""
-        return self._metrics_pace.due() and self._sink.has_viewers()
+        """Return whether metrics are due and a viewer subscribes; if so, start the timer."""
+        now_s = self._pace.clock()
+        if now_s < self._metrics_at_s or not self._sink.has_viewers():
+            return False
+        self._metrics_at_s = now_s + self._pace.period_s
+        self._pace.begin()
+        return True
 
     def show_metrics(self, metrics: Mapping[str, float]) -> None:
         """Send metrics of the learner now, by name; missing ones are NaN."""
-        self._metrics_pace.begin()
         data = telemetry_message([metrics.get(name, math.nan) for name in self._training])
         self._sink.send(self._topics[TRAINING_TOPIC], time.time_ns(), data)
-        self._metrics_pace.end()
+        self._pace.pause()
 
     def layout(self) -> dict[str, Any]:
         """Return the layout that shows these topics; see `layout.layout_of`."""
@@ -298,12 +309,10 @@ class LiveStream(ViewerServer):
         super().close()
 
     def _send_scene(self, source: SceneSource, *, is_picture: bool) -> None:
-        """Send frames and, if they are due, shapes; static ones if they have changed."""
+        """Send frames and, if they are due, shapes."""
         time_ns = self._time_ns
-        if self._steps_shown == 0 and source.static_scene() is not self._static_shapes:
-            self._static_shapes = source.static_scene()
-            self._emit(SCENE_STATIC, time_ns, marker_array(self._static_shapes))
-            self._emit(TF_STATIC, time_ns, transforms(source.static_frames(), 0))
+        if self._steps_shown == 0:
+            self._send_static(source, time_ns)
         if isinstance(source, MotionSource):
             for left_s, frames in source.motion():
                 moment_ns = time_ns - round(left_s / self._speed * 1e9)
@@ -314,6 +323,14 @@ class LiveStream(ViewerServer):
             self._tracks.add(frames[0].position)
         if is_picture:
             self._emit(SCENE, time_ns, marker_array(source.scene()))
+
+    def _send_static(self, source: SceneSource, time_ns: int) -> None:
+        """Send the static shapes and frames if they have changed."""
+        shapes = source.static_scene()
+        if shapes is not self._static_shapes:
+            self._static_shapes = shapes
+            self._emit(SCENE_STATIC, time_ns, marker_array(shapes))
+            self._emit(TF_STATIC, time_ns, transforms(source.static_frames(), 0))
 
     def _emit(self, topic: str, time_ns: int, data: bytes) -> None:
         self._sink.write_messages([(self._topics[topic], time_ns, data)])
