@@ -6,6 +6,7 @@ import base64
 import hashlib
 import importlib.util
 import json
+import math
 import re
 import shutil
 import signal
@@ -423,6 +424,29 @@ def test_an_episode_in_training_is_shown_at_its_speed() -> None:
         messages.WARN,
         "episode 1 ends after 4 steps: off_lane, return 0",
     )
+
+
+def test_the_rest_of_a_long_episode_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    viewer_is_there()
+    monkeypatch.setattr("mcaprl.recorder.viewer.live_stream.MAX_STEPS", 3)
+    env = make_sim("lane")
+    observation, _ = env.reset(seed=0)
+    description = LogMetadata.of_env(env)
+    stream = LiveStream(description, env.unwrapped, {"loss": "loss"}, port=0, speed=math.inf)
+    with closing(env), closing(stream):
+        viewer = Watcher(stream.url)
+        assert stream.begin_episode(7, "p")
+        shown = []
+        for k in range(3):
+            stream.look(env.unwrapped, 0.0)
+            stream.pause()
+            shown.append(stream.show(LiveStep(7, k, observation, 1, 0.0, False, False)))
+        time.sleep(0.3)
+    assert shown == [True, True, False]
+    seen = viewer.seen()["messages"]
+    warning = messages.decode(bytes_of(seen, "/rosout"), messages.LOG_TYPE)
+    assert warning.msg == "episode 7 is shown up to step 2 only"
+    assert len([m for m in seen if m["topic"] == "/rl/step"]) == 3
 
 
 def bytes_of(seen: list[Any], topic: str) -> bytes:
