@@ -54,13 +54,10 @@ class MemoryBag:
 def _column(values: Any) -> NDArray[Any]:
     if isinstance(values, np.ndarray):
         return values
-    if values and isinstance(values[0], str | bytes | list | tuple) and not _is_vector(values):
+    is_text = bool(values) and isinstance(values[0], str | bytes)
+    is_list = bool(values) and isinstance(values[0], list) and len(set(map(len, values))) > 1
+    if is_text or is_list:
         column = np.empty(len(values), object)
         column[:] = values
         return column
     return np.array(values, np.float64)
-
-
-def _is_vector(values: Sequence[Any]) -> bool:
-    lengths = {len(value) for value in values}
-    return len(lengths) == 1 and all(isinstance(part, int | float) for v in values for part in v)

@@ -1,0 +1,93 @@
+"""Mapping files: errors name file, line and key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mcaprl.errors import UsageError
+from mcaprl.recorder.mapping.config import Mapping, load_mapping, parse_mapping
+
+GOOD = """\
+clock: {rate_hz: 10}
+observation:
+  speed:
+    field: /odom.speed
+    clip: [0, 1]
+action: {field: /mode.data}
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "robot.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_good_mapping_has_defaults(tmp_path: Path) -> None:
+    found, place = load_mapping(written(tmp_path, GOOD))
+    assert found.time == "log_time"
+    assert found.observation["speed"].clip == (0, 1)
+    assert found.episodes.gap_s == 2
+    assert place.of("observation", "speed", "clip").endswith(":5: observation.speed.clip")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("clip:", "clap:", ":5: observation.speed.clap: unknown key; nearest: clip"),
+        ("clip: [0, 1]", "clip: [1, 0]", ":3: observation.speed: clip is the lowest value"),
+        (
+            "clip: [0, 1]",
+            "clip: [a, 1]",
+            ":5: observation.speed.clip.0: Input should be",
+        ),
+        ("action: {field: /mode.data}", "", ": action: this key is missing"),
+        ("rate_hz: 10", "rate_hz: -1", ":1: clock.rate_hz: Input should be greater than 0"),
+        ("rate_hz: 10", "rate_hz: 10, topic: /a", ":1: clock: give either rate_hz or topic"),
+        ("{field: /mode.data}", "{fields: [/a.b]}", "action: fields need one of actions, edges"),
+        ("{field: /mode.data}", "{fields: [/a.b], edges: [[1], [2]]}", "need 1 entries, as fields"),
+        ("{field: /mode.data}", "{fields: [/a.b], edges: [[2, 1]]}", "action: edges must rise"),
+        ("  speed:", "  a-b:", "observation has"),
+        ("clock:", "clocks:", ":1: clocks: unknown key; nearest: clock"),
+        ("clip: [0, 1]", "resize: [4, 4]", "observation.speed: resize is for images only"),
+        ("{rate_hz: 10}", "{rate_hz: 10", "not YAML"),
+    ],
+)
+def test_errors_name_file_line_and_key(tmp_path: Path, old: str, new: str, expected: str) -> None:
+    path = written(tmp_path, GOOD.replace(old, new))
+    if expected == "observation has":
+        expected = "'a-b' cannot be used in expressions"
+    with pytest.raises(UsageError) as error:
+        load_mapping(path)
+    assert str(path) in str(error.value)
+    assert expected in str(error.value)
+
+
+def test_files_that_are_no_mapping_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        load_mapping(tmp_path / "none.yaml")
+    with pytest.raises(UsageError, match="a mapping has keys and values"):
+        load_mapping(written(tmp_path, "- a\n- b\n"))
+    (tmp_path / "robot.yaml").write_bytes(b"\xff\xfe")
+    with pytest.raises(UsageError, match="is not UTF-8 text"):
+        load_mapping(tmp_path / "robot.yaml")
+
+
+def test_yaml_tags_make_no_objects(tmp_path: Path) -> None:
+    tagged = GOOD.replace("{rate_hz: 10}", "!!python/object/apply:os.system ['true']")
+    with pytest.raises(UsageError, match="clock"):
+        load_mapping(written(tmp_path, tagged))
+
+
+def test_a_mapping_without_a_file_is_named_mapping() -> None:
+    with pytest.raises(UsageError, match=r"^mapping: clock: this key is missing"):
+        parse_mapping({})
+
+
+def test_every_key_has_a_description() -> None:
+    pending = [Mapping.model_json_schema()]
+    for definition in (*pending, *pending[0]["$defs"].values()):
+        for name, key in definition.get("properties", {}).items():
+            assert key.get("description") or name in ("low", "high"), name
