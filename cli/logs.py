@@ -99,13 +99,14 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.argument("file", type=click.Path(path_type=Path, exists=True))
 @click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")
 @click.option("--camera", is_flag=True, help="With --scene: add metric depth images.")
 @click.option("--sim", help="With --scene: sim to step instead of the logged one.")
 @trust_option
+@mapping_options
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="File to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def annotate(file: Path, out: Path, **request: Any) -> None:

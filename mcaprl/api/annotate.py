@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import tempfile
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mcaprl.api.data import MappingFile, open_data
 from mcaprl.api.environments import sim_of
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction
 from mcaprl.errors import UsageError
+from mcaprl.files import check_target
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
@@ -46,9 +49,13 @@ def annotate(
     sim: str | None = None,
     trust_env: bool = False,
     overwrite: bool = False,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Annotation:
     """Copy a log, and add values of policies or the scene of the sim to each step.
+
+    With a mapping, the copy is the log that `convert` writes.
 
     Args:
         file: Path of the log.
@@ -61,6 +68,8 @@ def annotate(
         trust_env: Whether to import the module that the logged id names, and to pass the logged
             arguments to any environment.
         overwrite: Whether an existing file is replaced.
+        mapping: Mapping of another robot's bag; see `open`.
+        trust_code: Whether the mapping may name a Python function.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -75,6 +84,16 @@ def annotate(
     path, names, added = Path(file), as_names(policy), None
     if not names and not scene:
         raise UsageError("annotate needs --policy POLICY, --scene, or both")
+    if mapping is not None:
+        if scene:
+            raise UsageError("the scene of a bag cannot be added: there is no sim to step")
+        dataset = open_data(path, mapping=mapping, trust_code=trust_code)
+        check_target(Path(out), overwrite=overwrite)
+        with tempfile.TemporaryDirectory(prefix="mcaprl-") as folder:
+            log = Path(folder) / "converted.mcap"
+            dataset.save(log)
+            options: Any = {"gamma": gamma, "overwrite": overwrite, "progress": progress}
+            return annotate(log, out, policy=policy, **options)
     dataset = open_logs(path)
     found = values_topics(list(policy_names(names).values()))
     topics = dict(zip(dict.fromkeys(names), found.values(), strict=True))

@@ -26,6 +26,7 @@ CLASSES = ("Dataset", "Episode", "RecordMcap", "RecordVecMcap")
 FUNCTIONS = {
     "train-offline": ("train",),
     "train-online": ("train_online",),
+    "convert": ("convert", "suggest_mapping"),
     "evaluate": ("evaluate", "estimate"),
     "replay": ("replay", "verify", "render"),
 }
@@ -33,6 +34,8 @@ FUNCTIONS = {
 ONLY_OPTIONS = {
     "help": "click adds it",
     "json": "a function returns a dataclass, whose to_json the command prints",
+    "convert --dry-run": "out=None",
+    "convert --suggest": "it selects the function suggest_mapping",
     "info --strict": "an exit code",
     "replay --verify": "it selects the function verify",
     "record --no-scene": "scene=False",

@@ -1,0 +1,132 @@
+"""`convert`, and the commands that read bags by a mapping."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import OutputExistsError, UsageError
+from mcaprl.recorder.mapping.config import load_mapping
+from tests.support.bags import STEPS, speed, turn, write_rosbag1, write_rosbag2
+
+MAPPING = """\
+clock: {rate_hz: 10}
+observation:
+  speed: {field: /odom.twist.twist.linear.x}
+  yaw: {field: /odom.pose.pose.orientation, as: yaw}
+  place: {transform: base, in: odom}
+action:
+  fields: [/cmd_vel.linear.x, /cmd_vel.angular.z]
+  actions: {left: [1, 1], right: [1, -1]}
+reward: next(speed) - speed
+episodes: {terminated: speed > 5}
+meta: {policy: operator}
+"""
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    (tmp_path / "robot.yaml").write_text(MAPPING)
+    return write_rosbag2(tmp_path / "bag")
+
+
+def test_a_bag_is_opened_by_a_mapping(bag: Path, tmp_path: Path) -> None:
+    data = mcaprl.open(bag, mapping=tmp_path / "robot.yaml")
+    # The speed is 0.5 k at step k, so step 11 is the terminal one.
+    assert len(data) == STEPS - 1
+    np.testing.assert_allclose(data.observations[:, 0], [speed(k) for k in range(STEPS - 1)])
+    np.testing.assert_allclose(data.observations[:, 1], 0.1 * np.arange(STEPS - 1), rtol=1e-5)
+    np.testing.assert_allclose(data.observations[:, 2], np.arange(STEPS - 1), rtol=1e-6)
+    assert data.observation_names == ("speed", "yaw", "place_x", "place_y", "place_yaw")
+    assert data.actions.tolist() == [int(turn(k) < 0) for k in range(STEPS - 1)]
+    assert data.rewards.tolist() == [0.5] * (STEPS - 1)
+    assert data.terminated.tolist() == [False] * (STEPS - 2) + [True]
+    assert data.episodes[0].policy == "operator"
+    with pytest.raises(UsageError, match="are for logs, not for a mapping"):
+        mcaprl.open(bag, mapping=tmp_path / "robot.yaml", columns=[])
+
+
+def test_a_converted_bag_is_an_equal_log(bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "robot.mcap"
+    found = mcaprl.convert(bag, out, mapping=tmp_path / "robot.yaml")
+    assert mcaprl.open(out).fingerprint == found.dataset.fingerprint
+    assert not mcaprl.check(out).problems
+    with pytest.raises(OutputExistsError):
+        mcaprl.convert(bag, out, mapping=tmp_path / "robot.yaml")
+    with pytest.raises(UsageError, match=r"the name of a log ends with .mcap"):
+        mcaprl.convert(bag, tmp_path / "robot.hdf5", mapping=tmp_path / "robot.yaml")
+
+
+def test_every_form_of_bag_gives_the_same_log(bag: Path, tmp_path: Path) -> None:
+    mapping = tmp_path / "robot.yaml"
+    expected = mcaprl.open(bag, mapping=mapping).fingerprint
+    others = [write_rosbag2(tmp_path / "sqlite", "sqlite3"), write_rosbag1(tmp_path / "one.bag")]
+    assert [mcaprl.open(path, mapping=mapping).fingerprint for path in others] == [expected] * 2
+
+
+def test_commands_read_a_bag_by_a_mapping(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapping = ["--mapping", str(tmp_path / "robot.yaml")]
+    assert run(["info", str(bag), *mapping, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["steps"] == STEPS - 1
+    assert run(["check", str(bag), *mapping]) == 0
+    assert "1 file checked, no problems" in capsys.readouterr().out
+    assert run(["convert", str(bag), *mapping, "--dry-run"]) == 0
+    shown = capsys.readouterr().out
+    assert "11 of 12 of the clock" in shown
+    assert "6 left, 5 right" in shown
+    assert "'reward': 0.5" in shown
+    out = str(tmp_path / "out.mcap")
+    assert run(["convert", str(bag), out, *mapping]) == 0
+    assert f"{out}: 1 episode, 11 steps" in capsys.readouterr().out.replace("\n", "")
+    run_folder = tmp_path / "run"
+    request = ["train-offline", str(bag), *mapping, "--out", str(run_folder), "--algo", "bc"]
+    assert run([*request, "--updates", "3", "--batch-size", "4"]) == 0
+    assert json.loads((run_folder / "mapping.json").read_text())["reward"] == "next(speed) - speed"
+    assert "bc learns from 1 episode" in capsys.readouterr().out
+    request = ["annotate", str(bag), *mapping, "--policy", str(run_folder)]
+    assert run([*request, "--out", str(tmp_path / "values.mcap")]) == 0
+    assert "/rl/values has the values of" in capsys.readouterr().out
+    assert len(mcaprl.open(tmp_path / "values.mcap")) == STEPS - 1
+    assert not list(tmp_path.glob(".*"))
+    assert run([*request, "--scene", "--out", str(tmp_path / "scene.mcap")]) == 2
+    assert "there is no sim to step" in capsys.readouterr().err
+    (tmp_path / "robot.yaml").write_text(MAPPING.replace("terminated: speed > 5", "max_steps: 4"))
+    estimate = ["evaluate", "random", "--data", str(bag), *mapping, "--updates", "2", "--json"]
+    assert run(estimate) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 2
+
+
+def test_requests_that_lack_something_are_clear_errors(
+    bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapping = ["--mapping", str(tmp_path / "robot.yaml")]
+    assert run(["convert", str(bag), "out.mcap"]) == 2
+    assert "convert needs --mapping FILE, or --suggest" in capsys.readouterr().err
+    assert run(["convert", str(bag), *mapping]) == 2
+    assert "convert needs BAG and OUT, or --dry-run" in capsys.readouterr().err
+    (tmp_path / "robot.yaml").write_text(MAPPING.replace("/odom.twist", "/odom.twits", 1))
+    assert run(["convert", str(bag), "x.mcap", *mapping]) == 2
+    error = capsys.readouterr().err
+    assert "robot.yaml:3: observation.speed: /odom (nav_msgs/msg/Odometry) has no field" in error
+    assert "nearest: twist.twist.linear.x" in error
+    assert not Path("x.mcap").exists()
+
+
+def test_a_suggested_mapping_gives_a_dataset(bag: Path, tmp_path: Path) -> None:
+    path = tmp_path / "suggested.yaml"
+    text = mcaprl.suggest_mapping(bag)
+    path.write_text(text)
+    mapping, _ = load_mapping(path)
+    assert mapping.action.fields == ["/cmd_vel.linear.x", "/cmd_vel.angular.z"]
+    assert mapping.clock.rate_hz == 10
+    assert "# camera: {image: /camera/depth, resize: [84, 84]}" in text
+    data = mcaprl.open(bag, mapping=path)
+    assert len(data) == STEPS - 1
+    assert "odom_linear_x" in data.observation_names
