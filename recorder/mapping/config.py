@@ -50,10 +50,11 @@ class Quantity(_Part):
         default=None, description="Frame whose pose is looked up in `/tf`."
     )
     in_: str = Field(default="map", alias="in", description="Frame in which the pose is given.")
-    as_: Literal["yaw"] | None = Field(
+    as_: Literal["yaw", "count"] | None = Field(
         default=None,
         alias="as",
-        description="`yaw` converts a quaternion to its angle about z, radians.",
+        description="`yaw` converts a quaternion to its angle about z, radians; `count` is the"
+        " number of messages of the topic `field` so far, for events.",
     )
     align: Alignment = Field(
         default="last",

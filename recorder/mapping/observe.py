@@ -6,10 +6,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcaprl.recorder.bags.bag import Bag
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, Matches, during, interpolated, last, nearest
 from mcaprl.recorder.mapping.config import Quantity
 from mcaprl.recorder.mapping.paths import FieldPath, as_numbers, field_path, topic_of
@@ -59,6 +59,8 @@ def source_of(bag: Bag, quantity: Quantity) -> Source:
     if quantity.transform is not None:
         return Source(topic_of(bag, TF if TF in bag.topics else TF_STATIC), (), None)
     assert quantity.field is not None, "the mapping was validated"
+    if quantity.as_ == "count":
+        return Source(topic_of(bag, quantity.field), (), None)
     path = field_path(bag, quantity.field)
     if quantity.as_ == "yaw":
         fields = tuple(f"{path.field}.{axis}" for axis in _QUATERNION)
@@ -99,6 +101,10 @@ def values_of(
             quantity.transform, quantity.in_, steps_ns, quantity.align, quantity.tolerance_s
         )
         return _shaped(quantity, found, np.isnan(age_s), age_s)
+    if quantity.as_ == "count":
+        counts = np.searchsorted(run.times_ns, steps_ns, side="right").astype(np.float64)
+        nothing = np.zeros(len(counts), bool)
+        return _shaped(quantity, counts, nothing, nothing.astype(np.float64))
     if quantity.image is not None:
         match = _match(quantity, run, steps_ns, ends_ns)
         rows = _rows(run, match)

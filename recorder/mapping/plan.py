@@ -45,6 +45,7 @@ class Plan:
         reasons: Conditions of the reasons, by reason.
         reward: Function that computes the rewards.
         streams: Messages of the used topics.
+        constants: Constants of the used types by name; a name with several values is left out.
     """
 
     def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
@@ -83,6 +84,7 @@ class Plan:
         with place.named("reward"):
             self.reward = _reward_of(mapping.reward, trust_code=trust_code)
         self.streams = self._opened()
+        self.constants = self._constants()
 
     def _wanted(self, keys: tuple[str, ...], quantity: Quantity) -> Wanted:
         with self.place.named(*keys):
@@ -91,6 +93,13 @@ class Plan:
     def _expression(self, keys: tuple[str, ...], text: str) -> Expression:
         with self.place.named(*keys):
             return Expression(text)
+
+    def _constants(self) -> dict[str, NDArray[Any]]:
+        found: dict[str, set[int]] = {}
+        for topic in self.streams:
+            for name, value in self.bag.topics[topic].constants.items():
+                found.setdefault(name, set()).add(value)
+        return {name: np.array(min(each)) for name, each in found.items() if len(each) == 1}
 
     def _opened(self) -> dict[str, TopicStream]:
         fields: dict[str, set[str]] = {}

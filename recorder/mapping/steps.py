@@ -69,9 +69,12 @@ class StepReader:
             found = self._values(plan.behavior_prob, number, times_ns, ends_ns)
             probs = found.values.astype(np.float32)
         columns = {
-            name: values.values
-            for name, values in quantities.items()
-            if plan.quantities[name].quantity.image is None
+            **plan.constants,
+            **{
+                name: values.values
+                for name, values in quantities.items()
+                if plan.quantities[name].quantity.image is None
+            },
         }
         if actions.values.ndim == 1:
             columns["action"] = actions.values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -190,6 +191,32 @@ def test_a_rising_edge_begins_an_episode() -> None:
     ).dataset
     assert data.observations.ravel().tolist() == [1, 2, 3, 6, 7]
     assert [episode.reason for episode in data.episodes] == ["truncated", "end_of_data"]
+
+
+def test_an_event_begins_an_episode() -> None:
+    times = list(range(8))
+    bag = MemoryBag(
+        {
+            "/odom": (times, {"speed": [float(t) for t in times]}),
+            "/mode": (times, {"data": [0.0] * 8}),
+            "/start/_service_event": ([0.5, 4.5], {"info.event_type": [0.0, 0.0]}),
+        }
+    )
+    data = read(
+        bag,
+        fields={"starts": {"field": "/start/_service_event", "as": "count"}},
+        episodes={"begin": "next(starts) > starts"},
+    ).dataset
+    assert [e.observations.ravel().tolist() for e in data.episodes] == [[0, 1, 2], [4, 5, 6]]
+    assert data.episodes[0].reason == "restarted"
+
+
+def test_constants_of_the_types_are_names_in_expressions() -> None:
+    bag = drive()
+    info = bag.topics["/mode"]
+    bag.topics["/mode"] = dataclasses.replace(info, constants={"TURBO": 1})
+    data = read(bag, reward="7 if action == TURBO else 0").dataset
+    assert data.rewards.tolist() == [0, 7, 0, 7, 0]
 
 
 def test_short_episodes_are_dropped_and_reported() -> None:
