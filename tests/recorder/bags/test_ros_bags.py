@@ -29,6 +29,7 @@ FORMS: dict[str, Callable[[Path], Path]] = {
     "sqlite3 folder": lambda path: write_rosbag2(path / "bag", "sqlite3"),
     "sqlite3 file": lambda path: next(write_rosbag2(path / "bag", "sqlite3").glob("*.db3")),
     "compressed file": lambda path: write_rosbag2(path / "bag", "sqlite3", "FILE"),
+    "compressed mcap": lambda path: write_rosbag2(path / "bag", "mcap", "FILE"),
     "compressed messages": lambda path: write_rosbag2(path / "bag", "sqlite3", "MESSAGE"),
     "ROS 1": lambda path: write_rosbag1(path / "one.bag"),
     "odd name": lambda path: write_rosbag2(path / "a bag (1) #2"),

@@ -1,0 +1,115 @@
+"""Definitions in bags: IDL, ROS 1 in MCAP, missing types, and encodings that are not supported."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.bags.bag import open_bag
+from mcaprl.recorder.bags.ros import RosDecoder
+from tests.support.bags import START_NS, STORE1, STORE2
+
+IDL = """\
+================================================================================
+IDL: demo_msgs/msg/Level
+module demo_msgs { module msg {
+  module Level_Constants { const uint8 HIGH = 3; };
+  struct Level { uint8 level; double ratio; sequence<float> parts; };
+}; };
+"""
+
+
+def write_mcap(path: Path, channels: list[tuple[str, str, str, str, str, bytes]]) -> Path:
+    """Write one message for each topic, type, schema encoding, definition, encoding and data."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for topic, name, schema_encoding, text, encoding, data in channels:
+            schema = writer.register_schema(name, schema_encoding, text.encode())
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, START_NS, data, START_NS + 5)
+        writer.finish()
+    return path
+
+
+def vector(store: Any, kind: str = "geometry_msgs/msg/Vector3") -> Any:
+    return store.types[kind](1.0, 2.0, 3.0)
+
+
+def test_idl_definitions(tmp_path: Path) -> None:
+    decoder = RosDecoder("demo_msgs/msg/Level", IDL, encoding="ros2idl")
+    assert decoder.fields == {"level": "uint8", "ratio": "float64", "parts": "float32[]"}
+    message = decoder._store.types["demo_msgs/msg/Level"](2, 0.5, np.array([1, 2], np.float32))
+    data = bytes(decoder._store.serialize_cdr(message, "demo_msgs/msg/Level"))
+    path = write_mcap(
+        tmp_path / "idl.mcap", [("/level", "demo_msgs/msg/Level", "ros2idl", IDL, "cdr", data)]
+    )
+    with closing(open_bag(path)) as bag:
+        found = bag.read("/level", ["level", "ratio", "parts", "publish_time"]).columns
+        assert (found["level"][0], found["ratio"][0]) == (2, 0.5)
+        assert found["parts"].tolist() == [[1.0, 2.0]]
+        assert found["publish_time"].tolist() == [START_NS + 5]
+
+
+def test_ros1_messages_in_mcap(tmp_path: Path) -> None:
+    text, _ = STORE1.generate_msgdef("geometry_msgs/msg/Vector3", ros_version=1)
+    data = bytes(STORE1.serialize_ros1(vector(STORE1), "geometry_msgs/msg/Vector3"))
+    path = write_mcap(
+        tmp_path / "one.mcap", [("/v", "geometry_msgs/Vector3", "ros1msg", text, "ros1", data)]
+    )
+    with closing(open_bag(path)) as bag:
+        found = bag.read("/v", ["x", "z"]).columns
+        assert [found["x"].tolist(), found["z"].tolist()] == [[1.0], [3.0]]
+
+
+def test_known_types_need_no_definition_and_others_are_named(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/Vector3"
+    data = bytes(STORE2.serialize_cdr(vector(STORE2), kind))
+    broken = "geometry_msgs/Vector3 inner\nacme_msgs/Wheel wheel\n"
+    path = write_mcap(
+        tmp_path / "types.mcap",
+        [
+            ("/known", kind, "ros2msg", "", "cdr", data),
+            ("/unknown", "acme_msgs/msg/Robot", "ros2msg", "", "cdr", data),
+            ("/nested", "acme_msgs/msg/Car", "ros2msg", broken, "cdr", data),
+            ("/flat", "fb.Thing", "flatbuffer", "", "flatbuffer", data),
+        ],
+    )
+    with closing(open_bag(path)) as bag:
+        assert bag.read("/known", ["y"]).columns["y"].tolist() == [2.0]
+        problems = {name: topic.problem for name, topic in bag.topics.items()}
+        assert problems["/known"] == ""
+        assert "acme_msgs/msg/Robot: its definition is missing" in problems["/unknown"]
+        assert "the definition of the nested type acme_msgs/msg/Wheel is mi" in problems["/nested"]
+        assert "encoding 'flatbuffer'" in problems["/flat"]
+        assert bag.topics["/flat"].count == 1
+        with pytest.raises(LogError, match="/unknown cannot be read: acme_msgs/msg/Robot"):
+            bag.read("/unknown", ["x"])
+
+
+def test_a_topic_of_several_types_costs_only_itself(tmp_path: Path) -> None:
+    kinds = ("geometry_msgs/msg/Vector3", "geometry_msgs/msg/Point")
+    channels = [
+        (topic, kind, "ros2msg", "", "cdr", bytes(STORE2.serialize_cdr(vector(STORE2, kind), kind)))
+        for topic, kind in (("/mixed", kinds[0]), ("/mixed", kinds[1]), ("/one", kinds[0]))
+    ]
+    with closing(open_bag(write_mcap(tmp_path / "mixed.mcap", channels))) as bag:
+        assert "messages of several types" in bag.topics["/mixed"].problem
+        assert bag.topics["/mixed"].count == 2
+        assert bag.read("/one", ["x"]).columns["x"].tolist() == [1.0]
+
+
+def test_damaged_messages_name_their_topic(tmp_path: Path) -> None:
+    kind = "geometry_msgs/msg/Vector3"
+    path = write_mcap(tmp_path / "bad.mcap", [("/v", kind, "ros2msg", "", "cdr", b"\0\1\0\0abc")])
+    with (
+        closing(open_bag(path)) as bag,
+        pytest.raises(LogError, match="/v: 7 bytes are not a "),
+    ):
+        bag.read("/v", ["x"])
