@@ -18,7 +18,7 @@ help:
 	@echo "make bench            measure speed relative to other libraries"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
-	@echo "make docs             generate docs/cli.md, docs/api.md and the images of the docs"
+	@echo "make docs             generate the references and the images of the docs"
 	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
 	@echo "make clean            remove the environments and everything that was built"
 

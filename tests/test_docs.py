@@ -30,7 +30,9 @@ def _generator() -> ModuleType:
     return module
 
 
-@pytest.mark.parametrize(("page", "generate"), [("cli", "command"), ("api", "api")])
+@pytest.mark.parametrize(
+    ("page", "generate"), [("cli", "command"), ("api", "api"), ("mapping", "mapping")]
+)
 def test_generated_references_are_up_to_date(page: str, generate: str) -> None:
     pytest.importorskip("matplotlib")
     text = getattr(_generator(), f"{generate}_reference")()
@@ -44,6 +46,26 @@ def test_readme_code_runs(
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     exec(compile(code, "README.md", "exec"), {})
     assert "Dataset(CartPole-v1: 10 episodes" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:0 updates of the target network")
+def test_bags_page_code_and_commands_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "bags.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    exec(compile(code, "bags.md", "exec"), {})
+    (mapping,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert run(["convert", "--suggest", "bag"]) == 0
+    Path("suggested.yaml").write_text(capsys.readouterr().out)
+    assert run(["convert", "bag", "--mapping", "suggested.yaml", "--dry-run"]) == 0
+    Path("robot.yaml").write_text(mapping)
+    commands = re.findall(r"^ *mcaprl (.*robot.yaml.*)$", page, re.MULTILINE)
+    for command in commands[1:]:
+        options = ["--updates", "20"] if command.startswith(("train", "evaluate")) else []
+        assert run([*shlex.split(command), *options]) == 0, command
+    assert "3 episodes" in capsys.readouterr().out
 
 
 def test_sims_page_code_runs(capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,8 +100,8 @@ class Quantity(_Part):
 class Limits(_Part):
     """Limits of continuous actions."""
 
-    low: list[float]
-    high: list[float]
+    low: list[float] = Field(description="Lowest value of each field.")
+    high: list[float] = Field(description="Highest value of each field.")
 
 
 class Action(_Part):

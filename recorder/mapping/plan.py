@@ -24,7 +24,7 @@ Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
 
 
 class Wanted(NamedTuple):
-    """A quantity, where it stands in the mapping, and where it comes from."""
+    """A quantity, its keys in the mapping, and its source."""
 
     keys: tuple[str, ...]
     quantity: Quantity
@@ -111,7 +111,7 @@ class Plan:
                 fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
         gap_s = self.mapping.episodes.gap_s
         return {
-            # Messages of transforms have no time of their own, but one for each frame.
+            # Messages of transforms have a time for each frame.
             topic: TopicStream(
                 self.bag,
                 topic,

@@ -32,7 +32,7 @@ _LIKELY = {
 
 
 class _Entry(NamedTuple):
-    """A line of the mapping, and the remark behind it."""
+    """A line of the mapping, and the remark at its end."""
 
     name: str
     path: str
@@ -84,7 +84,7 @@ def suggested(bag: Bag) -> str:
 
 
 def _observations(topics: Iterable[TopicInfo], command: TopicInfo | None) -> Iterator[_Entry]:
-    """Yield the likely observations, each with a name of its own."""
+    """Yield the likely observations, each with a unique name."""
     names: set[str] = set()
     for info in topics:
         if info is command or info.name in _SKIPPED or info.type_name in _IMAGES:
