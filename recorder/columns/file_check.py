@@ -160,11 +160,10 @@ def check_file(reader: McapReader) -> list[Problem]:
 
 
 def _check_data_end(reader: McapReader, offset: int, content: memoryview) -> list[Problem]:
-    if len(content) != 4 or (
-        reader.summary_start and offset + RECORD_HEADER_BYTES + 4 != reader.summary_start
-    ):
+    record_end = offset + RECORD_HEADER_BYTES + len(content)
+    if len(content) < 4 or (reader.summary_start and record_end != reader.summary_start):
         return [Problem("the data section's end is damaged", f"byte {offset}")]
-    (crc,) = struct.unpack("<I", content)
+    (crc,) = struct.unpack_from("<I", content)
     if crc and crc32(reader.view[:offset]) != crc:
         where = f"bytes 0 to {offset}"
         return [Problem("the data section does not match its CRC", where)]

@@ -384,11 +384,17 @@ class McapReader:
     def _find_topics_in_chunks(self) -> None:
         """Search chunks for schemas and channels that are stored nowhere else."""
         for chunk in self.chunks:
-            found = list(map(self.channels.get, chunk.message_index_offsets))
-            is_known = all(channel and channel.schema_id in self.schemas for channel in found)
-            if not (is_known if found else self._summary_has_topics):
+            # A chunk without message indexes may contain any channel.
+            ids = chunk.message_index_offsets or self.channels
+            found = [self.channels.get(number) for number in ids]
+            is_known = all(channel and self._has_schema(channel) for channel in found)
+            if not is_known or not (chunk.message_index_offsets or self._summary_has_topics):
                 for topic in self._contents_of(chunk).topics:
                     self._keep(topic)
+
+    def _has_schema(self, channel: Channel) -> bool:
+        # The schema id 0 means no schema.
+        return channel.schema_id == 0 or channel.schema_id in self.schemas
 
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
         """Return whether the summary has this schema or channel; both records begin with an id."""

@@ -37,6 +37,9 @@ from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RE
 RECORD_HEADER = struct.Struct("<BQ")
 # The first fields of a message: channel, sequence number, log_time.
 MESSAGE_START = struct.Struct("<HIQ")
+# An attachment: two times, the lengths and bytes of name, media type and data, and a CRC.
+_ATTACHMENT_TIMES_BYTES = 16
+_TEXT_LENGTH, _DATA_LENGTH, _CRC = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I")
 _FOOTER_BYTES = RECORD_HEADER_BYTES + 20
 _PARSERS: dict[int, Any] = {
     Opcode.HEADER: Header,
@@ -112,9 +115,18 @@ def parse_record(opcode: int, content: memoryview) -> Any:
 
 
 def is_intact_attachment(content: memoryview) -> bool:
-    """Return whether an Attachment record matches its CRC or has none."""
-    (crc,) = struct.unpack("<I", content[-4:]) if len(content) >= 4 else (1,)
-    return not crc or crc32(content[:-4]) == crc
+    """Return whether an Attachment record matches its CRC or has none.
+
+    Bytes after the CRC are ignored.
+    """
+    end = _ATTACHMENT_TIMES_BYTES
+    try:
+        for length in (_TEXT_LENGTH, _TEXT_LENGTH, _DATA_LENGTH):
+            end += length.size + length.unpack_from(content, end)[0]
+        (crc,) = _CRC.unpack_from(content, end)
+    except (struct.error, OverflowError):
+        return False
+    return not crc or crc32(content[:end]) == crc
 
 
 @dataclass
