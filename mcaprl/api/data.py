@@ -37,8 +37,8 @@ def open_data(
     """Read logs, or another robot's bag by a mapping.
 
     The CRCs of all chunks that are read are checked. If a log was cut off or is still being
-    written, its finished episodes are read, with a warning. Of several logs, those without a
-    finished episode are skipped, with a warning.
+    written, its finished episodes are read, with a warning. If there are several logs, those
+    without a finished episode are skipped, with a warning.
 
     Args:
         data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
@@ -47,15 +47,15 @@ def open_data(
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
-        columns: Keys to read of a Dict observation space, nested keys as `joints/q`; the dataset's
-            observation space contains only these. An empty sequence reads no observations. Actions,
-            rewards and end flags are always read. Default: all keys.
+        columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
+            key. The dataset's observation space contains only these. An empty sequence reads no
+            observations. Actions, rewards and end flags are always read. Default: all keys.
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
-        images: Storage of image observations: `memory`; `mapped`, which leaves images on disk and
-            reads them when they are indexed (from an uncompressed log, otherwise from an
-            uncompressed copy that is written once beside the log); or `auto`, which is `mapped` if
-            the images would take more than half of the free memory.
+        images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
+            on disk and reads them when they are indexed. If the log is compressed, this needs an
+            uncompressed copy of the images, which is written once beside the log. `auto` is
+            `mapped` if the images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 
     Raises:

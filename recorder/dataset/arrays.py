@@ -34,7 +34,7 @@ def description_of(
     observation_space: spaces.Space[Any] | None,
     action_space: spaces.Space[Any] | None,
 ) -> LogMetadata:
-    """Return the metadata of arrays; see `Dataset.from_arrays`."""
+    """Return log metadata for the arguments of `Dataset.from_arrays`."""
     if observation_space is None and action_space is None:
         observation_space, action_space = _registered_spaces(env_id, observations)
     return LogMetadata(
@@ -48,7 +48,7 @@ def description_of(
 def columns_of_arrays(
     description: LogMetadata, observations: Any, next_observations: Any, given: Mapping[str, Any]
 ) -> Transitions:
-    """Return the columns of arrays, `given` by the names of `STEP_COLUMNS`.
+    """Convert arrays to columns; `given` maps the names in `STEP_COLUMNS` to arrays.
 
     Raises:
         SpaceError: Lengths or shapes do not agree with each other or with the spaces.
@@ -95,7 +95,7 @@ def columns_of_arrays(
 def _registered_spaces(
     env_id: str, observations: Any
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]] | tuple[None, None]:
-    """Return the spaces of a registered environment that has observations of these shapes."""
+    """Return the environment's spaces if it is registered and the observation shapes match."""
     if env_id not in gym.registry:
         return None, None
     try:
@@ -103,13 +103,13 @@ def _registered_spaces(
             leaves = observation_leaves(env.observation_space)
             fits = all(leaf.of(observations).shape[1:] == leaf.shape for leaf in leaves)
             return (env.observation_space, env.action_space) if fits else (None, None)
-    # An environment may lack its own dependencies, and the observations its keys.
+    # A dependency of the environment may not be installed, or an observation key may be missing.
     except Exception:
         return None, None
 
 
 def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
-    """Return the columns with log_times that increase by one step from frame to frame."""
+    """Replace the log_times: the first is `start_ns`, and each frame adds `step_ns`."""
     times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
     first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
     episodes = tuple(
@@ -126,7 +126,7 @@ def _space_of(observations: Any) -> spaces.Space[Any]:
 
 
 def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
-    """Return a Discrete space up to the largest integer, or an unbounded Box.
+    """Infer a Discrete space from integers (N,), or an unbounded Box from other arrays.
 
     Raises:
         SpaceError: An integer is negative, or the array is not numeric.
@@ -145,7 +145,7 @@ def box_of(array: NDArray[Any]) -> spaces.Box:
         low, high = int(np.iinfo(array.dtype).min), int(np.iinfo(array.dtype).max)
         return spaces.Box(low, high, array.shape[1:], array.dtype.type)
     if kind != "f":
-        raise SpaceError(f"no Box for an array of {array.dtype}; pass the space")
+        raise SpaceError(f"no Box can hold an array of {array.dtype}; pass the space")
     return spaces.Box(-np.inf, np.inf, array.shape[1:], array.dtype.type)
 
 

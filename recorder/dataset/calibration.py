@@ -1,10 +1,10 @@
 """Calibration of logged behavior probabilities.
 
 A log contains only the probability p of the action taken. If actions are drawn with probabilities
-p, E[1 / p] is the number of actions with p > 0. For a range of probabilities, the sum of 1 / p over
-the steps in the range, divided by the number of all steps, is the mean number of actions per state
-whose probability is in the range. For example, an epsilon-greedy policy over nine actions has one
-action of high probability and eight of low probability.
+p, E[1 / p] is the number of actions with p > 0. The same sum over only those steps whose p is in a
+range, divided by the number of all steps, estimates how many actions per state have a probability
+in that range. For example, an epsilon-greedy policy over nine actions has one action of high
+probability and eight of low probability.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Calibration:
 
     Attributes:
         available: Number of actions in the action space.
-        actions: Number of actions implied by the probabilities, the mean of 1 / p. Smaller than
-            `available` if some actions are never taken; larger, beyond chance, only if the logged
+        actions: Mean of 1 / p, an estimate of the number of actions. It is smaller than `available`
+            if some actions are never taken. It is significantly larger only if the logged
             probabilities are too small.
         error: Standard error of `actions`.
         smallest: Smallest logged probability.
@@ -68,9 +68,9 @@ class Calibration:
     def possible(self) -> bool:
         """Whether the probabilities are consistent with the number of actions.
 
-        With A actions, a step draws an action of probability p or less with a probability of at
-        most A p. This bounds the smallest probability without the standard error, which a few tiny
-        probabilities inflate.
+        With A actions, the chance that a step draws an action of probability p or less is at most
+        A p. The smallest probability is checked against this bound, because a few tiny
+        probabilities inflate the standard error and so hide the problem.
         """
         drawable = self.smallest * self.available * self.steps >= _LEAST_CHANCE
         return drawable and (self.actions <= self.available + _STANDARD_ERRORS * self.error + 1e-6)

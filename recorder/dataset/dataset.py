@@ -155,7 +155,7 @@ class Dataset:
 
     @cached_property
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) index k of each transition in `frames`: observation k, next observation k + 1."""
+        """(N,) index k into `frames`: row k is the observation, row k + 1 the next observation."""
         return self._transitions.frame_of_step()
 
     @property
@@ -244,7 +244,7 @@ class Dataset:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of spaces and transitions, independent of their file."""
+        """SHA-256 of the spaces and transitions; file names and compression do not affect it."""
         columns = self._transitions
         digest = hashlib.sha256(space_to_json(self.observation_space).encode())
         digest.update(space_to_json(self.action_space).encode())

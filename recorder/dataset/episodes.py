@@ -16,13 +16,13 @@ from mcaprl.recorder.format.reading import Columns, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
-"""Fields of a record's episode, its step, and whether it is the final record."""
+"""Fields of `/rl/step` that place a record: its episode, its step, and the final-record flag."""
 # Number of rows of a column that fit into the processor's cache.
 _BLOCK_ROWS = 2**15
 
 
 def time_order(topic: Topic) -> NDArray[np.int64] | None:
-    """Return the rows of a topic sorted by log_time; None if they are already sorted."""
+    """Return the row indexes that sort a topic by log_time; None if it is already sorted."""
     times = topic.times
     for start in range(0, len(times), _BLOCK_ROWS):
         block = times[start : start + _BLOCK_ROWS + 1]
@@ -32,10 +32,10 @@ def time_order(topic: Topic) -> NDArray[np.int64] | None:
 
 
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
-    """Return the order of `/rl/step` records that yields whole episodes; None for file order.
+    """Return row indexes that sort `/rl/step` records into whole episodes; None for file order.
 
-    Records are ordered by log_time, or by channel and then log_time if channels were recorded at
-    the same time, for example by two robots.
+    Records are sorted by log_time. If channels were recorded at the same time, for example by two
+    robots, records are sorted by channel first.
 
     Raises:
         CorruptLogError: No order yields whole episodes.
@@ -67,7 +67,7 @@ def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
         return np.empty(0, np.int64)
     read = int(finals[-1]) + 1
     steps, episodes = columns["step"][:read], columns["episode"][:read]
-    # An episode begins after a final record; the next step follows every other record.
+    # After a final record, a new episode begins. After any other record, `step` increases by 1.
     begins = np.concatenate([[0], finals[:-1] + 1])
     breaks = np.concatenate([_breaks(steps, 1), _breaks(episodes, 0)])
     wrong = [begins[steps[begins] != 0], breaks[~final[breaks]] + 1]
@@ -87,7 +87,7 @@ def episode_lengths(columns: Columns, where: object) -> NDArray[np.int64]:
 
 
 def _breaks(column: NDArray[Any], by: int) -> NDArray[np.int64]:
-    """Return the rows whose successor does not differ by `by`."""
+    """Return each row k for which `column[k + 1] - column[k]` is not `by`."""
     found = []
     for start in range(0, len(column) - 1, _BLOCK_ROWS):
         block = column[start : start + _BLOCK_ROWS + 1]
@@ -110,7 +110,7 @@ class EpisodeTopic:
         return self._columns["length"].astype(np.int64)
 
     def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-        """Read at least the summaries of the episodes that end at these log_times."""
+        """Read the summaries of the episodes that end at these log_times, and possibly others."""
         if not self._is_ours:
             return []
         fields, rows = EpisodeSummary._fields, None
@@ -139,14 +139,15 @@ class EpisodeTopic:
 def summaries(
     path: object, columns: Columns, lengths: NDArray[np.int64], recorded: list[EpisodeSummary]
 ) -> tuple[EpisodeSummary, ...]:
-    """Return a summary of each episode, computed from its records if not recorded.
+    """Return one summary per episode; compute those that are not in `recorded`.
 
-    `lengths` (E,) are the numbers of transitions, `recorded` the summaries from `/rl/episode`.
+    `lengths` (E,) contains the number of transitions of each episode, and `recorded` contains the
+    summaries from `/rl/episode`.
 
     Raises:
         CorruptLogError: A recorded summary disagrees with the records.
     """
-    # Keyed by the final record's time, because indexes restart from 0 in appended recordings.
+    # The end time is the key, because episode indexes restart at 0 in appended recordings.
     by_end = {summary.end_time_ns: summary for summary in recorded}
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()
@@ -174,7 +175,7 @@ def summaries_of_records(
     firsts = finals - lengths
     lasts = np.maximum(finals - 1, firsts)
     rewards = columns["reward"].astype(np.float64, copy=False)
-    # In the order of the summary's fields.
+    # These values have the order of the fields of `EpisodeSummary`.
     values = (
         columns["episode"][finals].tolist(),
         lengths.tolist(),

@@ -4,8 +4,8 @@ Such a log needs a topic `/rl/step` of CDR messages with the fields of `schema.p
 type and in any order; other fields are ignored, and `behavior_prob` is optional. Vectors are in
 `observation`, or in `observation_<key>` for each key of a Dict space; images are on topics
 `/rl/observation/<key>`, with the log_times of the step records. The inferred spaces are unbounded
-Boxes; integer actions are Discrete up to the largest action. If there are both `observation` and
-`observation_<key>` fields, `observation` becomes the key `state`.
+Boxes; for integer actions, the space is Discrete up to the largest action. If there are both
+`observation` and `observation_<key>` fields, `observation` becomes the key `state`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
     }
     parts |= {topic.removeprefix(_IMAGE_TOPIC): _image_space(reader, topic) for topic in images}
     metadata = LogMetadata(spaces.Dict(parts), action_space_of(action))
-    # Each leaf of the space must map back to its own field or topic.
+    # Each leaf is read from the field or topic with its name, so this must exist.
     for leaf in observation_leaves(metadata.observation_space):
         if not (reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns):
             raise LogError(

@@ -46,7 +46,8 @@ def image_cache(
 ) -> McapReader:
     """Open the uncompressed copy of a log's images; write the copy beside the log if needed.
 
-    The log_times and (K, *shape) images of the whole topic are consumed only to write the copy.
+    `blocks` yields the log_times and (K, *shape) images of the whole topic. It is iterated only if
+    the copy is written.
 
     Raises:
         LogError: The copy cannot be written.
@@ -80,7 +81,7 @@ def image_cache(
 
 
 def fingerprint(reader: McapReader) -> str:
-    """Return the SHA-256 of a log's chunk offsets and CRCs, and of its mtime if it has no CRCs."""
+    """Return the SHA-256 of a log's chunk offsets and CRCs; without CRCs, the mtime is added."""
     digest = hashlib.sha256(str(len(reader.view)).encode())
     has_crcs = bool(reader.chunks)
     for chunk in reader.chunks:

@@ -1,4 +1,4 @@
-"""Reader of image observations: the images of the records of `/rl/step`."""
+"""Reader of image observations, one image per record of `/rl/step`."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class _Images:
         return columns["data"].reshape(-1, *self._leaf.shape)
 
     def blocks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-        """Yield the times and images of blocks of messages, in log_time order."""
+        """Yield the log_times and images of the topic in blocks, in log_time order."""
         order = time_order(self.topic)
         order = np.arange(len(self.topic)) if order is None else order
         for start in range(0, len(order), IMAGES_PER_CHUNK):
@@ -96,7 +96,7 @@ class _Images:
             yield self.topic.times[part], self.read(part)
 
     def mapped(self, order: NDArray[np.int64]) -> MappedImages:
-        """Return the images (F, *shape) on disk; a chunk is validated when first read."""
+        """Return an array-like (F, *shape) of images on disk; reading a chunk validates it."""
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()

@@ -1,4 +1,4 @@
-"""Checks of a dataset for problems that harm or may harm learning."""
+"""Checks that find problems in a dataset that can harm learning."""
 
 from __future__ import annotations
 
@@ -227,7 +227,7 @@ def _leaves(dataset: Dataset) -> tuple[Leaf, ...]:
 
 
 def _bad_frames(leaf: Leaf, episode: Episode) -> NDArray[np.bool_]:
-    """Return which values of an episode's observations (T + 1, *shape) are not finite."""
+    """Mark the values (T + 1, *shape) of an episode's observations that are not finite."""
     last = leaf.of(episode.next_observations)[-1:]
     bad: NDArray[np.bool_] = ~np.isfinite(np.concatenate([leaf.of(episode.observations), last]))
     return bad
@@ -246,7 +246,7 @@ def _arrays(observations: Any) -> list[NDArray[Any]]:
 
 
 def _places(dataset: Dataset, flags: Callable[[Episode], NDArray[np.bool_]]) -> str:
-    """List the first steps with a set flag."""
+    """Format the first steps at which `flags` returns a true value."""
     found: list[str] = []
     for episode in dataset.episodes:
         bad = flags(episode)

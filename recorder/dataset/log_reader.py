@@ -1,4 +1,4 @@
-"""Reader of one log of format version 1: chunks -> columns -> episodes."""
+"""Reader of one log of format version 1; it converts chunks to columns, and columns to episodes."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from mcaprl.recorder.format.schema import is_intact, stored_dtype
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves, restricted, select
 from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
-# Number of steps; see `_without`.
+# If episodes have at least this many steps on average, `_without` moves rows in place.
 _LONG_EPISODE = 100
 REQUIRED_FIELDS = ("reward", "action", "terminated", "truncated", *COUNTERS)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Columns to read of a log, and their storage; see `open_logs`."""
+    """Options of reading a log: columns, image storage and threads; see `open_logs`."""
 
     columns: tuple[str, ...] | None = None
     images: Storage = "memory"
@@ -70,7 +70,7 @@ class LogReader:
             CorruptLogError: Records are missing, duplicated or out of order.
             NoEpisodesError: The log has no finished episode.
         """
-        # Reading the records validates these lengths.
+        # These lengths are from `/rl/episode`; `read` compares them with the records.
         listed = self._summaries.lengths if self._reader.complete else np.empty(0, np.int64)
         if self._steps.chunks_rise and int(listed.sum()) + len(listed) == len(self._steps):
             return listed
@@ -140,7 +140,8 @@ class LogReader:
         odd = [name for name in wanted if fields[name].kind == "O"]
         if odd:
             raise LogError(
-                f"{self.path}: {', '.join(odd)} of {STEP_TOPIC} is neither a number nor an array"
+                f"{self.path}: {STEP_TOPIC} has fields that are neither numbers nor arrays:"
+                f" {', '.join(odd)}"
             )
 
     def _finished(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -206,21 +207,21 @@ def describe(reader: McapReader) -> LogMetadata:
 
     Raises:
         NoStepsError: The file has no steps.
-        LogError: The metadata is incomplete, of a later version, or damaged.
+        LogError: The metadata is incomplete or damaged, or has a later version.
     """
     _steps_of(reader)
     return described(reader) or LogMetadata.from_strings({})
 
 
 def described(reader: McapReader) -> LogMetadata | None:
-    """Return the metadata of a log, or None if the log is of another writer.
+    """Return the metadata of a log, or None if another program wrote the log.
 
     Raises:
-        LogError: The metadata is of a later version, or damaged.
+        LogError: The metadata is damaged or has a later version.
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The summary section, which has a CRC, also contains the channel's copy.
+        # The summary section also contains this metadata, and it has a CRC.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata
@@ -252,7 +253,7 @@ def _steps_of(reader: McapReader) -> Topic:
 
 
 def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
-    """Return a field's column in the shape and dtype of its leaf.
+    """Convert a field's column to the shape and dtype of its leaf.
 
     Raises:
         CorruptLogError: The column does not convert exactly.
@@ -269,7 +270,7 @@ def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
             return cast
     raise CorruptLogError(
         f"{path}: {STEP_TOPIC} does not fit the spaces in the metadata: {leaf.name} is"
-        f" {column.dtype} {column.shape[1:]}, its space {leaf.dtype} {leaf.shape}"
+        f" {column.dtype} {column.shape[1:]}, expected {leaf.dtype} {leaf.shape}"
     )
 
 

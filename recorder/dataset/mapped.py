@@ -30,12 +30,12 @@ class ImageFile:
     ) -> None:
         """Create a view of the file's images without reading them.
 
-        A function of `checks` raises an error if its chunk is damaged, `check_unchanged` if the
-        file was changed in place.
+        Each function in `checks` raises an error if its chunk is damaged. `check_unchanged` raises
+        an error if the file was changed in place.
         """
         self.name, self._check_unchanged = name, check_unchanged
         bytes_ = np.frombuffer(view, np.uint8)
-        # A window at each byte offset; indexing a void dtype copies as fast as memcpy.
+        # Element k is the image that starts at byte k. Indexing a void dtype is as fast as memcpy.
         self._windows = np.lib.stride_tricks.as_strided(
             bytes_[:image_bytes].view(np.dtype((np.void, image_bytes))),
             (len(bytes_) - image_bytes + 1,),
@@ -45,7 +45,7 @@ class ImageFile:
         self._is_checked = np.zeros(len(checks), bool)
 
     def read(self, offsets: NDArray[np.int64], chunks: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """Copy the images at byte offsets (K,), in chunks with indexes (K,).
+        """Copy K images, given their byte offsets (K,) and the indexes (K,) of their chunks.
 
         Raises:
             CorruptLogError: A chunk is damaged.
@@ -74,7 +74,8 @@ class MappedImages:
     ) -> None:
         """Create an array of images of one shape without reading them.
 
-        `places` (F, 3) are index of the file, index of the chunk in the file, and byte offset.
+        Each row of `places` (F, 3) contains the index of the file, the index of the chunk in the
+        file, and the byte offset of the image.
         """
         self._files, self._places = tuple(files), places
         self.shape = (len(places), *shape)
@@ -112,7 +113,7 @@ class MappedImages:
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, key: Any) -> NDArray[Any]:
-        """Read images or parts of images, as NumPy indexing."""
+        """Read images or parts of images; `key` is a NumPy index."""
         first, rest = (key[0], key[1:]) if isinstance(key, tuple) else (key, ())
         places = self._places[first]
         if places.ndim == 1:

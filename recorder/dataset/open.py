@@ -32,21 +32,21 @@ def open_logs(
     """Read logs, or a selection of their columns and episodes.
 
     The CRCs of all chunks that are read are checked. If a log was cut off or is still being
-    written, its finished episodes are read, with a warning. Of several logs, those without a
-    finished episode are skipped, with a warning.
+    written, its finished episodes are read, with a warning. If there are several logs, those
+    without a finished episode are skipped, with a warning.
 
     Args:
         data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
             the same spaces; their episodes are concatenated in the order of the files.
-        columns: Keys to read of a Dict observation space, nested keys as `joints/q`; the dataset's
-            observation space contains only these. An empty sequence reads no observations. Actions,
-            rewards and end flags are always read. Default: all keys.
+        columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
+            key. The dataset's observation space contains only these. An empty sequence reads no
+            observations. Actions, rewards and end flags are always read. Default: all keys.
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
-        images: Storage of image observations: `memory`; `mapped`, which leaves images on disk and
-            reads them when they are indexed (from an uncompressed log, otherwise from an
-            uncompressed copy that is written once beside the log); or `auto`, which is `mapped` if
-            the images would take more than half of the free memory.
+        images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
+            on disk and reads them when they are indexed. If the log is compressed, this needs an
+            uncompressed copy of the images, which is written once beside the log. `auto` is
+            `mapped` if the images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 
     Raises:
@@ -55,7 +55,7 @@ def open_logs(
         UsageError: A column or an episode does not exist.
     """
     if threads < 1:
-        raise UsageError(f"threads {threads}: give 1 or more")
+        raise UsageError(f"threads is {threads}, expected 1 or more")
     chosen = None if columns is None else tuple(columns)
     selection = Selection(columns=chosen, images=images, threads=threads)
     logs = [LogReader(path, selection) for path in find_logs(data)]
@@ -67,7 +67,7 @@ def open_logs(
 def _call_each(
     logs: Sequence[LogReader], function: Callable[[LogReader], Result]
 ) -> list[tuple[LogReader, Result]]:
-    """Call a function on each log; of several logs, skip those without a finished episode.
+    """Call a function on each log; skip logs without finished episodes if there are several logs.
 
     Raises:
         NoEpisodesError: No log has a finished episode.
@@ -110,7 +110,7 @@ def _episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     outside = selected[(selected < -count) | (selected >= count)]
     if len(outside) or not len(selected):
         what = f"no episode {outside[0]}" if len(outside) else "no episodes are selected"
-        raise UsageError(f"{what}: the logs have {count}, counted from 0")
+        raise UsageError(f"{what}: the logs have {count} episodes, counted from 0")
     return np.unique(selected % count)
 
 
@@ -124,7 +124,7 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         every = [path for part in data for path in find_logs(part)]
         if not every:
             raise LogError("no data: the list of files is empty")
-        # Paths of the same file are read once.
+        # A file that is listed under several paths is read once.
         return list({os.path.realpath(path): path for path in every}.values())
     path = Path(data)
     if path.is_dir():

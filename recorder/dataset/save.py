@@ -28,8 +28,8 @@ def save_log(
 ) -> None:
     """Write columns as a log.
 
-    Times that do not increase from frame to frame are replaced by times from now on. Episodes are
-    numbered from 0.
+    If the log_times do not increase from frame to frame, they are replaced by times that start now.
+    Episodes are numbered from 0.
 
     Raises:
         OutputExistsError: The file exists and `overwrite` is not set.
@@ -37,11 +37,11 @@ def save_log(
     """
     if not columns.episodes:
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
-    # Data from arrays has no timestamps, so its times start at 0.
+    # Data from arrays has no timestamps: its first time is 0.
     if columns.log_time_ns[0] == 0 or (np.diff(columns.log_time_ns) <= 0).any():
         columns = with_fresh_times(columns, time.time_ns(), metadata.step_duration_ns)
     path = Path(path)
-    # The dataset may be read from the log that is replaced.
+    # The old log is replaced at the end, because images of the dataset may be read from it.
     with replacing(path, LogError, overwrite=overwrite) as unfinished:
         log = LogWriter(unfinished, metadata, compression=compression)
         try:

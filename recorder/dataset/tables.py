@@ -22,7 +22,7 @@ MAX_COLUMNS = 64
 
 
 def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: LogMetadata) -> Any:
-    """Return a table with one row per transition, including both observations."""
+    """Return a table with one row per transition, which contains both of its observations."""
     pyarrow = import_extra("pyarrow", "tables")
     step_frames = columns.frame_of_step()
     lengths = columns.lengths

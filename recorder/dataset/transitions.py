@@ -33,7 +33,7 @@ class Transitions:
         terminated: (N,) bool.
         truncated: (N,) bool.
         behavior_probs: (N,) float32; NaN where unknown.
-        episodes: Summaries of the episodes, in order; their lengths determine the episodes' rows.
+        episodes: Summaries of the episodes, in order. Their lengths divide the rows into episodes.
     """
 
     frames: tuple[Frames, ...]
@@ -69,7 +69,7 @@ class Transitions:
         return self.first_steps + np.arange(len(self.episodes))
 
     def frame_of_step(self) -> NDArray[np.int64]:
-        """Return the (N,) frame index k of each transition's observation; the next one is k + 1."""
+        """Return the index (N,) of each transition's observation in `frames`."""
         episode_of_step = np.repeat(np.arange(len(self.episodes)), self.lengths)
         return np.arange(len(self.rewards)) + episode_of_step
 

@@ -1,8 +1,8 @@
 """A Foxglove layout for a log: its panels and plotted series.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
-Foxglove and in Lichtblick. Each plotted series is a scalar: array elements of a slice would all be
-joined into one line.
+Foxglove and in Lichtblick. Each plotted series is a scalar, because viewers join all elements of an
+array slice into one line.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TRAINING_TOPIC = "/rl/training"
 # Maximum number of series in a plot; further series are left out.
 MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
-# Plots of telemetry: title and suffix of the names.
+# Titles of telemetry plots; a plot shows the telemetry whose names have the given suffix.
 PLOTTED_ENDINGS = {"speed": "speed_m_s", "offsets": "offset_m"}
 # Range of the depth image's color map, millimeters.
 DEPTH_RANGE_MM = (0, 50_000)
@@ -100,7 +100,7 @@ def _plots(
     learning: Mapping[str, str],
     panels: dict[str, dict[str, Any]],
 ) -> list[Node]:
-    """Add plots of reward and return, and tabs below with all other numbers of the log."""
+    """Add plots of reward and return, and a tab panel with plots of all other numbers."""
     returns = {"return of episode": "/rl/episode.total_reward"}
     if RETURN_SO_FAR in telemetry_names:
         returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
@@ -128,7 +128,7 @@ def _plots(
 
 
 def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return each annotating policy's action values, TD error, advantage and entropy."""
+    """Return series of the Q-values, TD error, advantage and entropy on each values topic."""
     series = {}
     for topic in filter(is_values_topic, topics):
         title = topic.removeprefix("/rl/")
@@ -140,7 +140,7 @@ def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dic
 
 
 def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return one series per component of an action, or one per discrete action at its steps."""
+    """Return a series per action component, or per discrete action, with the steps that took it."""
     names = metadata.action_names()
     if names:
         taken = {
@@ -252,7 +252,7 @@ def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
 
 
 def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:
-    """Stack panels of equal size, or with the first one's share given."""
+    """Stack panels; their sizes are equal unless `first_percent` sets the size of the first."""
     first, *rest = nodes
     if not rest:
         return first

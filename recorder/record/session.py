@@ -26,7 +26,7 @@ from mcaprl.texts import encodable
 
 @dataclass
 class OpenEpisode:
-    """An episode that is being recorded: its policy, arguments of `reset`, and transitions."""
+    """An episode that is being recorded: its policy, `reset` arguments and number of steps."""
 
     policy: str
     epsilon: float
@@ -63,7 +63,7 @@ class EpisodeLog:
             SpaceError, OutputExistsError, LogError: As for `LogWriter`.
         """
         self._description = description
-        # The process may change its working folder before the end.
+        # A relative path refers to this folder, even if the process changes its folder later.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
@@ -117,9 +117,9 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a seed must be from 0 to 2**63 - 1")
 
     def begin(self, display: Display) -> None:
-        """Begin the next episode's display messages, in a new file if the current one is full.
+        """Begin the display messages of the next episode; start a new file if this one is full.
 
-        The first episode adds the layout.
+        The layout is written with the first episode.
         """
         mcap, start_ns, parts = self.log.mcap, self.next_start_ns, self._parts
         has_episodes = self.episodes > self._first_in_file
@@ -137,7 +137,7 @@ class EpisodeLog:
             self._has_layout = True
 
     def close(self) -> None:
-        """Finish the log, and remove its last file if that has no episode."""
+        """Finish the log, and remove the last numbered file if it contains no episode."""
         in_place = self._is_in_place()
         self.log.close()
         if not in_place:
@@ -174,7 +174,7 @@ class EpisodeLog:
         """Count an episode after it is completely written.
 
         Raises:
-            LogError: The file is not at its path; it is closed.
+            LogError: The file was removed or replaced; the log is then closed.
         """
         self.next_start_ns = summary.end_time_ns + self.step_ns
         self.episodes += 1

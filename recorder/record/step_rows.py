@@ -1,9 +1,9 @@
-"""Buffers for the values of an open episode, copied per step and written as whole columns.
+"""Buffers that copy the values of an open episode at each step and write whole columns.
 
 A step only copies its values; times, counters, constants and the message layout are filled in when
 a chunk is written. Buffers have no row counter: their first value belongs to the first step that is
-not on disk. Only the recorder counts steps, once all their values are stored; values beyond its
-counter are dropped.
+not on disk. Only the recorder counts steps. It counts a step after all values of the step are
+stored; values of steps that are not counted are dropped.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Converter = Callable[[Any], NDArray[Any]]
 
 
 class Arrays:
-    """A byte buffer of arrays of one dtype and size."""
+    """A byte buffer for arrays that have the same dtype and size."""
 
     def __init__(self, dtype: np.dtype[Any], size: int) -> None:
         """Create an empty buffer of arrays of `size` numbers."""
@@ -57,20 +57,20 @@ class Arrays:
                     take(value)
                     return
             except (AttributeError, TypeError, ValueError):
-                # Not an array, or not contiguous in memory.
+                # The value is not an array, or it is not contiguous in memory.
                 pass
             append(as_declared(value, leaf))
 
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Copy the first values into a column, without dropping them."""
+        """Fill a column with the first values, which also stay in the buffer."""
         if len(column):
             waiting = np.frombuffer(self._waiting.getbuffer(), self._dtype, column.size)
             column[:] = waiting.reshape(column.shape)
 
     def drop(self, count: int | None = None) -> None:
-        """Drop the first values, or all."""
+        """Drop the first `count` values; default: all values."""
         rest = b"" if count is None else self._waiting.getvalue()[count * self._bytes_each :]
         self._waiting.seek(0)
         self._waiting.truncate()
@@ -102,11 +102,11 @@ class Integers:
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Copy the first values into a column, without dropping them."""
+        """Fill a column with the first values, which also stay in the buffer."""
         column[:] = self._waiting[: len(column)]
 
     def drop(self, count: int | None = None) -> None:
-        """Drop the first values, or all."""
+        """Drop the first `count` values; default: all values."""
         del self._waiting[:count]
 
 
@@ -154,7 +154,7 @@ class StepColumns:
 
     @property
     def full_at(self) -> int:
-        """The first step whose observation has no row."""
+        """First step whose observation does not fit into the rows."""
         return self._first_step + len(self._rows)
 
     def make_room(self, step: int) -> None:
@@ -170,7 +170,7 @@ class StepColumns:
         self._drop(count)
 
     def end(self, steps: int, terminated: bool, truncated: bool) -> None:
-        """Mark the last of `steps` transitions, 1 or more, and the final row; write the rows."""
+        """Set the end flags of the last transition, fill the final row, and write all rows."""
         final = steps - self._first_step
         assert final >= 1, "the last transition stays in memory"
         self._fill(final, final + 1)
@@ -234,7 +234,7 @@ class ImageColumn:
 
     @property
     def full_at(self) -> int:
-        """First step for whose image no row is left."""
+        """First step whose image does not fit into the rows."""
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:
@@ -270,12 +270,12 @@ def observation_store(
 
 
 def converters(space: spaces.Space[Any]) -> list[Converter]:
-    """Return the function of each leaf that reads its value from an observation."""
+    """Return one function per leaf, which reads the leaf's value from an observation."""
     return [_converter(leaf) for leaf in observation_leaves(space)]
 
 
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
-    """Return a value in the dtype and shape that its space declares.
+    """Convert a value to the dtype and shape that its space declares.
 
     An array of floats that loses precision causes a warning; other values must convert exactly.
 
@@ -308,10 +308,10 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
 
 
 def reward_number(reward: Any) -> float:
-    """Return a reward that is an array of one number as a number.
+    """Convert a reward that is an array of one number to a float.
 
     Raises:
-        SpaceError: It is anything else.
+        SpaceError: The reward is not one number.
     """
     array = np.asarray(reward)
     if array.size != 1 or array.dtype.kind not in "biuf":
@@ -332,7 +332,7 @@ def _converter(leaf: Leaf) -> Converter:
 
 
 def _part(leaf: Leaf) -> Callable[[Any], Any]:
-    """Return a function that reads a leaf's value from an observation, unconverted."""
+    """Return a function that reads a leaf's value from an observation without converting it."""
 
     def part(observation: Any) -> Any:
         try:

@@ -1,7 +1,7 @@
 """Buffers for the open episodes of a vector environment.
 
-A block of message records, (environments, capacity), contains a row per environment. One indexed
-assignment writes a field for all environments, and each episode is contiguous in memory.
+The message records are in one array of shape (environments, capacity). One indexed assignment
+writes a field for all environments, and each episode is contiguous in memory.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
-# Initial capacity of the block in steps, limited by its size in bytes. The capacity doubles when
-# an episode needs more.
+# Maximum initial capacity in steps, and in bytes of one environment's rows. The capacity doubles
+# when an episode needs more.
 _FIRST_CAPACITY = 64
 _FIRST_BYTES = 2**20
 
@@ -25,18 +25,18 @@ class OpenRows(Generic[Rows]):
     """Message records of one topic for all open episodes."""
 
     def __init__(self, chunk: Rows, environments: int) -> None:
-        """Allocate the block; `chunk` is preallocated rows with the constant fields set."""
+        """Allocate the array; `chunk` contains blank rows whose constant fields are set."""
         self._per_chunk = len(chunk)
         first = max(1, min(_FIRST_CAPACITY, _FIRST_BYTES // chunk.itemsize))
         self._rows = chunk.blank(environments, first)
 
     @property
     def capacity(self) -> int:
-        """Number of steps that fit the block."""
+        """Number of steps that fit into the array."""
         return len(self._rows)
 
     def make_room(self, step: int) -> None:
-        """Grow the block until `step` fits."""
+        """Grow the array if `step` does not fit."""
         if step >= self.capacity:
             self._rows = self._rows.grown(max(2 * self.capacity, step + 1))
 
@@ -52,7 +52,7 @@ class OpenRows(Generic[Rows]):
         self._rows.put(field, (environments, steps), values)
 
     def write(self, environment: int, count: int, start_ns: int, step_ns: int) -> None:
-        """Write the first `count` rows of an environment in chunks, from log_time `start_ns`."""
+        """Write the first `count` rows of an environment in chunks; row 0 has time `start_ns`."""
         times = start_ns + np.arange(count) * step_ns
         for first in range(0, count, self._per_chunk):
             chunk = slice(first, min(first + self._per_chunk, count))
@@ -63,7 +63,7 @@ class OpenSteps(OpenRows[StepRows]):
     """Rows of `/rl/step` of all open episodes."""
 
     def end(self, environment: int, summary: EpisodeSummary, step_ns: int) -> None:
-        """Number an episode's rows, mark its end and write the rows."""
+        """Number an episode's rows, set its end flags, and write the rows."""
         rows, count, last = self._rows, summary.length + 1, summary.length - 1
         rows.number((environment, slice(count)), summary.episode, np.arange(count))
         rows.put("terminated", (environment, last), summary.terminated)

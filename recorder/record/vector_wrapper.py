@@ -1,9 +1,8 @@
 """A Gymnasium wrapper that records a vector environment, one whole episode after the other.
 
-The rows of each environment's open episode stay in memory until the episode ends, and are then
-written after the previously ended episode. The file has the same form as a single environment's,
-and simulated time increases from episode to episode. If the process is killed, the open episode of
-each environment is lost.
+The rows of an open episode stay in memory. When the episode ends, they are appended to the file.
+The file has the same form as a recording of a single environment, and simulated time increases from
+episode to episode. If the process is killed, the open episode of each environment is lost.
 
 No scene is recorded: replay the seeds and actions in a single environment to get it.
 """
@@ -42,8 +41,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     Attributes:
         behavior_probs: (N,) probabilities of the next actions under the behavior policy. Set them
             before each `step`, which resets them to NaN (unknown).
-        policy: Name of the policy, for `/rl/episode`; may be changed at any time. An episode
-            records the name at its start.
+        policy: Name of the policy, for `/rl/episode`; may be changed at any time. Each episode
+            records the name that is set when the episode begins.
         epsilon: Exploration rate of the policy; NaN if unknown. May be changed at any time.
         policy_version: Number of updates of the policy so far. If passed to the constructor,
             `/rl/learner` records `policy_version` and `epsilon` at each `step`.
@@ -67,7 +66,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> None:
         """Wrap `env` and create the file; for the other arguments, see `RecordMcap`.
 
-        `env` has spaces that `RecordMcap` supports, and an autoreset mode in its metadata. If
+        `env` must have spaces that `RecordMcap` supports and declare its autoreset mode. If
         `policy_version` is None, the log has no `/rl/learner`.
 
         Raises:
@@ -118,7 +117,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._action_leaf = action_leaf(self.action_space)
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Number of transitions in each environment's open episode, and whether one is open.
+        # Whether each environment has an open episode, and the number of transitions in it.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # Whether each environment resets itself in the next step.
@@ -145,7 +144,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         seeds = [seed + k for k in range(count)] if isinstance(seed, int) else seed
         seeds = [None] * count if seeds is None else list(seeds)
         self._recording.check_can_begin(seeds)
-        # Read before the reset: environments remove the mask from the options.
+        # The options are read before the reset, because environments remove the mask from them.
         given = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
         numbers = np.flatnonzero((options or {}).get("reset_mask", np.ones(count, np.bool_)))
         self._interrupt(numbers)
@@ -288,7 +287,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._display.clear()
 
     def _end(self, number: int, terminated: bool, truncated: bool, reason: str) -> None:
-        """Write an episode after the previous one."""
+        """Append an ended episode to the log."""
         recording, episode = self._recording, self._open[number]
         steps = episode.steps = int(self._steps[number])
         # Set first, so that an error does not cause a second write of this episode.
@@ -328,6 +327,6 @@ def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
 
 
 def _of_env(infos: dict[str, Any], key: str, number: int) -> Any:
-    """Return one environment's entry of the infos; None if it has none."""
+    """Return `infos[key]` of one environment; None if it is missing."""
     found = infos.get(key)
     return found[number] if isinstance(found, np.ndarray | list | tuple) else None

@@ -162,7 +162,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
         probability = self.behavior_prob
-        # The function is called only where this comparison, at each step, does not suffice.
+        # This comparison is faster than a call, so the function is called only if it fails.
         if probability is not _UNKNOWN and not SMALLEST <= probability <= 1.0:
             check_probability(probability, "behavior_prob")
         try:

@@ -106,7 +106,7 @@ def test_episodes(log: Path, asked: Any, meant: list[int]) -> None:
 
 @pytest.mark.parametrize("asked", [5, -6, [0, 9]])
 def test_missing_episodes_are_refused(log: Path, asked: Any) -> None:
-    with pytest.raises(UsageError, match="the logs have 5, counted from 0"):
+    with pytest.raises(UsageError, match="the logs have 5 episodes, counted from 0"):
         mcaprl.open(log, episodes=asked)
     with pytest.raises(UsageError, match="no episodes are selected"):
         mcaprl.open(log, episodes=[])
@@ -159,7 +159,7 @@ def test_damage_is_reported_with_several_threads(log: Path, tmp_path: Path) -> N
     damage(log, tmp_path / "log.mcap", "/rl/step", number=2)
     with pytest.raises(CorruptLogError):
         mcaprl.open(tmp_path / "log.mcap", threads=3)
-    with pytest.raises(UsageError, match="threads 0"):
+    with pytest.raises(UsageError, match="threads is 0"):
         mcaprl.open(log, threads=0)
 
 
