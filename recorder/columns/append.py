@@ -1,4 +1,4 @@
-"""State of a finished MCAP file that a writer needs to append to the file."""
+"""State that a writer needs to append to a finished MCAP file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DATA_END = struct.Struct("<BQI")
 
 @dataclass
 class WrittenState:
-    """Final state of the writer of a finished file.
+    """State in which a writer left a finished file.
 
     Attributes:
         summary: Summary of the file.
@@ -40,7 +40,7 @@ class WrittenState:
 
 
 def written_state(path: Path) -> WrittenState:
-    """Read the final state of the writer of a file.
+    """Read the state that a writer needs to append to a finished file.
 
     Raises:
         LogError: The file is damaged or not finished, or has messages outside of chunks.

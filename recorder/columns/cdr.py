@@ -59,9 +59,10 @@ class Layout:
     """Positions of the wanted fields in messages with equal string and sequence lengths.
 
     Attributes:
-        dtype: Structured dtype of a message with padding: wanted fields and `constants`.
-        constants: Values that all messages of the layout share: byte order, and the length of each
-            string and sequence.
+        dtype: Structured dtype of the wanted fields and of `constants`; all other bytes of a
+            message are padding.
+        constants: Values that are equal in all messages of the layout: the byte order, and the
+            length of each string and sequence.
     """
 
     dtype: np.dtype[Any]
@@ -96,7 +97,7 @@ class MessageType:
 
     @cached_property
     def dtypes(self) -> dict[str, np.dtype[Any]]:
-        """Dtype of each top-level field; `object` for all but numbers and arrays."""
+        """Dtype of each top-level field; `object` if it is neither a number nor an array."""
         return {name: _dtype_of(description) for name, description in self._fields.items()}
 
     def decode(self, data: bytes) -> Any:
@@ -107,17 +108,17 @@ class MessageType:
         """
         try:
             return self._store.deserialize_cdr(data, self.name)
-        # As above, errors of many types.
+        # The library raises errors of many types when a message does not fit its type.
         except Exception as error:
             raise CorruptLogError(f"{len(data)} bytes are not a {self.name}: {error}") from error
 
     def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
-        """Return the last layout of messages of this length; None if there is none."""
+        """Return the layout that was found last for this message length; None if there is none."""
         return self._layouts.get((length, *wanted))
 
     def layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
-        """Return the layout of an example; None if the message has no layout."""
-        # A new layout takes as long as decoding a few messages.
+        """Return the layout of an example message; None if the message has no layout."""
+        # Building a new layout takes as long as decoding a few messages.
         key = (len(example), *wanted)
         known = self._layouts.get(key)
         if known is None or not known.fits(np.frombuffer(example, known.dtype)):
@@ -141,7 +142,7 @@ class MessageType:
         return walk.layout()
 
     def _pass(self, walk: _Walk, description: Any, name: str | None) -> None:
-        """Skip one field; record its position under `name` unless that is None."""
+        """Skip one field; record its position under `name` unless `name` is None."""
         kind, what = description
         match kind:
             case Nodetype.BASE if what[0] == "string":

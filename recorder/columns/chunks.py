@@ -33,8 +33,8 @@ _ZSTD = zstandard.ZstdCompressionParameters.from_level
 SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
 # Images resemble images far back in the chunk, and their bytes are not noise.
 LONG_RECORDS = _ZSTD(1)
-# Messages of different lengths are mostly display messages, so repetitive that a slower search
-# halves their size.
+# Messages of different lengths are mostly display messages. They repeat so much that a slower
+# search halves their size.
 MIXED_RECORDS = _ZSTD(12)
 # Longer messages are mostly images.
 LONG_MESSAGE_BYTES = 2**11
@@ -97,7 +97,7 @@ class ChunkHeader(NamedTuple):
     data: slice
 
     def to_record(self) -> bytes:
-        """Return the Chunk record up to its data."""
+        """Return the bytes of the Chunk record that precede its data."""
         name, data_bytes = self.compression.encode(), int(self.data.stop - self.data.start)
         length = _CHUNK_START.size - RECORD_HEADER_BYTES + len(name) + 8 + data_bytes
         start: bytes = _CHUNK_START.pack(
@@ -112,7 +112,7 @@ class ChunkHeader(NamedTuple):
         return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
     def to_index(self, offset: int, content_bytes: int) -> ChunkIndex:
-        """Return a ChunkIndex without message indexes of the Chunk record at `offset`."""
+        """Describe the Chunk record at `offset` by a ChunkIndex without message indexes."""
         return ChunkIndex(
             chunk_start_offset=offset,
             chunk_length=RECORD_HEADER_BYTES + content_bytes,
@@ -224,7 +224,7 @@ class Scratch:
         return zstandard.ZstdDecompressor()
 
     def take(self, size: int) -> memoryview:
-        """Return `size` bytes, which overwrite those of the last call."""
+        """Return `size` bytes of memory, which the next call reuses."""
         self.kept = _NOTHING
         if len(self._memory) < size:
             # Release the old memory first.
@@ -236,7 +236,7 @@ class Scratch:
 def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None) -> memoryview:
     """Return the records of the chunk at `offset`, decompressed and checked against their CRC.
 
-    They are valid until the next use of `scratch`, by default new memory.
+    The records are valid until the next use of `scratch`; without `scratch`, they get new memory.
 
     Raises:
         CorruptLogError: The chunk is damaged, or its decompressed size does not match its header.
@@ -246,7 +246,7 @@ def chunk_records(file: memoryview, offset: int, scratch: Scratch | None = None)
     if len(records) != header.uncompressed_bytes:
         raise CorruptLogError(
             f"the chunk at byte {offset} has {len(records)} bytes of records,"
-            f" not the {header.uncompressed_bytes} of its header"
+            f" but its header declares {header.uncompressed_bytes}"
         )
     if header.crc and crc32(records) != header.crc:
         raise CorruptLogError(f"the chunk at byte {offset} does not match its CRC")

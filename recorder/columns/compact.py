@@ -1,7 +1,7 @@
 """Compaction of a finished MCAP file: small chunks are merged into larger ones.
 
-A writer that flushes often leaves many small chunks, and each costs a reader as much as hundreds
-of its messages. The compacted file is written beside the original, and replaces it only
+A writer that flushes often leaves many small chunks. A reader needs as much time for a small chunk
+as for hundreds of messages. The compacted file is written beside the original, and replaces it only
 when it is complete and on disk: until then, the original is a valid file with all messages.
 
 Only chunks of the same kind are merged; channels that share a chunk are of the same kind. All other
@@ -36,9 +36,9 @@ SMALL_CHUNK_BYTES = 2**16
 _MERGED_BYTES = 2**20
 # Saving fewer chunks than this is not worth the time of rewriting the file.
 _MIN_CHUNKS_SAVED = 8
-# Copying more bytes than this to avoid one chunk takes longer than readers save.
+# If each avoided chunk costs more copied bytes than this, copying takes longer than readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
-# Records that are between listed chunks only where the summary omits a chunk.
+# If one of these records is between two listed chunks, the summary omits a chunk.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 
@@ -76,15 +76,15 @@ def compact(
 
 
 def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
-    """Return the source chunks of each chunk of the compacted file, in the order of that file.
+    """Group the source chunks: each group becomes one chunk of the compacted file, in file order.
 
-    A merged chunk takes the place of its last source chunk, so that all top-level records that it
-    needs come before it.
+    A merged chunk takes the place of its last source chunk, so that it comes after all top-level
+    records that it needs.
     """
     chunks = list(chunks)
     kinds = _kinds(chunks)
     groups: list[list[ChunkIndex]] = []
-    # The last group of each kind, and the bytes of its records.
+    # The last group of each kind, and the total size of its records in bytes.
     current: dict[int, tuple[list[ChunkIndex], int]] = {}
     for chunk in chunks:
         size = chunk.uncompressed_size
@@ -103,7 +103,7 @@ def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
 
 
 def _kinds(chunks: Iterable[ChunkIndex]) -> dict[int, int]:
-    """Return a number for each channel, equal for channels that share chunks."""
+    """Number the kinds of channels: channels that share a chunk get the same number."""
     kinds: dict[int, int] = {}
     for ids in {tuple(chunk.message_index_offsets) for chunk in chunks}:
         connected = {kinds.get(channel_id, channel_id) for channel_id in ids}
@@ -152,7 +152,7 @@ class _CompactedFile(OutputFile):
         os.replace(self.path, target)
 
     def _copy_top_level(self, view: memoryview, part: slice, summary: Summary) -> None:
-        """Copy the bytes between two chunks, usually none."""
+        """Copy the bytes between two chunks; usually there are none."""
         if part.start == part.stop:
             return
         first_record = part.start or len(MCAP0_MAGIC)

@@ -1,4 +1,4 @@
-"""Decoder of the messages of one channel: as arrays if layouts are equal, else one by one."""
+"""Decoder of one channel: messages with equal layouts become arrays, others are read one by one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mcaprl.recorder.columns.message_rows import (
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.records import RECORD_HEADER
 
-# Messages of a chunk with more different lengths than this are decoded one by one.
+# If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
 
 Columns = dict[str, NDArray[Any]]
@@ -71,7 +71,7 @@ class Decoder:
         }
 
     def fill(self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows) -> None:
-        """Copy the messages of index entries to rows of the columns."""
+        """Decode the messages of the index entries into rows of the columns."""
         if self._put_alike(columns, records, index, rows):
             return
         if isinstance(rows, slice):
@@ -92,7 +92,7 @@ class Decoder:
     def _put_by_length(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: NDArray[np.int64]
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Copy messages of equal length together; return index and rows of the other messages."""
+        """Copy messages of equal length together; return the index entries and rows that remain."""
         if int(index["offset"].max()) > len(records) - MESSAGE_HEADER.itemsize:
             return index, rows
         lengths = gather(records, index, MESSAGE_HEADER)["length"]
@@ -106,7 +106,7 @@ class Decoder:
     def _put_alike(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
     ) -> bool:
-        """Copy the messages and return True if they share one layout; else return False."""
+        """If all messages share one layout, copy them and return True; else return False."""
         found = self.alike(records, index, columns)
         if found is None:
             return False

@@ -73,7 +73,7 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     offsets = index["offset"]
     if offsets[0] or offsets[-1] >= len(records):
         return False
-    # Each size is at least that of a header, so the lengths below do not wrap around.
+    # Each size is at least the size of a header, so the lengths below do not wrap around.
     sizes = np.diff(offsets, append=np.uint64(len(records)))
     if (sizes < MESSAGE_HEADER.itemsize).any():
         return False
@@ -90,7 +90,7 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
 
 
 def check_statistics(reader: McapReader) -> list[Problem]:
-    """Compare the counts of the summary with those of the file.
+    """Compare the counts in the summary with the numbers of records in the file.
 
     Raises:
         CorruptLogError: An index is damaged.

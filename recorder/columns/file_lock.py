@@ -44,7 +44,7 @@ def create(path: Path, *, overwrite: bool) -> FileIO:
             release(file)
     except OSError as error:
         raise LogError(f"cannot write {path}: {error.strerror or error}") from error
-    # Another process has created or replaced the file since it was looked for.
+    # Another process has created or replaced the file in the meantime.
     raise _taken(path)
 
 

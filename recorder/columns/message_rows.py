@@ -29,10 +29,10 @@ MESSAGE_HEADER = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-# Opcode and length, which the length of a record does not include.
+# Size of the opcode and the length field. The length field does not count these bytes.
 RECORD_HEADER_BYTES = 9
 INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
-# The fields of a MessageIndex record before its entries.
+# Fields that precede the entries of a MessageIndex record.
 _INDEX_START = struct.Struct("<BQHI")
 # The first fields of a Message record, equal for all records of one channel and length.
 _HEAD = struct.Struct("<BQH")
@@ -74,7 +74,7 @@ def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
 
 @lru_cache(maxsize=64)
 def _words(size: int) -> np.dtype[Any]:
-    """Return a dtype of the first bytes of a record as two words, which compare faster."""
+    """Return a dtype that reads the start of a record as two words, for faster comparisons."""
     formats, offsets = ["<u8", "<u8"], [0, _HEAD.size - 8]
     return np.dtype(
         {"names": ["front", "back"], "formats": formats, "offsets": offsets, "itemsize": size}
@@ -82,7 +82,7 @@ def _words(size: int) -> np.dtype[Any]:
 
 
 def message_index_head(channel_id: int, entries_bytes: int) -> bytes:
-    """Return the MessageIndex record of a channel up to its entries."""
+    """Return the bytes of a MessageIndex record that precede its entries."""
     length = _INDEX_START.size - RECORD_HEADER_BYTES + entries_bytes
     head: bytes = _INDEX_START.pack(Opcode.MESSAGE_INDEX, length, channel_id, entries_bytes)
     return head
@@ -122,7 +122,7 @@ class MessageRange:
 
     @classmethod
     def of_index(cls, chunk: ChunkIndex | None, index: NDArray[Any]) -> Self:
-        """Return the range of an index that is in memory."""
+        """Create a range from index entries that are already in memory."""
         return cls(chunk, len(index), lambda: index)
 
     @cached_property

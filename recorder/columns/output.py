@@ -38,7 +38,7 @@ class OutputFile:
         self.position, self._crc, self._summary, self._data_end = 0, 0, Summary(), 0
 
     def is_at(self, path: Path) -> bool:
-        """Return whether the open file is the one at a path."""
+        """Return whether `path` refers to the open file."""
         return is_at(self._file.fileno(), path)
 
     def abandon(self) -> None:

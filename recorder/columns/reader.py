@@ -1,11 +1,11 @@
 """Reader of MCAP files: summary, channels, and positions of messages.
 
-The file is mapped into memory, and only the chunks of requested topics are read. Each chunk is
-checked against its CRC, each message against its index entry.
+The file is mapped into memory, and only the chunks of requested topics are read. The reader checks
+each chunk against its CRC and each message against its index entry.
 
-Files of any writer are supported. Records that the summary does not list are searched for: chunks
-and messages between the listed chunks, and schemas, channels and messages inside chunks. A file
-without a summary, whose writer was killed or is still running, is scanned from the start.
+Files of any writer are supported. The reader searches for records that the summary does not list:
+chunks and messages between the listed chunks, and schemas, channels and messages inside chunks. A
+file without a summary is scanned from the start; its writer was killed or is still running.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class McapReader:
         chunks: Indexes of all chunks, in file order.
         schemas: Schemas by id.
         channels: Channels by id.
-        metadata: Metadata records by name; the first of several with the same name.
+        metadata: Metadata records by name. If several have the same name, the first one is kept.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -203,7 +203,7 @@ class McapReader:
         return ranges
 
     def records_of(self, messages: MessageRange, scratch: Scratch | None = None) -> memoryview:
-        """Return the bytes to which the offsets of an index refer; see `chunk_records`.
+        """Return the bytes that contain the messages: a chunk's records, or the whole file.
 
         Raises:
             CorruptLogError: The chunk is damaged.
@@ -218,8 +218,8 @@ class McapReader:
 
         Args:
             chunk: Element of `chunks`.
-            scratch: Memory for the records, which are valid until its next use; each file needs its
-                own.
+            scratch: Memory for the records. They are valid until it is used again. Each file needs
+                its own scratch memory.
 
         Raises:
             CorruptLogError: The chunk is damaged.
@@ -249,10 +249,10 @@ class McapReader:
                 yield time_ns, self.message(records, channel, time_ns, offset)
 
     def message(self, records: memoryview, channel: Channel, time_ns: int, offset: int) -> bytes:
-        """Return the bytes of the message of an index entry.
+        """Return the payload of a message, given the time and offset in its index entry.
 
         Raises:
-            CorruptLogError: The message does not match the entry.
+            CorruptLogError: The message does not match the index entry.
         """
         start = offset + MESSAGE_HEADER.itemsize
         if start <= len(records):
@@ -302,8 +302,8 @@ class McapReader:
             entries = message_index(self.view, offset, channel_id)
             if count not in (None, len(entries)):
                 raise CorruptLogError(
-                    f"the message index at byte {offset} has {len(entries)} entries, not the"
-                    f" {count} of the summary"
+                    f"the message index at byte {offset} has {len(entries)} entries, but the"
+                    f" summary counts {count}"
                 )
             return entries
 
@@ -325,7 +325,7 @@ class McapReader:
         self.chunks.sort(key=_START_OF)
 
     def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
-        """Read the records that the summary does not list; all records if there is no summary."""
+        """Read the records that the summary does not list. Without a summary, read all records."""
         start, before = len(MCAP0_MAGIC), None
         found: list[ChunkIndex] = []
         for chunk in self.chunks:
@@ -335,7 +335,8 @@ class McapReader:
             before, start = chunk, end_of(chunk)
             if start > len(self.view):
                 raise CorruptLogError(
-                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} ends after the file"
+                    f"{self.path}: the chunk at byte {chunk.chunk_start_offset} extends beyond the"
+                    " end of the file"
                 )
         found += self._read_records(start, None, before, unchunked)
         if found:
@@ -348,9 +349,9 @@ class McapReader:
         chunk: ChunkIndex | None,
         unchunked: UnindexedMessages,
     ) -> list[ChunkIndex]:
-        """Read a part of the data section, by default the rest, and return its chunks.
+        """Read the records from `start` to `stop` (None: to the end) and return the chunks found.
 
-        Message indexes at the start of the part belong to `chunk`, the one before the part.
+        Message indexes before the first of these chunks belong to `chunk`, which ends at `start`.
         Messages outside of chunks are added to `unchunked`.
         """
         self.data_end, found = start, []
@@ -370,11 +371,11 @@ class McapReader:
                 self._parse(opcode, content, offset)
             self.data_end = offset + RECORD_HEADER_BYTES + len(content)
         if self.complete and self.data_end != stop:
-            raise CorruptLogError(f"{self.path}: damaged at byte {self.data_end}: no record there")
+            raise CorruptLogError(f"{self.path}: there is no valid record at byte {self.data_end}")
         return found
 
     def _check_data_crc(self) -> None:
-        """Check the CRC of the data section, the only one that covers unchunked messages."""
+        """Check the CRC of the data section; no other CRC covers unchunked messages."""
         offset, opcode, content = next(self.records(self.data_end), (0, 0, memoryview(b"")))
         if opcode == Opcode.DATA_END:
             (crc,) = struct.unpack_from("<I", content)
@@ -408,7 +409,7 @@ class McapReader:
             self._keep(parse_record(opcode, content))
 
     def _keep(self, record: McapRecord) -> None:
-        """Store a record, unless one with its id or name was read before (from the summary)."""
+        """Store a record, unless an earlier record has the same id or name."""
         match record:
             case Schema():
                 self.schemas.setdefault(record.id, record)

@@ -89,7 +89,7 @@ def records_of(
 ) -> Iterator[tuple[int, int, memoryview]]:
     """Yield offset, opcode and content of each record from `start` on.
 
-    Stops before a record that extends beyond `stop`, by default the end of the view.
+    Stops before a record that extends beyond `stop`. The default is the end of the view.
     """
     offset, stop = start, len(view) if stop is None else stop
     while offset + RECORD_HEADER.size <= stop:
@@ -131,7 +131,7 @@ def is_intact_attachment(content: memoryview) -> bool:
 
 @dataclass
 class UnindexedMessages:
-    """Messages found by a scan, by channel id, in file order."""
+    """Times and offsets of the messages that a scan found, by channel id and in file order."""
 
     _times: dict[int, array[int]] = field(default_factory=dict)
     _offsets: dict[int, array[int]] = field(default_factory=dict)
@@ -188,14 +188,14 @@ def contents_of(chunk: memoryview) -> ChunkContents:
             topics.append(parse_record(opcode, content))
         end = offset + RECORD_HEADER_BYTES + len(content)
     if end != len(chunk):
-        raise CorruptLogError("a record ends after its chunk")
+        raise CorruptLogError("a record extends beyond the end of its chunk")
     return ChunkContents(topics, messages.indexes())
 
 
 def only(
     records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Copy the records of index entries; return the copies and their indexes."""
+    """Copy the records that the indexes point to; return the copies and new indexes for them."""
     kept, new = bytearray(), {}
     for channel_id, index in indexes.items():
         entries = []
@@ -208,7 +208,7 @@ def only(
 
 
 def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
-    """Return the indexes of a chunk of messages of one length; None for any other chunk."""
+    """Return the indexes of a chunk; None unless all its records are messages of equal length."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None
     size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]

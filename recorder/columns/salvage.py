@@ -1,9 +1,10 @@
 """Search for the valid records of a damaged MCAP file.
 
-MCAP has no synchronization markers. The search for the record after a damaged one skips the length
-of the damaged one; if no valid record follows, it tries each byte over a limited distance, then
-looks for chunks, in which two lengths must agree. A record is valid if its lengths agree and if
-serializing its parsed content reproduces its bytes. Chunk CRCs are checked at decompression only.
+MCAP has no synchronization markers. After a damaged record, the search first skips the length that
+this record declares. If no valid record follows, the search tries each byte over a limited
+distance. Then it looks only for chunks, in which two lengths must agree. A record is valid if its
+lengths agree and if serializing its parsed content reproduces its bytes. The CRC of a chunk is
+checked only when the chunk is decompressed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
 _SEARCHED = (*_REWRITTEN, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _CHUNK_NAME = struct.Struct("<QQQII")
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
-# Distance over which every byte is tried; beyond it, only chunks are searched for.
+# The search tries every byte over this distance; beyond it, the search looks only for chunks.
 _NEAR_BYTES = 2**16
 _BLOCK_BYTES = 2**22
 
@@ -74,7 +75,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
             damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # The length is compared first: copying the rest at each record would take quadratic time.
+        # Compare the length first: a copy of the remaining file for each record would be slow.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 
@@ -153,7 +154,7 @@ def _next_record(view: memoryview, damaged: int) -> int:
         is_valid = (
             following < len(view) and view[following] in _KNOWN and _valid_record(view, following)
         )
-        # A wrong length can lead into a later chunk, past valid ones.
+        # A wrong length can point to a later chunk, so that valid chunks are skipped.
         if is_valid and _next_chunk(view, damaged + 1, following) == following:
             return following
     near = min(damaged + _NEAR_BYTES, len(view))

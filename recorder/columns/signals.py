@@ -24,8 +24,8 @@ _HELD = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 class HoldSignals:
     """Context manager that delays signals; they are handled as usual at its end.
 
-    Only a context in the main thread, where Python runs all handlers, has an effect; a nested one
-    has none.
+    A context has an effect only in the main thread, where Python runs all handlers. A nested
+    context has no effect.
     """
 
     _is_held: ClassVar[bool] = False

@@ -1,7 +1,7 @@
 """Messages of a topic as columns: one array for each wanted field, in the order of log_time.
 
-Messages of equal length in a chunk are read as one array, even if other records lie between them;
-all others are decoded one by one, with the same values.
+Messages of equal length in a chunk are read as one array, even if other records lie between them.
+All other messages are decoded one by one; their values are the same as in an array.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class Topic:
 
     @cached_property
     def chunks_rise(self) -> bool:
-        """Whether all messages are of one channel, in chunks whose times do not overlap."""
+        """Whether one channel has all messages, and the times of its chunks do not overlap."""
         chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
         return (
             self.channels == 1
@@ -125,8 +125,8 @@ class Topic:
 
         Args:
             wanted: Names of fields.
-            order: Positions in `times` of the messages to read; default: all. Other chunks are not
-                read.
+            order: Positions in `times` of the messages to read, by default all. Chunks without
+                such messages are not read.
             threads: Number of threads that decompress chunks and copy messages.
 
         Raises:

@@ -40,7 +40,7 @@ def recover_file(
     Args:
         source: Path of the damaged file.
         target: Path of the new file; an existing one is replaced.
-        damages: List to which damaged places and records that cannot be copied are added.
+        damages: List that receives the damaged places and the records that cannot be copied.
         restore: Function that returns the metadata records to write.
 
     Raises:
@@ -75,8 +75,8 @@ def copy_messages(
         target: Path of the new file; an existing one is replaced.
         actions_of: Function that returns the action for each message of one channel in one chunk,
             given their index: `DROP`, `KEEP`, or a larger number for a message to edit.
-        edit: Function that changes a message in place, given its channel, the bytes of the chunk
-            from its data on, and the action.
+        edit: Function that changes a message in place. It gets the channel, the bytes of the chunk
+            from the message's payload on, and the action.
 
     Yields:
         The writer, for more messages.
@@ -110,7 +110,7 @@ def copy_messages(
 def _writer_like(
     view: memoryview, records: Iterable[ValidRecord], target: Path
 ) -> Iterator[McapWriter]:
-    """Open a writer with the profile and the compression (of the first chunk) of a file."""
+    """Open a writer with the profile of a file and the compression of its first chunk."""
     profile, compression = "ros2", "zstd"
     for offset, opcode, content in records:
         if opcode == Opcode.HEADER:
@@ -137,7 +137,7 @@ class _Topics:
         self._damages = damages
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
-        # The summary has its own CRC; the CRC of the data section fails at any damage.
+        # The copies in the summary are the most reliable, since the summary has a separate CRC.
         for record in intact_summary(view):
             if not isinstance(record, ChunkIndex):
                 self.take(record, 0)
@@ -156,7 +156,7 @@ class _Topics:
             self._damages.append(Damage(offset, 0, what))
 
     def announce(self, channel_id: int, writer: McapWriter) -> bool:
-        """Write a channel and its schema unless they are written; return whether they are known."""
+        """Write a channel and its schema once; return False if a definition of them is missing."""
         channel = self.channels.get(channel_id)
         if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
             return False
@@ -174,8 +174,8 @@ class _Copy:
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
-        # Offsets of the chunks with a CRC and length. Chunks listed in an intact
-        # summary are never repeated ones, even if their records are equal.
+        # Offsets of the chunks so far, by the CRC and length of their records. A chunk that an
+        # intact summary lists is never a repeated chunk, even if an earlier one has equal records.
         self._seen: dict[tuple[int, int], list[int]] = {}
         self._listed = {
             record.chunk_start_offset

@@ -39,7 +39,7 @@ class McapWriter(OutputFile):
 
     Attributes:
         path: Path of the current file.
-        position: Length of the file so far; while appending, without the old summary.
+        position: Length of the file so far. While appending, the old summary is not counted.
         untouched: Whether the file existed before and nothing has been written to it yet.
     """
 
@@ -70,7 +70,7 @@ class McapWriter(OutputFile):
         if compression not in COMPRESSIONS:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self._compressors, self._profile = Compressors(compression), profile
-        # Records that every file starts with, in this order.
+        # Records at the start of every file, in this order.
         self._top_level: list[TopLevelRecord] = []
         if append and Path(path).exists():
             self._continue(Path(path))
@@ -102,7 +102,7 @@ class McapWriter(OutputFile):
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Write the channel of a topic of `ros2msg` messages if it is new; return its id.
+        """Return the channel id of a topic of `ros2msg` messages; write the channel if it is new.
 
         Raises:
             LogError: The topic has messages of another type.

@@ -214,5 +214,5 @@ def test_an_index_with_too_few_messages_is_refused(large: Path, tmp_path: Path) 
     struct.pack_into("<I", spoilt, place, reported - 16)
     path = tmp_path / "spoilt.mcap"
     path.write_bytes(spoilt)
-    with pytest.raises(CorruptLogError, match="has 8191 entries, not the 8192 of the summary"):
+    with pytest.raises(CorruptLogError, match="has 8191 entries, but the summary counts 8192"):
         mcaprl.open(path)
