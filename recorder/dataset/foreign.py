@@ -68,7 +68,7 @@ def inferred_metadata(reader: McapReader, columns: Columns) -> LogMetadata:
     for leaf in observation_leaves(metadata.observation_space):
         if not (reader.channels_of(leaf.topic) if leaf.encoding else leaf.name in columns):
             raise LogError(
-                f"{reader.path}: the observation '{leaf.path[0]}' is not named"
+                f"{reader.path}: the observation '{leaf.path[0]}' must be named"
                 f" {leaf.topic if leaf.encoding else leaf.name}; use lower-case letters, digits and"
                 " single underscores"
             )

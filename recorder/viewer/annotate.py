@@ -1,7 +1,7 @@
-"""Annotation of a copy of a log: topics with policies' outputs at its steps, or with its scene.
+"""Annotation of a copy of a log with topics that contain the outputs of policies, or the scene.
 
-The copy contains all messages of the log, followed by the new messages with the log_times of their
-steps, and a layout that shows the new topics.
+The copy contains all messages of the log, then the new messages, and a layout that shows the new
+topics. Each new message has the log_time of its step.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from mcaprl.recorder.viewer.verify import Verification, verify
 
 @contextmanager
 def annotated_copy(source: Path, out: Path, *, overwrite: bool = False) -> Iterator[AnnotatedCopy]:
-    """Yield a copy of a log, which is moved to `out` if the body ends without an error.
+    """Yield a copy of a log; move it to `out` if the `with` block ends without an error.
 
     Args:
         source: Path of the log.
-        out: Path of the copy, which may be the log's.
+        out: Path of the copy; may be equal to `source`.
         overwrite: Whether to replace an existing file.
 
     Raises:
@@ -65,11 +65,11 @@ class AnnotatedCopy:
         self._display: Display | None = None
 
     def add_values(self, topic: str, episodes: Sequence[tuple[Episode, Mapping[str, Any]]]) -> None:
-        """Write a topic of `schema.values_schema`, one message for each step.
+        """Write a topic with schema `schema.values_schema` and one message per step.
 
         Args:
             topic: Topic to write; see `values_topics`.
-            episodes: Episodes with their columns, (T, ...) by field.
+            episodes: Episodes, each with a dict of the columns (T, ...) by field name.
 
         Raises:
             UsageError: The log already has the topic.
@@ -89,7 +89,7 @@ class AnnotatedCopy:
 
         Raises:
             UsageError: The log already has a scene, or the environment provides none.
-            LogError: The replay differs from the log, or the log lacks seeds of episodes.
+            LogError: The replay differs from the log, or the log has no seed for an episode.
         """
         self._refuse(SCENE)
         display = Display(self._log, env.unwrapped, scene=True, camera=camera)

@@ -96,7 +96,7 @@ class ViewerServer:
 
     @property
     def app_url(self) -> str:
-        """Link that opens Foxglove connected to the server."""
+        """Link that opens Foxglove and connects it to the server."""
         return str(self._server.app_url()).replace(quote(self._inner), quote(self._outer))
 
     @property
@@ -118,5 +118,5 @@ class ViewerServer:
 
 
 def _hidden_host() -> str:
-    """Return a loopback address that no web page can guess, to bypass the filter."""
+    """Return a random loopback address, so that no web page finds a way around the filter."""
     return "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))

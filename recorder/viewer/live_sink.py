@@ -49,7 +49,7 @@ class LiveSink(MessageSink):
         return any(channel.has_sinks() for channel in self._channels)
 
     def welcome(self) -> None:
-        """Send the kept messages to all viewers, for a new one."""
+        """Send the kept messages to all viewers, because a new viewer needs them."""
         self._has_newcomers = True
 
     def send(self, channel_id: int, time_ns: int, data: bytes) -> None:

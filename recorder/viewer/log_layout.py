@@ -21,8 +21,8 @@ def layout_of_log(
 
     Args:
         reader: Reader of the log.
-        topics: Topics to show; default: those of the log.
-        shown: Display topics to show instead of the log's; default: the log's.
+        topics: Topics to show; default: all topics of the log.
+        shown: Source of telemetry names and the frame to follow; default: the log.
 
     Raises:
         LogError: The file has no transitions, or is damaged.

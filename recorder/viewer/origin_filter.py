@@ -1,10 +1,10 @@
 """A proxy in front of the Foxglove server that only lets trusted web pages connect.
 
-Any web page can open a WebSocket to a local port; the browser sends the page's origin in `Origin`,
-which the server must check. foxglove-sdk does not, so this proxy checks the head of each request
-and forwards allowed connections unchanged. Requests without `Origin` are allowed, because they come
-from local programs other than browsers. `Host` is also checked, because a foreign page's host name
-can resolve to this machine (DNS rebinding).
+Any web page can open a WebSocket to a local port. The browser sends the page's origin in the header
+`Origin`, which a server must check. foxglove-sdk does not check it. This proxy checks the head of
+each request and forwards allowed connections unchanged. Requests without `Origin` are allowed,
+because they come from local programs other than browsers. `Host` is also checked, because the host
+name of another page can resolve to this machine (DNS rebinding).
 """
 
 from __future__ import annotations

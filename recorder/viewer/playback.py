@@ -1,6 +1,6 @@
 """Playback of logs by a clock with pause, speed and seek.
 
-Messages are located by the indexes of the memory-mapped file and read on demand. Only a few
+The indexes of the memory-mapped file locate messages, which are read on demand. Only a few
 decompressed chunks are cached, so memory use does not grow with the log.
 """
 
@@ -84,9 +84,9 @@ class Track:
             yield place.time_ns, place.channel, self._message(place)
 
     def latest(self, time_ns: int) -> _Messages:
-        """Yield the latest message of each topic up to a time, which defines the display.
+        """Yield the latest message of each topic up to a time; a viewer shows these messages.
 
-        Messages before the window are included.
+        Messages before `start_ns` are included.
         """
         for topic in self._topics:
             place = topic.latest(min(time_ns, self.end_ns))
@@ -146,7 +146,7 @@ class _TopicIndex:
 
 
 def _rows_before(part: MessageRange, time_ns: int) -> int:
-    # NumPy would compare uint64 times with a signed integer as floats.
+    # NumPy would convert uint64 times to floats to compare them with a signed integer.
     return int(np.searchsorted(part.index["log_time"], np.uint64(max(time_ns, 0))))
 
 
@@ -159,7 +159,7 @@ def _by_time(part: MessageRange) -> MessageRange:
 
 @dataclass
 class Player:
-    """Playback clock of one or more logs; all logs are shifted to start at the first one's start.
+    """Playback clock of one or more logs, which are shifted to the start time of the first log.
 
     Attributes:
         tracks: Logs to play.
@@ -193,7 +193,7 @@ class Player:
         self._next_ns = self.time_ns + 1
 
     def current_messages(self) -> list[Played]:
-        """Return the latest message of each topic, as needed by a new viewer."""
+        """Return the latest message of each topic, which a new viewer needs."""
         return self._played(lambda track, shift: track.latest(self.time_ns - shift))
 
     def advance(self, elapsed_s: float) -> list[Played]:
@@ -208,7 +208,7 @@ class Player:
         return sorted(due, key=lambda message: message.time_ns)
 
     def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
-        """Return the messages that a function finds in each shifted log."""
+        """Call `found` on each log, and return its messages with times on the player's clock."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

@@ -1,7 +1,7 @@
 """A live server that plays logs to Foxglove, with play, pause, speed and seek.
 
-Messages are sent as they are stored in the file. If several logs are played at once, frame names in
-messages get a prefix per log, so that the frames of two cars differ.
+Messages are sent as they are stored in the file. If several logs are played at once, a prefix for
+each log is added to the frame names in its messages, so that the frames of two cars differ.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 _PERIOD_S = 1 / 30
 # Range of speeds that a viewer may request; others are ignored.
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
-# Viewers drop all that they have when the time goes back, so it has to arrive before the picture;
-# the server has separate queues for times and messages.
+# Viewers drop all messages when the time goes back, so the time has to arrive before the picture.
+# The server has separate queues for times and messages, so the picture waits for these ticks.
 _TICKS_AFTER_SEEK = 2
 # Topics whose messages are events; a viewer that receives one twice shows it twice.
 _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
 
 
 class LiveServer(ViewerServer):
-    """Server that plays logs to all connected viewers, starting with the first subscriber.
+    """Server that plays logs to all connected viewers; playback starts at the first subscription.
 
-    Viewers can set two parameters: `episode`, which seeks to the episode's start, and `loop`.
+    Viewers can set two parameters: `episode` seeks to the start of an episode, and `loop` sets
+    whether playback restarts at the end.
     """
 
     def __init__(
@@ -89,9 +90,9 @@ class LiveServer(ViewerServer):
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the messages that are due, after the current picture to those who need one."""
-        # The lock is held until all is sent, so that no message from before a seek follows the
-        # response to the seek.
+        """Send the messages that are due; first send the current picture to viewers without it."""
+        # The lock is held until all messages are sent. Otherwise a message from before a seek could
+        # arrive after the response to the seek.
         with self._lock:
             player = self._player
             if player.ended and player.loops and player.playing:
@@ -171,7 +172,7 @@ class LiveServer(ViewerServer):
         return [message for message in current if self._is_lacking(message, joined, seeked)]
 
     def _is_lacking(self, message: Played, joined: set[int], seeked: bool) -> bool:
-        """Return whether viewers lack a current message, and none gets an event twice."""
+        """Return whether viewers lack a current message; never send an event to a viewer twice."""
         channel_id = self._channels[message.track, message.channel_id].id()
         topic = self._reader(message.track).channels[message.channel_id].topic
         if topic not in _EVENT_TOPICS:
@@ -179,7 +180,7 @@ class LiveServer(ViewerServer):
         first_ns = self._player.start_ns
         is_first = channel_id in joined and self._subscribers[channel_id] == 1
         if not is_first and self._player.time_ns >= self._sent_ns:
-            # A seek forward leaves viewers the events that they have.
+            # After a seek forward, viewers still show earlier events.
             first_ns = max(first_ns, self._sent_ns + 1)
         return (seeked or is_first) and message.time_ns >= first_ns
 

@@ -14,7 +14,7 @@ WORLD = "map"
 """Name of the frame that all logs share."""
 _MARKERS, _FRAMES = "visualization_msgs/msg/MarkerArray", "tf2_msgs/msg/TFMessage"
 PREFIXED_TYPES = (_MARKERS, _FRAMES)
-"""Types of messages that contain names of frames, which get a prefix."""
+"""Types of messages that contain frame names; these names get a prefix."""
 
 
 def prefixes_of(paths: Sequence[Path]) -> list[str]:
@@ -37,7 +37,7 @@ def prefixes_of(paths: Sequence[Path]) -> list[str]:
 
 
 def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) -> bytes:
-    """Return a message with prefixed frame names, except `WORLD`, and shifted stamps.
+    """Add a prefix to a message's frame names other than `WORLD`, and shift its stamps.
 
     Args:
         data: CDR bytes of the message.
@@ -71,7 +71,7 @@ def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
     if not prefix:
         return layout
     text = json.dumps(layout)
-    # Every string that begins with a slash is a topic; panels are named Kind!what.
+    # Strings that begin with a slash are topics. Names of panels have the form `Kind!title`.
     text = re.sub(r'"(/[a-z])', rf'"/{prefix}\1', text)
     text = re.sub(r'"(\w+)!', rf'"\1!{prefix} ', text)
     text = re.sub(r'("followTf": ")(?!map")', rf"\1{prefix}/", text)

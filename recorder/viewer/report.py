@@ -96,7 +96,7 @@ def _findings_section(findings: Sequence[Problem]) -> Section:
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
-    """Return the section on behavior probabilities; none if they are unknown."""
+    """Return a list of the section on behavior probabilities; empty if they are unknown."""
     found = calibration(dataset.behavior_probs, dataset.action_space)
     if found is None:
         return []
@@ -162,7 +162,7 @@ def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
 
 
 def _commands(dataset: Dataset) -> list[str]:
-    """Return the command that replays each episode; empty if the file is unknown."""
+    """Return one command per episode that replays it; an empty string if its file is unknown."""
     counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
     if sum(counts) != len(dataset.episodes):
         return [""] * len(dataset.episodes)
@@ -183,7 +183,7 @@ def _card(kind: str, episode: Episode, track: Positions, places: Positions, comm
 
 
 def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
-    """Plot an episode's track over all positions, or its cumulative reward without positions."""
+    """Plot an episode's track over all positions, or the cumulative reward if it has no track."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)
@@ -238,7 +238,7 @@ def _bars(axes: Any, counts: Mapping[str, int], label: str) -> None:
 
 
 def tracks_of(dataset: Dataset) -> list[Positions]:
-    """Return each episode's positions, (T + 1, 2) x and y in meters; (0, 2) where unknown.
+    """Return the positions (T + 1, 2) of each episode in meters; (0, 2) if they are unknown.
 
     Raises:
         LogError: A file of the dataset is missing or damaged.
@@ -248,7 +248,7 @@ def tracks_of(dataset: Dataset) -> list[Positions]:
 
 
 def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
-    """Return the times (M,) and positions (M, 2) of a log; None if it has none."""
+    """Return the times (M,) and positions (M, 2) in a log; None if it has no positions."""
     topic = Topic(McapReader(path), TELEMETRY)
     if not len(topic) or not set(_POSITION) <= set(topic.fields):
         return None
@@ -259,7 +259,7 @@ def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
 def _positions_at(
     times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
 ) -> Positions:
-    """Return the positions at exactly these times, or an empty array if no log has them."""
+    """Return the positions at these exact times, or an empty array if no log contains them all."""
     for known, positions in logs:
         start = int(np.searchsorted(known, times[0]))
         stop = start + len(times)

@@ -1,4 +1,4 @@
-"""Steps of an annotated log with large TD errors or with disagreement of the policy."""
+"""Steps of an annotated log where the TD error is large, or a policy would act differently."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHOWN = 5
 
 @dataclass(frozen=True)
 class Surprise:
-    """A step with a large TD error, or whose logged action a policy disagrees with.
+    """A step with a large TD error, or at which a policy would take another action.
 
     Attributes:
         file: Path of the log.
@@ -29,8 +29,8 @@ class Surprise:
         time_ns: log_time of the step.
         episode: Index of the episode in the log.
         step: Index of the step in the episode.
-        value: TD error; for a disagreement, the logged action's advantage, or the policy's
-            normalized entropy if the policy has no values.
+        value: TD error, or for a disagreement the advantage of the logged action. If the policy has
+            no Q-values, the value of a disagreement is the policy's normalized entropy.
     """
 
     file: str
@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy."""
+    """Yield the disagreements with the lowest advantage, or entropy if there are no Q-values."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]
@@ -97,7 +97,7 @@ def _largest(numbers: NDArray[Any], chosen: NDArray[np.bool_]) -> list[int]:
 
 
 def _places(steps: Topic) -> dict[int, tuple[int, int]]:
-    """Return the episode and step of each log_time."""
+    """Return a dict from each log_time to its episode and step."""
     times = steps.times
     order = np.argsort(times, kind="stable")
     step = steps.read(("step",))["step"][order]

@@ -80,7 +80,7 @@ class Verification:
     Attributes:
         episodes: Number of compared episodes.
         steps: Number of compared steps.
-        unseeded: Indexes of episodes that cannot be replayed, since their start is unknown.
+        unseeded: Indexes of episodes that cannot be replayed, because their start is unknown.
         difference: The first difference; None if there is none.
     """
 
@@ -90,7 +90,7 @@ class Verification:
     difference: Difference | None
 
     def problems(self, file: str = "") -> list[Problem]:
-        """List the difference, and a note on the episodes that were not compared."""
+        """Return the difference, if any, and a note if episodes were not compared."""
         found = [] if self.difference is None else [self.difference.to_problem(file)]
         if self.unseeded:
             more = ", ..." if len(self.unseeded) > _MOST_EPISODES else ""
@@ -107,15 +107,15 @@ def verify(
     only: int | None = None,
     on_frame: Callable[[Episode, int], None] = lambda episode, step: None,
 ) -> Verification:
-    """Step `env` through the log up to the first difference.
+    """Repeat the logged actions in `env` up to the first difference.
 
     Args:
         dataset: Dataset of one log.
         env: New environment of the same kind, which is reset and stepped.
-        only: Index of the only episode to return a difference for; earlier episodes are stepped
-            too if its random state depends on them. Default: all episodes.
-        on_frame: Callback with the episode and step, called after each identical observation,
-            while the environment is in that state.
+        only: Index of the episode to compare. Earlier episodes are also compared if its random
+            state depends on them. Default: all episodes.
+        on_frame: Function that is called with the episode and step after each identical
+            observation, while the environment is in that state.
 
     Raises:
         SpaceError: The spaces of the environment and the log differ.
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return an episode and those that its start depends on; all if `only` is None."""
+    """Return the episode `only` and the episodes that its start depends on; default: all."""
     if only is None:
         return episodes
     first = only
@@ -164,7 +164,7 @@ def _compare(
     episode: Episode,
     on_frame: Callable[[Episode, int], None],
 ) -> Difference | None:
-    """Step one episode and return its first difference."""
+    """Replay one episode and return the first difference."""
     leaves = observation_leaves(dataset.observation_space)
     for step, now in enumerate(_stepped(env, episode, dataset.action_space)):
         fields = []
@@ -263,4 +263,4 @@ def _check_spaces(dataset: Dataset, env: gym.Env[Any, Any]) -> None:
         logged, actual = getattr(dataset, role), getattr(env, role)
         if logged != actual:
             name = env.spec.id if env.spec else "the environment"
-            raise SpaceError(f"the log has {role} {logged}; {name} has {actual}")
+            raise SpaceError(f"the log has {role} {logged}, but {name} has {actual}")
