@@ -40,6 +40,7 @@ from mcaprl.recorder.viewer.video import (
     VIDEO_KINDS,
     check_output,
     evenly_spaced,
+    parts_of_step,
     shown_steps,
     write_sheet,
     write_video,
@@ -222,7 +223,8 @@ def render(
     dataset = open_logs(path)
     one = dataset.episodes[episode]
     reader = McapReader(path)
-    if reader.channel_of(SCENE) is not None:
+    has_scene = reader.channel_of(SCENE) is not None
+    if has_scene:
         draw = partial(_of_scene, reader, dataset, one)
     else:
         make = partial(sim_of, dataset, path, sim, trust_env=trust_env, render_mode="rgb_array")
@@ -231,8 +233,11 @@ def render(
     if movie is not None:
         step_ns = float(np.median(np.diff(one.log_time_ns)))
         shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
-        with progress(f"drawing {movie}", len(shown)) as advance:
-            frames = write_video(movie, _counted(draw(shown), advance), images_per_s)
+        # The sim renders steps only.
+        parts = parts_of_step(images_per_s) if has_scene else 1
+        images = draw(shown, parts) if has_scene else draw(shown)
+        with progress(f"drawing {movie}", (len(shown) - 1) * parts + 1) as advance:
+            frames = write_video(movie, _counted(images, advance), images_per_s * parts)
     if sheet is not None:
         stills = evenly_spaced(one.length, _STILLS)
         write_sheet(sheet, list(draw(stills)))
@@ -240,14 +245,18 @@ def render(
 
 
 def _of_scene(
-    reader: McapReader, dataset: Dataset, episode: Episode, steps: Collection[int]
+    reader: McapReader,
+    dataset: Dataset,
+    episode: Episode,
+    steps: Collection[int],
+    parts: int = 1,
 ) -> _Images:
     from mcaprl.sims.drawing.chase_view import ChaseView
     from mcaprl.sims.drawing.scene import Frame, Shape
 
     static, last = [], None
     with closing(ChaseView()) as view:
-        for moment in moments_of_episode(reader, episode):
+        for moment in moments_of_episode(reader, episode, parts):
             if moment.step not in steps:
                 continue
             if moment.static is not last:
@@ -257,7 +266,7 @@ def _of_scene(
                 [Shape(**vars(seen)) for seen in moment.moving],
                 [Frame(**vars(seen)) for seen in moment.frames],
                 moment.follow,
-                _caption(dataset, episode, moment.step),
+                _caption(dataset, episode, moment.step, moment.time_ns),
             )
 
 
@@ -287,9 +296,9 @@ def _of_sim(
     yield from found
 
 
-def _caption(dataset: Dataset, episode: Episode, step: int) -> list[str]:
+def _caption(dataset: Dataset, episode: Episode, step: int, time_ns: int) -> list[str]:
     """Return the lines in the corner of an image."""
-    since_s = (episode.log_time_ns[step] - episode.log_time_ns[0]) / 1e9
+    since_s = (time_ns - int(episode.log_time_ns[0])) / 1e9
     first = f"episode {episode.index}   {since_s:.2f} s   step {step} of {episode.length}"
     total = float(episode.rewards[:step].sum())
     if step == episode.length:

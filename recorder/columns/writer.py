@@ -23,7 +23,11 @@ from mcaprl._version import __version__
 from mcaprl.errors import LogError, UnknownNameError
 from mcaprl.files import remove_leftover
 from mcaprl.recorder.columns.append import TopLevelRecord, WrittenState, written_state
-from mcaprl.recorder.columns.chunks import LONG_MESSAGE_BYTES, Compressors
+from mcaprl.recorder.columns.chunks import (
+    LONG_MESSAGE_BYTES,
+    RARE_MESSAGE_BYTES,
+    Compressors,
+)
 from mcaprl.recorder.columns.compact import compact
 from mcaprl.recorder.columns.file_lock import copy_start, create, release, reopen, replaced
 from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, adjacent_offsets, message_record
@@ -194,12 +198,13 @@ class McapWriter(OutputFile):
             records += message_record(channel_id, counts[channel_id] % 2**32, time_ns, data)
             counts[channel_id] += 1
         times = [time_ns for _, time_ns, _ in messages]
+        is_rare = len(records) > RARE_MESSAGE_BYTES * len(messages)
         self._store(
             memoryview(records),
             # There are few entries, for which `struct` is faster than an array.
             {id_: struct.pack(f"<{len(pairs)}Q", *pairs) for id_, pairs in entries.items()},
             (min(times), max(times)),
-            self._compressors.mixed,
+            self._compressors.rare if is_rare else self._compressors.mixed,
         )
 
     def write_records(self, records: memoryview, indexes: Mapping[int, NDArray[Any]]) -> None:

@@ -1,13 +1,16 @@
 """Topics that only viewers read, with the same log times as the transitions.
 
-/scene, /scene/static   shapes: moving ones at most five times a second and at each episode's start
-                        and end; static ones when they differ from the previous episode's. A viewer
-                        that seeks needs only the latest message of each topic
+/scene                  moving shapes, at most ten times a second, and at episode starts and ends
+/scene/static           static shapes, when they differ from those of the previous episode
 /scene/tracks           tracks of the episodes so far, written at the ends of episodes
-/tf, /tf_static         frames: moving ones at each step, and at the moments within the step that
-                        the environment provides; static ones as above
+/tf                     moving frames at each step, and their poses until the next step; each pose
+                        has its own stamp
+/tf_static              static frames, when they differ from those of the previous episode
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
+/camera/camera_info     intrinsics of the depth camera, once
+
+A viewer that seeks needs only the latest message of each scene topic.
 """
 
 from __future__ import annotations
@@ -22,12 +25,16 @@ from mcaprl.recorder.format.log_writer import LogTopics
 from mcaprl.recorder.format.schema import telemetry_message, telemetry_schema
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.layout import RETURN_SO_FAR
+from mcaprl.recorder.record.motion import Moment, motion_transforms
 from mcaprl.recorder.record.scene import (
     DepthSource,
+    Frame,
     MotionSource,
+    PinholeSource,
     SceneSource,
     Shape,
     TelemetrySource,
+    camera_info,
     depth_millimeters,
     marker_array,
     transforms,
@@ -36,13 +43,14 @@ from mcaprl.recorder.record.step_rows import ImageColumn
 from mcaprl.recorder.record.tracks import Tracks
 
 SCENE, SCENE_STATIC, TRACKS = "/scene", "/scene/static", "/scene/tracks"
-TF, TF_STATIC, TELEMETRY, DEPTH = "/tf", "/tf_static", "/telemetry", "/camera/depth"
+TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
+DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Display messages are written when they exceed this size or the episode ends.
 _CHUNK_BYTES = 2**20
 # Tracks are written again when the messages since the last ones have this many times their size.
 _BYTES_PER_TRACKS = 4
 # Bodies move with their frames at each step; other moving shapes are redrawn after this time.
-_SCENE_PERIOD_NS = 200_000_000
+_SCENE_PERIOD_NS = 100_000_000
 
 
 class ShownTopics:
@@ -55,7 +63,7 @@ class ShownTopics:
     """
 
     def __init__(self, log: LogTopics, source: object) -> None:
-        """Announce the topics that `source`, an environment after `reset`, provides."""
+        """Add a channel for each topic that `source` provides; `source` must have been reset."""
         types: dict[str, str] = {}
         self.telemetry_names: tuple[str, ...] = ()
         self.follow_frame = ""
@@ -78,7 +86,7 @@ class ShownTopics:
 
 
 class Display:
-    """The display messages of an episode, collected and written in separate chunks."""
+    """A buffer of an episode's display messages, which writes them in separate chunks."""
 
     def __init__(self, log: LogTopics, source: object, *, scene: bool, camera: bool) -> None:
         """Select the topics to record.
@@ -101,12 +109,15 @@ class Display:
         camera = camera or bool(log.image_leaves)
         self._depth = source if camera and isinstance(source, DepthSource) else None
         self._depth_images: ImageColumn | None = None
+        self._camera = b""
         self.shows_steps = any((self._scene, self._telemetry, self._depth))
         self._shown: ShownTopics | None = None
         self._tracks, self._bytes_since_tracks = Tracks(), 0
         self._static: dict[str, bytes] = {}
         # Latest shapes that are not drawn yet; they are drawn at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
+        # Frames at the latest step, which are written with the motion after it.
+        self._moment: Moment | None = None
 
     @property
     def shown(self) -> ShownTopics:
@@ -130,23 +141,28 @@ class Display:
             if self._depth is not None:
                 shape = self._depth.depth_image_m().shape
                 self._depth_images = ImageColumn(self._log, DEPTH, shape, "16UC1")
+                if isinstance(self._depth, PinholeSource):
+                    self._camera = camera_info(self._depth.depth_focal_px(), shape)
+                    channel = self._log.add_channel(CAMERA_INFO, "sensor_msgs/msg/CameraInfo")
+                    self.shown.channels[CAMERA_INFO] = channel
         if self._scene is not None:
             self._emit_changed(SCENE_STATIC, start_ns, marker_array(self._scene.static_scene()))
             self._emit_changed(TF_STATIC, start_ns, transforms(self._scene.static_frames(), 0))
         if self._depth_images is not None:
             self._depth_images.begin(start_ns, step_ns)
+        if self._camera:
+            self._emit_changed(CAMERA_INFO, start_ns, self._camera)
 
     def observe(self, step: int, reward: float) -> None:
-        """Add the display messages after `step` steps, the last of which had this reward."""
+        """Add the messages that show the state after `step` steps, and the last step's reward."""
         self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
             self._pending = (time_ns, self._scene.scene())
             if step % self._steps_per_scene == 0:
                 self._draw_pending()
-            self._emit_motion(time_ns)
             frames = self._scene.frames()
-            self._emit(TF, time_ns, transforms(frames, time_ns))
+            self._emit_motion(time_ns, frames)
             if frames:
                 self._tracks.add(frames[0].position)
         if self._telemetry is not None:
@@ -161,6 +177,9 @@ class Display:
     def end(self, summary: EpisodeSummary) -> None:
         """Write the messages of an episode that has ended."""
         self._draw_pending()
+        if self._moment is not None:
+            self._emit(TF, self._moment[0], motion_transforms([self._moment]))
+            self._moment = None
         if self._scene is not None:
             self._emit_tracks(summary)
         self._flush_messages()
@@ -172,10 +191,10 @@ class Display:
         if self._messages:
             # The dropped messages may include the static scene.
             self.resend_static()
-        self._messages, self._bytes, self._pending = [], 0, None
+        self._messages, self._bytes, self._pending, self._moment = [], 0, None, None
 
     def resend_static(self) -> None:
-        """Write the static scene again with the next episode, for a new file."""
+        """Write all static messages again in the next episode."""
         self._static = {}
 
     def _draw_pending(self) -> None:
@@ -184,12 +203,14 @@ class Display:
             self._emit(SCENE, time_ns, marker_array(shapes))
             self._pending = None
 
-    def _emit_motion(self, end_ns: int) -> None:
-        """Add the frames within the step that ends at the log_time `end_ns`."""
-        if self._motion is not None:
-            for left_s, frames in self._motion.motion():
-                time_ns = end_ns - round(left_s * 1e9)
-                self._emit(TF, time_ns, transforms(frames, time_ns))
+    def _emit_motion(self, time_ns: int, frames: Sequence[Frame]) -> None:
+        """Add the frames of the previous step with their motion until `time_ns`, its end."""
+        end = (time_ns, frames)
+        if self._moment is not None:
+            inner = self._motion.motion() if self._motion is not None else ()
+            between = [(time_ns - round(left_s * 1e9), each) for left_s, each in inner]
+            self._emit(TF, self._moment[0], motion_transforms([self._moment, *between, end]))
+        self._moment = end
 
     def _emit_tracks(self, summary: EpisodeSummary) -> None:
         """Write the tracks so far, unless short episodes would make them most of the log."""
@@ -215,5 +236,9 @@ class Display:
     def _flush_messages(self) -> None:
         # Sorting by topic puts similar messages next to each other, which saves 10% of file size.
         self._messages.sort(key=itemgetter(0))
-        self._log.sink.write_messages(self._messages)
+        # The static scene is alone in its chunk, which is compressed better.
+        static = self.shown.channels.get(SCENE_STATIC)
+        for alone in (True, False):
+            part = [message for message in self._messages if (message[0] == static) == alone]
+            self._log.sink.write_messages(part)
         self._messages, self._bytes = [], 0

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.topics import IMAGE_FRAME
 
 Vector = tuple[float, float, float]
 Quad = tuple[float, float, float, float]
@@ -27,16 +28,17 @@ MARKER_TYPES = {
     "cylinder": 3,
     "line": 4,
     "segments": 5,
+    "spheres": 7,
     "points": 8,
     "text": 9,
     "triangles": 11,
 }
 _ADD, _DELETE_ALL = 0, 3
 _FOREVER = (0, 0)
-# Rounding values to binary fractions, finer than viewers resolve, halves their size in a log.
+# Values are rounded to binary fractions. This halves their size in a log and is invisible.
 _POINTS_PER_M = 2**6
-_POSITIONS_PER_M = 2**10
-_ROTATIONS_PER_ONE = 2**14
+_POSITIONS_PER_M = 2**8
+_ROTATIONS_PER_ONE = 2**12
 
 
 class Shape(Protocol):
@@ -104,7 +106,7 @@ class SceneSource(Protocol):
     """An environment that provides shapes and frames."""
 
     def static_scene(self) -> Sequence[Shape]:
-        """Return the shapes constant in an episode, including bodies fixed to moving frames."""
+        """Return the shapes that stay the same in an episode; their frames may move."""
 
     def scene(self) -> Sequence[Shape]:
         """Return the current shapes that change from step to step."""
@@ -133,7 +135,7 @@ class TelemetrySource(Protocol):
     """An environment that provides numbers to plot."""
 
     def telemetry(self) -> Mapping[str, float]:
-        """Return numbers by name; names are constant and are ROS field names with units."""
+        """Return numbers by name. The names never change; they are ROS field names with units."""
 
 
 @runtime_checkable
@@ -141,15 +143,23 @@ class DepthSource(Protocol):
     """An environment with a depth camera."""
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return (height, width) distances along the rays in meters; infinite where empty."""
+        """Return (height, width) distances along the rays in meters; infinity if nothing is hit."""
+
+
+@runtime_checkable
+class PinholeSource(Protocol):
+    """An environment whose depth camera is a pinhole camera with its axis in the image's middle."""
+
+    def depth_focal_px(self) -> tuple[float, float]:
+        """Return the focal lengths of the depth image, in pixel widths and pixel heights."""
 
 
 def marker_array(shapes: Iterable[Shape]) -> bytes:
     """Encode shapes as one `visualization_msgs/msg/MarkerArray`.
 
     The first marker deletes all earlier ones, so that a viewer which seeks to this message shows
-    only these shapes. Stamps are 0, which means the latest transform of the frame, so that equal
-    shapes encode to equal messages.
+    only these shapes. Stamps are 0, so that equal shapes encode to equal messages. A stamp of 0
+    refers to the latest transform of the frame.
     """
     markers = [_marker(action=_DELETE_ALL), *map(_shape_marker, shapes)]
     return messages.encode(messages.new("visualization_msgs/msg/MarkerArray", markers=markers))
@@ -157,24 +167,62 @@ def marker_array(shapes: Iterable[Shape]) -> bytes:
 
 def transforms(frames: Iterable[Frame], time_ns: int) -> bytes:
     """Encode frames as one `tf2_msgs/msg/TFMessage`."""
-    stamped = [
-        messages.new(
-            "geometry_msgs/msg/TransformStamped",
-            header=messages.header(time_ns, frame.parent),
-            child_frame_id=frame.name,
-            transform=messages.new(
-                "geometry_msgs/msg/Transform",
-                translation=_vector(_rounded(frame.position, _POSITIONS_PER_M)),
-                rotation=_quaternion(_rounded(frame.rotation, _ROTATIONS_PER_ONE)),
-            ),
-        )
-        for frame in frames
-    ]
+    stamped = [stamped_transform(frame, time_ns) for frame in frames]
     return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
 
 
+def stamped_transform(frame: Frame, time_ns: int) -> Any:
+    """Return a frame as `geometry_msgs/msg/TransformStamped`."""
+    return messages.new(
+        "geometry_msgs/msg/TransformStamped",
+        header=messages.header(time_ns, frame.parent),
+        child_frame_id=frame.name,
+        transform=messages.new(
+            "geometry_msgs/msg/Transform",
+            translation=_vector(_rounded(frame.position, _POSITIONS_PER_M)),
+            rotation=_quaternion(_rounded(frame.rotation, _ROTATIONS_PER_ONE)),
+        ),
+    )
+
+
+def camera_info(focal_px: tuple[float, float], shape: tuple[int, ...]) -> bytes:
+    """Encode a pinhole camera as `sensor_msgs/msg/CameraInfo`, without distortion.
+
+    Args:
+        focal_px: Focal lengths in pixel widths and pixel heights.
+        shape: Height and width of the image, pixels. The optical axis meets its middle; the middle
+            of the first pixel is at 0.
+    """
+    height, width = shape[:2]
+    matrix = np.array([[focal_px[0], 0, width / 2 - 0.5], [0, focal_px[1], height / 2 - 0.5]])
+    matrix = np.vstack([matrix, [0.0, 0.0, 1.0]])
+    whole = messages.new(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=0,
+        y_offset=0,
+        height=0,
+        width=0,
+        do_rectify=False,
+    )
+    info = messages.new(
+        "sensor_msgs/msg/CameraInfo",
+        header=messages.header(0, IMAGE_FRAME),
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.column_stack([matrix, np.zeros(3)]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=whole,
+    )
+    return messages.encode(info)
+
+
 def depth_millimeters(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Convert depth to 16UC1 millimeters; 0 (REP 118) where empty or beyond 65.5 m."""
+    """Convert depth to millimeters (16UC1); infinite depth and depth beyond 65.5 m become 0."""
     millimeters = np.rint(np.where(np.isfinite(depth_m), depth_m, 0.0) * 1000.0)
     return np.where(millimeters <= np.iinfo(np.uint16).max, millimeters, 0).astype("<u2")
 
@@ -245,7 +293,7 @@ def _marker(
 
 
 def _rounded(numbers: Any, per_one: int) -> Any:
-    """Round numbers or arrays to the nearest 1/per_one, as lists."""
+    """Round numbers or arrays to multiples of 1 / per_one, and convert arrays to lists."""
     return (np.rint(np.multiply(numbers, per_one)) / per_one).tolist()
 
 

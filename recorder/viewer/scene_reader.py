@@ -1,10 +1,13 @@
-"""Reader of a log's scene: the shapes and frames at each step of an episode."""
+"""Reader of a log's scene: the shapes and frames at and between the steps of an episode."""
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -24,7 +27,7 @@ _ADD = 0
 
 @dataclass(frozen=True)
 class SeenShape:
-    """A marker as a `scene.Shape`, with only the rotation about z."""
+    """A marker with the attributes of `scene.Shape`; rotations other than about z are lost."""
 
     name: str
     kind: str
@@ -39,7 +42,7 @@ class SeenShape:
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """A transform as a `scene.Frame`."""
+    """A transform with the attributes of `scene.Frame`."""
 
     name: str
     position: Vector
@@ -49,10 +52,11 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class SeenStep:
-    """The scene at one step.
+    """The scene at one step, or at a moment between it and the next one.
 
     Attributes:
-        step: Index of the step; the last is that of the final observation.
+        step: Index of the step; the final observation has the largest index.
+        time_ns: log_time of the moment.
         static: Static shapes; the same list object until they change.
         moving: Moving shapes.
         frames: Moving and static frames.
@@ -60,14 +64,21 @@ class SeenStep:
     """
 
     step: int
+    time_ns: int
     static: list[SeenShape] = field(default_factory=list)
     moving: list[SeenShape] = field(default_factory=list)
     frames: list[SeenFrame] = field(default_factory=list)
     follow: str = ""
 
 
-def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[SeenStep]:
+def moments_of_episode(reader: McapReader, episode: Episode, parts: int = 1) -> Iterator[SeenStep]:
     """Yield the scene at each step of an episode.
+
+    Args:
+        reader: Reader of the log.
+        episode: Episode of the log.
+        parts: Number of moments for each step except the last one: the step, and evenly spaced
+            moments before the next one.
 
     Raises:
         LogError: The log has no scene.
@@ -78,25 +89,56 @@ def moments_of_episode(reader: McapReader, episode: Episode) -> Iterator[SeenSte
         )
     track = Track(reader, topics=(SCENE, SCENE_STATIC, TF, TF_STATIC))
     before: dict[str, tuple[bytes, Any]] = {}
-    for step, time_ns in enumerate(episode.log_time_ns.tolist()):
+    for step, time_ns in _moments(episode.log_time_ns.tolist(), parts):
         for _, channel, data in track.latest(time_ns):
             if before.get(channel.topic, (b"",))[0] != data:
                 before[channel.topic] = (data, _decoded(channel.topic, data))
-        found = {topic: parts for topic, (_, parts) in before.items()}
-        moving_frames = found.get(TF, [])
+        found = {topic: values for topic, (_, values) in before.items()}
+        moving_frames = _frames_at(found.get(TF, []), time_ns)
         yield SeenStep(
             step=step,
+            time_ns=time_ns,
             static=found.get(SCENE_STATIC, []),
             moving=found.get(SCENE, []),
-            frames=[*moving_frames, *found.get(TF_STATIC, [])],
+            frames=[*moving_frames, *_frames_at(found.get(TF_STATIC, []), time_ns)],
             follow=moving_frames[0].name if moving_frames else "",
         )
+
+
+def _moments(times_ns: list[int], parts: int) -> Iterator[tuple[int, int]]:
+    """Yield the step and the log_time of each moment."""
+    for step, (time_ns, next_ns) in enumerate(pairwise(times_ns)):
+        for part in range(parts):
+            yield step, time_ns + (next_ns - time_ns) * part // parts
+    yield len(times_ns) - 1, times_ns[-1]
+
+
+def _frames_at(stamped: list[tuple[int, SeenFrame]], time_ns: int) -> list[SeenFrame]:
+    """Interpolate the frames of a message at a time; outside its stamps, use the nearest stamp."""
+    by_name: dict[str, list[tuple[int, SeenFrame]]] = {}
+    for stamp_ns, frame in stamped:
+        by_name.setdefault(frame.name, []).append((stamp_ns, frame))
+    return [_frame_at(sorted(poses, key=itemgetter(0)), time_ns) for poses in by_name.values()]
+
+
+def _frame_at(poses: list[tuple[int, SeenFrame]], time_ns: int) -> SeenFrame:
+    after = bisect_right(poses, time_ns, key=itemgetter(0))
+    if after in (0, len(poses)):
+        return poses[max(after - 1, 0)][1]
+    (start_ns, start), (end_ns, end) = poses[after - 1 : after + 1]
+    share = (time_ns - start_ns) / (end_ns - start_ns)
+    # A quaternion and its negative are the same rotation.
+    sign = math.copysign(1.0, sum(a * b for a, b in zip(start.rotation, end.rotation, strict=True)))
+    x, y, z = np.array(start.position) * (1 - share) + np.array(end.position) * share
+    turn = np.array(start.rotation) * (1 - share) + np.array(end.rotation) * (sign * share)
+    a, b, c, d = turn / np.linalg.norm(turn)
+    return replace(start, position=(x, y, z), rotation=(a, b, c, d))
 
 
 def _decoded(topic: str, data: bytes) -> list[Any]:
     if topic in (TF, TF_STATIC):
         tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
-        return [_frame(transform) for transform in tree.transforms]
+        return [(_stamp_ns(transform), _frame(transform)) for transform in tree.transforms]
     array = messages.decode(data, "visualization_msgs/msg/MarkerArray")
     return [_shape(m) for m in array.markers if m.action == _ADD and m.type in _KINDS]
 
@@ -115,6 +157,11 @@ def _shape(marker: Any) -> SeenShape:
         frame=marker.header.frame_id,
         text=marker.text,
     )
+
+
+def _stamp_ns(transform: Any) -> int:
+    stamp = transform.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def _frame(transform: Any) -> SeenFrame:

@@ -18,7 +18,9 @@ Image = NDArray[np.uint8]
 
 VIDEO_KINDS = (".mp4", ".gif")
 MAX_FPS: Final = 50.0
-"""Frame rate limit of GIF viewers, which is close to that of screens."""
+"""Largest frame rate that GIF viewers support; it is close to the frame rate of screens."""
+SMOOTH_FPS: Final = 20.0
+"""Frame rate from which motion looks continuous."""
 _COLUMNS = 3
 _GAP_PX = 6
 
@@ -46,7 +48,7 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
 
 
 def write_video(path: Path, images: Iterable[Image], fps: float) -> int:
-    """Write a video frame by frame; an `.mp4` is encoded as H.264, a `.gif` loops.
+    """Write a video frame by frame: an H.264 encoded `.mp4`, or a `.gif` that loops.
 
     Args:
         path: Path of the video, `.mp4` or `.gif`.
@@ -77,9 +79,9 @@ def _write(path: Path, kind: str, images: Iterable[Image], fps: float) -> int:
             imageio.imwrite(path, stills, duration=milliseconds, **options)
         return len(stills)
     count = 0
-    # The temporary file's name has no format suffix.
+    # The format is given because the name of the temporary file has no suffix.
     options = {"extension": kind, "plugin": "pyav", "container": kind.removeprefix(".")}
-    # The encoder cannot end after an error of a write, such as a full disk.
+    # The encoder cannot be closed after a failed write, so it writes to memory.
     content = BytesIO()
     with imageio.imopen(content, "w", **options) as video:
         video.init_video_stream("libx264", fps=float(fps))
@@ -127,6 +129,15 @@ def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
     """
     stride = max(1, math.ceil(steps_per_s / MAX_FPS - 1e-9))
     return range(length % stride, length + 1, stride), steps_per_s / stride
+
+
+def parts_of_step(images_per_s: float) -> int:
+    """Return the number of images per shown step, so that a video has at least 20 per second.
+
+    >>> parts_of_step(2.0), parts_of_step(10.0), parts_of_step(30.0)
+    (10, 2, 1)
+    """
+    return max(1, math.ceil(SMOOTH_FPS / images_per_s - 1e-9))
 
 
 def evenly_spaced(length: int, count: int) -> list[int]:

@@ -42,6 +42,16 @@ def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
     return Lens(width_px, height_px, width_px / 2 / math.tan(horizontal_fov_rad / 2))
 
 
+def focal_lengths(view: Lens, shape: tuple[int, int]) -> tuple[float, float]:
+    """Return the focal lengths of an image of another (height, width), in its pixels.
+
+    >>> focal_lengths(lens(256, 144, math.pi / 2), (72, 64))
+    (32.00000000000001, 64.00000000000001)
+    """
+    height_px, width_px = shape
+    return view.focal_px * width_px / view.width_px, view.focal_px * height_px / view.height_px
+
+
 def ray_lengths(view: Lens) -> Floats:
     """Return (height, width) lengths of the rays from the camera to the plane z = 1."""
     return lengths((view.height_px, view.width_px), view.focal_px, view.focal_px)

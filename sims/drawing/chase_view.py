@@ -216,7 +216,7 @@ def _outlines(shape: Shape) -> tuple[list[Floats], float]:
             return [_DOT], size[0]
         case "triangles":
             return list(points.reshape(-1, 3, 3)), 0.0
-        case "points":
+        case "points" | "spheres":
             return [_DOT + point for point in points], size[0]
         case "segments":
             return list(points.reshape(-1, 2, 3)), size[0]

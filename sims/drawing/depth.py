@@ -8,7 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.camera import Lens, draw, draw_wires, fronts, lengths, ray_lengths
+from mcaprl.sims.drawing.camera import (
+    Lens,
+    draw,
+    draw_wires,
+    focal_lengths,
+    fronts,
+    lengths,
+    ray_lengths,
+)
 from mcaprl.sims.geometry.compiled import compiled
 
 Floats = NDArray[np.float64]
@@ -130,10 +138,7 @@ class DepthCamera:
         self._rows = overlaps(view.height_px, small[0])
         self._columns = overlaps(view.width_px, small[1])
         self._small = small
-        self._small_focal_px = (
-            view.focal_px * small[1] / view.width_px,
-            view.focal_px * small[0] / view.height_px,
-        )
+        self._small_focal_px = focal_lengths(view, small)
         self._small_lengths = lengths(small, *self._small_focal_px)
 
     def inverse_distance(self, position_m: tuple[float, float, float], axes: Floats) -> Floats:

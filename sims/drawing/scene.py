@@ -19,9 +19,20 @@ Color = tuple[float, float, float, float]
 """Red, green, blue and opacity, each 0 to 1."""
 
 Kind = Literal[
-    "box", "sphere", "cylinder", "line", "segments", "points", "triangles", "arrow", "text"
+    "box",
+    "sphere",
+    "cylinder",
+    "line",
+    "segments",
+    "points",
+    "spheres",
+    "triangles",
+    "arrow",
+    "text",
 ]
 """Kind of a shape, which decides the meaning of its `points` and `size`; see `Shape`."""
+
+_COARSE_PER_M = 8
 
 
 def no_points() -> NDArray[np.float64]:
@@ -46,8 +57,8 @@ class Shape:
     """(N, 3) meters. `line`: a strip; `segments`: pairs; `triangles`: triples; `arrow`: start and
     end; empty for the others."""
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Meters. `line`, `segments` and `points`: the first is the width; `arrow`: shaft diameter,
-    head diameter, head length; `text`: the last is the height."""
+    """Meters. `line`, `segments` and `points`: the first is the width; `spheres`: the diameters;
+    `arrow`: shaft diameter, head diameter, head length; `text`: the last is the height."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Meters, in `frame`."""
     yaw_rad: float = 0.0
@@ -87,3 +98,33 @@ def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
     """Add a height to points (..., 2); return (N, 3) points."""
     flat = points_m.reshape(-1, 2)
     return np.column_stack([flat, np.full(len(flat), z_m)])
+
+
+def coarse(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Round points that change at each step to 1/8 m; short numbers take little space in logs."""
+    rounded: NDArray[np.float64] = np.rint(points_m * _COARSE_PER_M) / _COARSE_PER_M
+    return rounded
+
+
+def cut(segments_m: NDArray[np.float64], longest_m: float) -> NDArray[np.float64]:
+    """Cut segments into pieces of `longest_m` each, the last one shorter.
+
+    Viewers do not draw a line that begins behind the camera, so that long lines disappear there.
+
+    Args:
+        segments_m: (2 N, K) starts and ends in turn.
+        longest_m: Length of a piece.
+
+    Returns:
+        (2 M, K) starts and ends in turn.
+
+    >>> cut(np.array([[0.0, 0.0], [5.0, 0.0]]), 2.0)[:, 0].tolist()
+    [0.0, 2.0, 2.0, 4.0, 4.0, 5.0]
+    """
+    cuts = []
+    for start, end in segments_m.reshape(-1, 2, segments_m.shape[-1]):
+        length_m = float(np.linalg.norm(end - start))
+        shares = np.append(np.arange(0.0, length_m, longest_m) / length_m, 1.0)
+        points = start + shares[:, np.newaxis] * (end - start)
+        cuts.append(np.stack([points[:-1], points[1:]], axis=1).reshape(-1, points.shape[-1]))
+    return np.concatenate(cuts)

@@ -12,7 +12,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, path, raised, yaw_rotation
+from mcaprl.sims.drawing.scene import (
+    Color,
+    Frame,
+    Kind,
+    Shape,
+    coarse,
+    path,
+    raised,
+    yaw_rotation,
+)
 
 Vector = tuple[float, float, float]
 
@@ -24,6 +33,10 @@ LAMP: Color = (1.0, 0.96, 0.78, 1.0)
 TRAIL: Color = (0.20, 0.62, 0.95, 0.9)
 RAY: Color = (0.98, 0.80, 0.28, 0.8)
 LOOK: Color = (0.99, 0.55, 0.10, 1.0)
+TAIL_LAMP: Color = (0.48, 0.02, 0.03, 1.0)
+
+BORDER_PIECE_M = 3.0
+"""Length of the pieces of painted lines; see `cut`."""
 
 
 def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, float]) -> Shape:
@@ -33,20 +46,41 @@ def ground(color: Color, middle_m: tuple[float, float], size_m: tuple[float, flo
     return Shape("ground", "box", color, size=size, position=at)
 
 
-def label(text: str, color: Color, height_m: float, frame: str = "car") -> Shape:
+def label(speed_m_s: float, height_m: float, frame: str = "car") -> Shape:
     """Return a text shape named `speed` above the origin of a frame."""
-    at = (0.0, 0.0, height_m)
-    return Shape("speed", "text", color, size=(1.0, 1.0, 0.8), position=at, frame=frame, text=text)
+    at, size, text = (0.0, 0.0, height_m), (1.0, 1.0, 0.4), f"{speed_m_s:.1f} m/s"
+    return Shape("speed", "text", WHITE, size=size, position=at, frame=frame, text=text)
 
 
 def trail(places_m: Sequence[tuple[float, ...]], width_m: float) -> Shape:
     """Return a line through the car's last positions; at least one (x, y) in the map."""
-    return Shape("trail", "line", TRAIL, raised(path(places_m), 0.06), size=(width_m, 0.0, 0.0))
+    return Shape("trail", "line", TRAIL, raised(path(places_m), 0.1), size=(width_m, 0.0, 0.0))
 
 
 def lookahead(points_m: NDArray[np.float64]) -> Shape:
     """Return a shape that marks the path points (N, 2) in the agent's observation."""
-    return Shape("lookahead", "points", LOOK, raised(points_m, 0.3), size=(0.6, 0.6, 0.6))
+    points = raised(coarse(points_m), 0.3)
+    return Shape("lookahead", "spheres", LOOK, points, size=(0.6, 0.6, 0.6))
+
+
+def rays(lines_m: NDArray[np.float64], car: Frame, height_m: float) -> tuple[Shape, Shape]:
+    """Return distance rays as lines, with dots at their ends.
+
+    Dots and lines have the same points in the car's frame, because equal bytes take little space in
+    a log. The dots at the starts are in the car or mark its sensors.
+
+    Args:
+        lines_m: (R, 2, 2) starts and ends in the map.
+        car: Frame of the car.
+        height_m: Height of the rays.
+    """
+    _, _, sin, cos = car.rotation
+    turn = np.array([[cos * cos - sin * sin, -2 * sin * cos], [2 * sin * cos, cos**2 - sin**2]])
+    points = raised(coarse((lines_m - np.array(car.position[:2])) @ turn), height_m)
+    return (
+        Shape("rays", "segments", RAY, points, size=(0.06, 0.0, 0.0), frame=car.name),
+        Shape("hits", "spheres", LOOK, points, size=(0.3, 0.3, 0.3), frame=car.name),
+    )
 
 
 def steering_arrow(axle_m: float, wheel_rad: float) -> Shape:

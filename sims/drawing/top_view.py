@@ -60,7 +60,7 @@ def _outlines(shape: Shape) -> list[Floats]:
             outlines = [_SQUARE * shape.size[:2]]
         case "sphere" | "cylinder":
             outlines = [_CIRCLE * shape.size[:2]]
-        case "points":
+        case "points" | "spheres":
             outlines = [_CIRCLE * width_m + point for point in flat]
         case "triangles":
             outlines = list(flat.reshape(-1, 3, 2))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing import shapes
 from mcaprl.sims.drawing.scene import Color, Shape, raised
-from mcaprl.sims.drawing.shapes import LAMP, WHITE, car_part
+from mcaprl.sims.drawing.shapes import LAMP, TAIL_LAMP, WHITE, car_part
 from mcaprl.sims.highway.course import FLIP, Course
 
 Floats = NDArray[np.float64]
@@ -28,8 +28,8 @@ OTHER_PAINT: Color = (0.86, 0.62, 0.16, 1.0)
 MARGIN_M = 60.0
 """Width of the grass around the road."""
 CAR_HEIGHT_M = 1.4
-DASH_SAMPLES, DASH_PERIOD = 3, 6
-"""Numbers of segments of about 1 m in a dash, and in a period of a dashed line."""
+PIECE_M = 3.0
+"""Approximate length of the pieces of lanes and lines; a dashed line has every second piece."""
 STRIPED, CONTINUOUS = 1, 2
 """Values of highway-env's `LineType`."""
 
@@ -72,9 +72,9 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
 
 def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
-    """Yield each lane with its left and right edge, as (N, 2) map points about 1 m apart."""
+    """Yield each lane with its left and right edge, as (N, 2) map points about 3 m apart."""
     for lane in network.lanes_list():
-        along_m = np.linspace(0.0, lane.length, 2 + int(lane.length))
+        along_m = np.linspace(0.0, lane.length, 2 + int(lane.length / PIECE_M))
         half_m = [lane.width_at(each) / 2 for each in along_m]
         # In highway-env, lateral distances to the left are negative.
         sides = [
@@ -101,7 +101,7 @@ def _lines(network: Any) -> Floats:
         for line, points in zip(lane.line_types, sides, strict=True):
             pairs = np.stack([points[:-1], points[1:]], axis=1)
             if line == STRIPED:
-                pairs = pairs[np.arange(len(pairs)) % DASH_PERIOD < DASH_SAMPLES]
+                pairs = pairs[::2]
             if line >= STRIPED:
                 pieces.append(pairs)
     return np.concatenate(pieces)
@@ -114,6 +114,8 @@ def _own_car() -> list[Shape]:
         car_part("roof", PAINT, (2.0, 1.6, 0.08), (-0.4, 0.0, CAR_HEIGHT_M - 0.04)),
         car_part("lamp_left", LAMP, (0.08, 0.4, 0.16), (2.5, 0.68, 0.66)),
         car_part("lamp_right", LAMP, (0.08, 0.4, 0.16), (2.5, -0.68, 0.66)),
+        car_part("tail_left", TAIL_LAMP, (0.08, 0.35, 0.16), (-2.5, 0.72, 0.68)),
+        car_part("tail_right", TAIL_LAMP, (0.08, 0.35, 0.16), (-2.5, -0.72, 0.68)),
         *shapes.wheels(shapes.RUBBER, 1.5, -1.5, 0.85, 0.34, 0.26),
     ]
 
@@ -130,7 +132,7 @@ def moving_shapes(
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(np.array(aims_m)),
         shapes.steering_arrow(1.5, steering_rad),
-        shapes.label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
+        shapes.label(car.speed_m_s, 2.8),
         *(_other_car(f"other_{number}", other) for number, other in enumerate(others)),
     )
 

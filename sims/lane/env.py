@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.drawing.camera import focal_lengths
 from mcaprl.sims.drawing.follow_view import Body, FollowView
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.drawing.shapes import car_frame
 from mcaprl.sims.lane import scene as lane_scene
+from mcaprl.sims.lane.camera import IMAGE_SHAPE, LENS
 from mcaprl.sims.lane.fleet import LaneFleet
 from mcaprl.sims.lane.rules import DECISION_S, Car, wheel_angle
 from mcaprl.sims.vehicle.batched import BatchedEnv
@@ -177,6 +179,10 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     def depth_image_m(self) -> NDArray[np.float32]:
         """Return the front camera's image: (84, 84) distances along each ray, meters."""
         return self.fleet.depth_image_m(0)
+
+    def depth_focal_px(self) -> tuple[float, float]:
+        """Return the focal lengths of the depth image, in pixel widths and pixel heights."""
+        return focal_lengths(LENS, IMAGE_SHAPE)
 
     def static_scene(self) -> Sequence[Shape]:
         """Return the shapes that never change; the car's shapes are in the frame `car`."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing import shapes
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, raised
-from mcaprl.sims.drawing.shapes import LOOK, RAY, WHITE, car_part
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, coarse, cut, raised
+from mcaprl.sims.drawing.shapes import LOOK, TAIL_LAMP, WHITE, car_part
 from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.lane import course
 from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
@@ -66,6 +66,7 @@ def _road() -> list[Shape]:
     side_m = 420.0
     middle = course.COURSE.points_m.mean(axis=0)
     borders = raised(course.outline(course.LANE_HALF_WIDTH_M), 0.02)
+    borders = cut(borders, shapes.BORDER_PIECE_M)
     return [
         shapes.ground(GRASS, middle, (side_m, side_m)),
         Shape("road", "triangles", ASPHALT, _asphalt()),
@@ -96,8 +97,8 @@ def _car() -> list[Shape]:
         car_part("roof", PAINT, (1.7, 1.45, 0.08), (-0.40, 0.0, 1.36)),
         car_part("lamp_left", shapes.LAMP, (0.08, 0.35, 0.15), (2.2, 0.62, 0.66)),
         car_part("lamp_right", shapes.LAMP, (0.08, 0.35, 0.15), (2.2, -0.62, 0.66)),
-        car_part("tail_left", PAINT, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
-        car_part("tail_right", PAINT, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
+        car_part("tail_left", TAIL_LAMP, (0.08, 0.3, 0.15), (-2.12, 0.62, 0.68)),
+        car_part("tail_right", TAIL_LAMP, (0.08, 0.3, 0.15), (-2.12, -0.62, 0.68)),
         *shapes.wheels(shapes.RUBBER, axle_m, -axle_m, side_m, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
@@ -114,23 +115,19 @@ def moving_shapes(
     """Return the shapes that change with each step; include the rays if `has_rays`."""
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
-    link = np.array([(car.x_m, car.y_m), nearest])
+    link = coarse(np.array([(car.x_m, car.y_m), nearest]))
     wheel_rad = wheel_angle(car.steering, car.speed_m_s)
     seen = (
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(aims),
         Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
         shapes.steering_arrow(WHEELBASE_M / 2, wheel_rad),
-        shapes.label(f"{car.speed_m_s:.1f} m/s", WHITE, 2.4),
+        shapes.label(car.speed_m_s, 2.8),
     )
     if not has_rays:
         return seen
-    lines_m = ray_lines(car)
-    return (
-        *seen,
-        Shape("rays", "segments", RAY, raised(lines_m, 0.5), size=(0.06, 0.0, 0.0)),
-        Shape("hits", "points", LOOK, raised(lines_m[:, 1], 0.75), size=(0.3, 0.3, 0.3)),
-    )
+    frame = shapes.car_frame(car.x_m, car.y_m, car.yaw_rad)
+    return (*seen, *shapes.rays(ray_lines(car), frame, 0.75))
 
 
 def camera_frame() -> Frame:

@@ -58,12 +58,16 @@ MAST_TOP_M = 0.9
 @functools.cache
 def ground_triangles() -> Floats:
     """Return the ground in ROS axes, (T, 3, 3) meters, facing up; do not modify it."""
-    corners = np.array([[(x, y, -ground_height(x, y)) for y in GROUND_Y_M] for x in GROUND_X_M])
+    return grid_triangles(GROUND_X_M, GROUND_Y_M)
+
+
+def grid_triangles(x_m: Floats, y_m: Floats) -> Floats:
+    """Return the ground of an NED grid in ROS axes, (T, 3, 3) meters, cell by cell, facing up."""
+    corners = np.array([[(x, y, -ground_height(x, y)) for y in y_m] for x in x_m])
     here, north = corners[:-1, :-1], corners[1:, :-1]
     east, both = corners[:-1, 1:], corners[1:, 1:]
-    first = np.stack([here, both, north], axis=2)
-    second = np.stack([here, east, both], axis=2)
-    return to_ros(np.concatenate([first.reshape(-1, 3, 3), second.reshape(-1, 3, 3)]))
+    cells = np.stack([here, both, north, here, east, both], axis=2)
+    return to_ros(cells.reshape(-1, 3, 3))
 
 
 def tree_triangles(tree: Tree) -> Floats:

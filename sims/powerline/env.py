@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.sims.drawing.camera import focal_lengths
 from mcaprl.sims.drawing.scene import Frame, Shape
 from mcaprl.sims.powerline import scene as powerline_scene
+from mcaprl.sims.powerline.camera import IMAGE_SHAPE, LENS
 from mcaprl.sims.powerline.fleet import PowerlineFleet
 from mcaprl.sims.powerline.rules import DECISION_S, Flight
 from mcaprl.sims.vehicle.batched import BatchedEnv
@@ -158,6 +160,10 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     def depth_image_m(self) -> NDArray[np.float32]:
         """Return (84, 84) distances along the camera's rays, meters; infinity without surface."""
         return self.fleet.depth_image_m(0)
+
+    def depth_focal_px(self) -> tuple[float, float]:
+        """Return the focal lengths of the depth image, in pixel widths and pixel heights."""
+        return focal_lengths(LENS, IMAGE_SHAPE)
 
     def static_scene(self) -> Sequence[Shape]:
         """Return the shapes that never change; the drone's shapes are in the frame `drone`."""

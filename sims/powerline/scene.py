@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, no_points, path
+from mcaprl.sims.drawing.scene import Color, Frame, Kind, Shape, coarse, cut, no_points, path
 from mcaprl.sims.drawing.shapes import LOOK, STEEL, TRAIL, WHITE, label
 from mcaprl.sims.geometry.vectors import Vector, norm
 from mcaprl.sims.powerline import camera, course
@@ -27,20 +27,31 @@ Floats = NDArray[np.float64]
 CERAMIC: Color = (0.45, 0.25, 0.18, 1.0)
 COPPER: Color = (0.10, 0.10, 0.12, 1.0)
 ROUTE: Color = (0.93, 0.76, 0.22, 1.0)
+TOWER: Color = (0.42, 0.45, 0.48, 1.0)
 BODY: Color = (0.16, 0.17, 0.20, 1.0)
+ARM: Color = (0.95, 0.95, 0.93, 1.0)
 PAINT: Color = (0.83, 0.18, 0.16, 1.0)
 DISC: Color = (0.85, 0.88, 0.92, 0.45)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
 UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
 """Offset of arrows; viewers reject an arrow of length 0."""
-CORNERS_PER_M = 16
-"""Rounding of surface corners to 1/16 m, which reduces their size in a log to a third."""
-SHADES = 10
+CORNERS_PER_M = 4
+"""Rounding of surface corners to 1/4 m, which reduces their size in a log to a third."""
+GROUND_X_M = np.concatenate(
+    [np.linspace(-180, -30, 6), np.linspace(0, 48, 5), np.linspace(60, 720, 21)]
+)
+GROUND_Y_M = np.linspace(-260, 345, 17)
+"""NED grid of the drawn ground, coarser than that of the depth camera."""
+FIR_CORNERS = np.array([[1.0, 0.0], [-0.5, 0.75], [-0.5, -0.75]])
+"""Foot of a drawn fir, relative to half its side."""
+SHADES = 8
 """Number of brightness levels of surfaces; the angle to the sun determines the level."""
 SUN = np.array([0.45, 0.35, 0.82])
 
 DRONE_SCALE = 5.0
+ROUTE_PIECE_M = 12.0
+"""Length of the pieces of the route; see `cut`."""
 CROSSINGS = 6
 """Number of cross-braced sections of a tower."""
 
@@ -63,6 +74,17 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
             red, green, blue = (min(1.0, bright * part) for part in color)
             shapes.append(Shape(f"{name}_{shade}", "triangles", (red, green, blue, 1.0), points))
     return shapes
+
+
+def _fir(tree: course.Tree) -> Floats:
+    """Return a fir as a pyramid with three sides in ROS axes, (3, 3, 3) meters."""
+    half_m = 0.5 * camera.TREE_SIDE_M * tree.height_m
+    # The drawn ground is up to 1 m lower than the real one.
+    foot_z_m = course.ground_height(tree.x_m, tree.y_m) - 1.0
+    foot = np.array([tree.x_m, -tree.y_m, foot_z_m])
+    corners = foot + np.pad(half_m * FIR_CORNERS, ((0, 0), (0, 1)))
+    top = foot + np.array([0.0, 0.0, tree.height_m + 0.5])
+    return np.array([[corners[i - 1], corners[i], top] for i in range(3)])
 
 
 def _lattice(tower: course.Tower) -> Floats:
@@ -101,13 +123,15 @@ def _arm(index: int, tower: course.Tower) -> list[Shape]:
 
 
 def _line() -> list[Shape]:
-    shapes = [Shape("route", "line", ROUTE, course.to_ros(course.POINTS_M), size=(0.12, 0.0, 0.0))]
+    route = course.to_ros(course.POINTS_M)
+    legs = cut(np.stack([route[:-1], route[1:]], axis=1).reshape(-1, 3), ROUTE_PIECE_M)
+    shapes = [Shape("route", "segments", ROUTE, legs, size=(0.12, 0.0, 0.0))]
     for index, tower in enumerate(course.towers()):
         lattice = _lattice(tower)
-        shapes.append(Shape(f"tower_{index}", "segments", STEEL, lattice, size=(0.16, 0.0, 0.0)))
+        shapes.append(Shape(f"tower_{index}", "segments", TOWER, lattice, size=(0.3, 0.0, 0.0)))
         shapes += _arm(index, tower)
     wires = camera.world_wires().reshape(-1, 3)
-    shapes.append(Shape("conductors", "segments", COPPER, wires, size=(0.10, 0.0, 0.0)))
+    shapes.append(Shape("conductors", "segments", COPPER, wires, size=(0.16, 0.0, 0.0)))
     return shapes
 
 
@@ -117,7 +141,7 @@ def _drone() -> list[Shape]:
     turns = ((1, 1), (-1, -1), (1, -1), (-1, 1))
     names = ("front_left", "rear_right", "front_right", "rear_left")
     arm = functools.partial(
-        _part, kind="box", color=BODY, size=(2 * math.sqrt(2) * arm_m, 0.12, 0.08)
+        _part, kind="box", color=ARM, size=(2 * math.sqrt(2) * arm_m, 0.12, 0.08)
     )
     return [
         _part("body", "box", BODY, (0.9, 0.55, 0.3)),
@@ -146,8 +170,8 @@ def _part(
 @functools.cache
 def ground_shapes() -> tuple[Shape, ...]:
     """Return the ground and the firs."""
-    firs = np.concatenate([camera.tree_triangles(tree) for tree in course.trees()])
-    ground = _shaded("ground", camera.ground_triangles(), GRASS)
+    firs = np.concatenate([_fir(tree) for tree in course.trees()])
+    ground = _shaded("ground", camera.grid_triangles(GROUND_X_M, GROUND_Y_M), GRASS)
     return (*ground, *_shaded("firs", firs, NEEDLES))
 
 
@@ -164,16 +188,15 @@ def moving_shapes(flight: Flight, trail_m: Sequence[tuple[float, ...]]) -> tuple
     here = np.array(ros(position))
     # Shapes near the drone use its frame, so that their points repeat and compress well in logs.
     level, origin = "base_stabilized", np.zeros(3)
-    link = np.array([origin, ros(place.point_m) - here])
-    ahead = np.array([ros(course.point_on_line(place.along_m + 6.0)) - here])
+    link = coarse(np.array([origin, ros(place.point_m) - here]))
+    ahead = coarse(np.array([ros(course.point_on_line(place.along_m + 6.0)) - here]))
     arrow = np.array([origin, np.array(ros(flight.command_m_s)) + UP_A_LITTLE])
-    speed_m_s = norm(flight.drone.velocity_m_s)
     return (
         Shape("trail", "line", TRAIL, course.to_ros(path(trail_m)), size=(0.15, 0.0, 0.0)),
         Shape("offset", "line", LOOK, link, size=(0.08, 0.0, 0.0), frame=level),
-        Shape("ahead", "points", LOOK, ahead, size=(0.4, 0.4, 0.4), frame=level),
+        Shape("ahead", "spheres", LOOK, ahead, size=(0.4, 0.4, 0.4), frame=level),
         Shape("command", "arrow", WHITE, arrow, size=(0.12, 0.3, 0.4), frame=level),
-        label(f"{speed_m_s:.1f} m/s", WHITE, 1.6, level),
+        label(norm(flight.drone.velocity_m_s), 2.0, level),
     )
 
 

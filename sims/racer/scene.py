@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.sims.drawing import shapes
-from mcaprl.sims.drawing.scene import Color, Frame, Shape, raised
-from mcaprl.sims.drawing.shapes import LOOK, RAY, car_part
+from mcaprl.sims.drawing.scene import Color, Frame, Shape, cut, raised
+from mcaprl.sims.drawing.shapes import car_part
 from mcaprl.sims.racer.car import Car
 from mcaprl.sims.racer.course import (
     IMAGE_HEIGHT_PX,
@@ -25,6 +25,7 @@ from mcaprl.sims.racer.course import (
     to_map,
 )
 from mcaprl.sims.racer.rays import ray_ends
+from mcaprl.sims.racer.rules import speed_of
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def _car() -> list[Shape]:
         car_part("rear_wing", WHITE, (0.26, 1.1, 0.08), (-1.37, 0.0, 0.80)),
         car_part("rear_wing_left", CARBON, (0.3, 0.05, 0.45), (-1.35, 0.55, 0.62)),
         car_part("rear_wing_right", CARBON, (0.3, 0.05, 0.45), (-1.35, -0.55, 0.62)),
-        car_part("helmet", HELMET, (0.3, 0.3, 0.3), (-0.1, 0.0, 0.6), "sphere"),
+        car_part("helmet", HELMET, (0.44, 0.44, 0.44), (0.0, 0.0, 0.62), "sphere"),
         *shapes.wheels(RUBBER, 0.95, -1.0, 0.55, WHEEL_RADIUS_M, WHEEL_WIDTH_M),
     ]
 
@@ -75,7 +76,7 @@ def static_shapes(track: Track) -> tuple[Shape, ...]:
     return (
         shapes.ground(GRASS, (width_m / 2, height_m / 2), (width_m, height_m)),
         Shape("road", "triangles", ASPHALT, raised(to_map(asphalt(track)), 0.0)),
-        Shape("gates", "segments", GATE, raised(gates_m, 0.02), size=(0.15, 0.0, 0.0)),
+        Shape("gates", "segments", GATE, cut(raised(gates_m, 0.02), 4.0), size=(0.15, 0.0, 0.0)),
         *(_wall(index, ends_m) for index, ends_m in enumerate(walls_m)),
         *_car(),
     )
@@ -90,9 +91,9 @@ def moving_shapes(
     return (
         shapes.trail(trail_m, 0.15),
         Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
-        Shape("rays", "segments", RAY, raised(rays_m, 0.4), size=(0.1, 0.0, 0.0)),
-        Shape("hits", "points", LOOK, raised(rays_m[:, 1], 0.62), size=(0.5, 0.5, 0.5)),
-        shapes.label(f"{car.speed_px:.0f} px/step, {int(car.gates)} gates", WHITE, 2.0),
+        # Above the walls, so that the ends are visible.
+        *shapes.rays(rays_m, car_frame(car), WALL_HEIGHT_M + 0.025),
+        shapes.label(speed_of(car), 2.5),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,6 +19,7 @@ from mcaprl.recorder.columns.topic import Topic
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.record.layout import layout_of
+from mcaprl.recorder.record.motion import motion_transforms
 from mcaprl.recorder.record.scene import (
     MARKER_TYPES,
     DepthSource,
@@ -26,8 +28,9 @@ from mcaprl.recorder.record.scene import (
     depth_millimeters,
     marker_array,
 )
+from mcaprl.recorder.viewer.scene_reader import moments_of_episode
 from mcaprl.sims import SIMS, make_sim
-from mcaprl.sims.drawing.scene import Kind, Shape
+from mcaprl.sims.drawing.scene import Frame, Kind, Shape, cut
 from mcaprl.sims.evaluation.pilots import make_pilot
 from tests.support.layouts import check_layout, series_of
 
@@ -76,15 +79,64 @@ def test_moving_topics_have_one_message_a_step(log: Path) -> None:
         assert [time for time, _ in read(log, topic, type_name)] == times, topic
 
 
-def test_frames_move_twenty_times_a_second(log: Path) -> None:
-    """A step of the lane sim takes 0.25 s: four frames within it, and one at its end."""
-    messages_of_tf = read(log, "/tf", "tf2_msgs/msg/TFMessage")
-    for times in step_times(log):
-        moved = [time for time, _ in messages_of_tf if times[0] <= time <= times[-1]]
-        assert moved == list(range(times[0], times[-1] + 1, 50_000_000))
-    for time, message in messages_of_tf:
-        stamp = message.transforms[0].header.stamp
-        assert stamp.sec * 10**9 + stamp.nanosec == time
+def stamps(message: Any) -> list[int]:
+    headers = [transform.header for transform in message.transforms]
+    return [header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers]
+
+
+def test_frames_at_each_step_reach_to_the_next(log: Path) -> None:
+    """A viewer interpolates between stamps; the sim's moments are 0.05 s apart."""
+    found = read(log, "/tf", "tf2_msgs/msg/TFMessage")
+    times = step_times(log)
+    assert [time for time, _ in found] == [time for episode in times for time in episode]
+    after = {now: end for episode in times for now, end in pairwise([*episode, episode[-1]])}
+    for time, message in found:
+        seen = stamps(message)
+        assert (seen[0], seen[-1]) == (time, after[time])
+        assert all((stamp - time) % 50_000_000 == 0 for stamp in seen)
+        assert seen == sorted(set(seen))
+    between = [len(message.transforms) for _, message in found]
+    assert max(between) > 2, "a bend needs more than its ends"
+
+
+def test_poses_within_a_step_are_found_by_interpolation(log: Path, tmp_path: Path) -> None:
+    """The way that a viewer draws differs from the way of the sim by at most 0.04 m."""
+    path, env = tmp_path / "lane.mcap", gym.make("mcaprl/LaneKeeping-v0")
+    way: list[tuple[int, tuple[float, ...]]] = []
+    with closing(mcaprl.RecordMcap(env, path)) as recorder:
+        recorder.reset(seed=0)
+        sim: Any = env.unwrapped
+        for step in range(1, 9):
+            recorder.step(step % 6)
+            end = 250_000_000 * step
+            way += [(end - round(left * 1e9), each[0].position) for left, each in sim.motion()]
+    (episode,) = mcaprl.open(path).episodes
+    seen = list(moments_of_episode(McapReader(path), episode, parts=5))
+    start, drawn = seen[0].time_ns, {each.time_ns: each.frames[0].position for each in seen}
+    assert len(way) == 8 * 4
+    assert len(drawn) == 8 * 5 + 1
+    for time, position in way:
+        np.testing.assert_allclose(drawn[start + time], position, atol=0.04 + 2**-8)
+
+
+def test_knots_by_hand() -> None:
+    """A stop after 0.1 s: one knot between the ends. A straight way needs none."""
+    still = (0.0, 0.0, 0.0, 1.0)
+
+    def moments(places_m: list[float]) -> list[tuple[int, list[Frame]]]:
+        return [(k * 10**8, [Frame("car", (x, 0.0, 0.0), still)]) for k, x in enumerate(places_m)]
+
+    for places_m, kept in (
+        ([0.0, 1.0, 1.0, 1.0], [0, 1, 3]),
+        ([0.0, 1.0, 2.0, 3.0], [0, 3]),
+        ([0.0, 1.0, 2.03, 3.0], [0, 3]),
+        ([5.0], [0]),
+    ):
+        data = motion_transforms(moments(places_m))
+        tree = messages.decode(data, "tf2_msgs/msg/TFMessage")
+        assert stamps(tree) == [k * 10**8 for k in kept], places_m
+        found = [transform.transform.translation.x for transform in tree.transforms]
+        assert found == [places_m[k] for k in kept]
 
 
 def test_unchanged_static_topics_are_written_once(log: Path) -> None:
@@ -99,9 +151,11 @@ def test_unchanged_static_topics_are_written_once(log: Path) -> None:
 
 
 def test_a_frequently_changing_scene_is_subsampled(tmp_path: Path) -> None:
-    """The racer has ten steps a second; the scene is written five times a second and at the end."""
-    path = tmp_path / "racer.mcap"
-    with closing(mcaprl.RecordMcap(gym.make("mcaprl/Racer-v0"), path)) as recorder:
+    """At 25 steps a second, the scene is written every second step and at the end."""
+    path, env = tmp_path / "racer.mcap", gym.make("mcaprl/Racer-v0")
+    sim: Any = env.unwrapped
+    sim.step_duration_s = 0.04
+    with closing(mcaprl.RecordMcap(env, path)) as recorder:
         for _ in range(2):
             recorder.reset(seed=0)
             for _ in range(5):
@@ -150,13 +204,11 @@ def test_frames_form_a_tree_under_map(log: Path) -> None:
 
 def test_car_frame_agrees_with_the_telemetry(log: Path) -> None:
     reported = Topic(McapReader(log), "/telemetry").read(["x_m", "y_m", "speed_m_s"])
-    steps = {time for episode in step_times(log) for time in episode}
-    moved = read(log, "/tf", "tf2_msgs/msg/TFMessage")
-    frames = [message.transforms[0] for time, message in moved if time in steps]
+    frames = [m.transforms[0] for _, m in read(log, "/tf", "tf2_msgs/msg/TFMessage")]
     assert [frame.child_frame_id for frame in frames] == ["car"] * len(reported["x_m"])
     for axis in "xy":
         places = [getattr(frame.transform.translation, axis) for frame in frames]
-        np.testing.assert_allclose(places, reported[f"{axis}_m"], rtol=2**-16, atol=2**-10)
+        np.testing.assert_allclose(places, reported[f"{axis}_m"], rtol=2**-16, atol=2**-8)
     assert (reported["speed_m_s"] >= 0).all()
 
 
@@ -216,17 +268,32 @@ def test_cumulative_return_is_the_sum_of_rewards(log: Path) -> None:
     np.testing.assert_allclose(reported, sums, rtol=2**-16)
 
 
-@pytest.mark.parametrize(("sim", "episodes"), [("lane", 4), ("powerline", 10), ("racer", 1)])
-def test_a_scene_makes_a_log_at_most_three_times_as_large(
-    sim: str, episodes: int, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("sim", ["lane", "powerline", "racer", "highway-lane"])
+def test_a_scene_makes_a_log_at_most_three_times_as_large(sim: str, tmp_path: Path) -> None:
     sizes: list[int] = []
     for options in ([], ["--no-scene"]):
         path = tmp_path / f"{len(sizes)}.mcap"
-        command = ["record", sim, "--epsilon", "0.1", "--episodes", str(episodes), *options]
+        command = ["record", sim, "--episodes", "2", "--seed", "1", *options]
         assert run([*command, "--out", str(path)]) == 0
         sizes.append(path.stat().st_size)
     assert sizes[0] <= 3 * sizes[1]
+
+
+def test_segments_are_cut_into_pieces() -> None:
+    """7 m along y in pieces of 3 m."""
+    pieces = cut(np.array([[1.0, 0.0, 0.5], [1.0, 7.0, 0.5]]), 3.0)
+    assert pieces[:, 1].tolist() == [0.0, 3.0, 3.0, 6.0, 6.0, 7.0]
+    assert np.unique(pieces[:, [0, 2]], axis=0).tolist() == [[1.0, 0.5]]
+
+
+def test_depth_images_have_a_camera(log: Path) -> None:
+    """90 degrees on 84 pixels: f = 42; 144 of 256 pixels high: f = 42 256 / 144 in y."""
+    ((time, info),) = read(log, "/camera/camera_info", "sensor_msgs/msg/CameraInfo")
+    assert time == step_times(log)[0][0]
+    assert (info.width, info.height, info.header.frame_id) == (84, 84, "camera")
+    wanted = [42.0, 0.0, 41.5, 0.0, 42.0 * 256 / 144, 41.5, 0.0, 0.0, 1.0]
+    np.testing.assert_allclose(info.k, wanted)
+    np.testing.assert_allclose(info.p.reshape(3, 4)[:, :3].ravel(), wanted)
 
 
 def test_layout_without_a_scene() -> None:

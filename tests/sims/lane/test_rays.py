@@ -160,7 +160,8 @@ def test_the_scene_shows_the_rays_that_are_observed() -> None:
     lines = shapes["rays"].points.reshape(16, 2, 3)
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
     assert lengths[0] == pytest.approx(74.0)
-    np.testing.assert_allclose(shapes["hits"].points[:, :2], lines[:, 1, :2])
+    np.testing.assert_array_equal(shapes["hits"].points, shapes["rays"].points)
+    assert shapes["hits"].kind == "spheres"
     plain = make_sim("lane").unwrapped
     assert isinstance(plain, LaneKeepingEnv)
     plain.reset(seed=0)

@@ -1,0 +1,77 @@
+"""Motion of frames within a step, as the few poses that viewers interpolate between.
+
+A message of `/tf` at the log_time of a step contains the frames at that time, and then their poses
+until the end of the step, each with its own stamp. A viewer that has only transforms up to the
+current time cannot draw a vehicle between two of them; with the step's end, it can draw any moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.record.scene import Frame, stamped_transform
+
+Moment = tuple[int, Sequence[Frame]]
+"""log_time in nanoseconds, and the moving frames at that time."""
+
+_TOLERANCE_M = 0.04
+_TOLERANCE_ROTATION = 0.01
+"""Difference of quaternion components; 0.01 rad for small angles."""
+
+
+def motion_transforms(moments: Sequence[Moment]) -> bytes:
+    """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
+
+    Of the poses of a frame between the first and the last moment, only those are kept that linear
+    interpolation between the others misses by more than 0.02 m or 0.01 rad.
+
+    Args:
+        moments: Moments with the same frames each, in order of time.
+    """
+    times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
+    kept = []
+    for number in range(len(moments[0][1])):
+        frames = [each[number] for _, each in moments]
+        for k in knots(times, _scaled(frames)) if len(moments) > 1 else [0]:
+            kept.append((moments[k][0], number, frames[k]))
+    kept.sort(key=lambda each: each[:2])
+    stamped = [stamped_transform(frame, time_ns) for time_ns, _, frame in kept]
+    return messages.encode(messages.new("tf2_msgs/msg/TFMessage", transforms=stamped))
+
+
+def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:
+    """Return the indices of the rows from which linear interpolation finds all others within 1.
+
+    Args:
+        times: (N,) increasing times; N is at least 2.
+        values: (N, K) numbers.
+
+    Returns:
+        Increasing indices, the first 0 and the last N - 1.
+
+    >>> times = np.arange(5.0)
+    >>> knots(times, times[:, None] * 7), knots(times, np.array([[0.0], [0], [0], [4], [8]]))
+    ([0, 4], [0, 2, 4])
+    """
+    if len(times) == 2:
+        return [0, 1]
+    share = ((times - times[0]) / (times[-1] - times[0]))[:, None]
+    missed = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1)
+    worst = int(missed.argmax())
+    if missed[worst] <= 1.0:
+        return [0, len(times) - 1]
+    after = knots(times[worst:], values[worst:])
+    return knots(times[: worst + 1], values[: worst + 1]) + [worst + k for k in after[1:]]
+
+
+def _scaled(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Return (N, 7) positions and quaternions in units of their tolerances."""
+    positions = np.array([frame.position for frame in frames]) / _TOLERANCE_M
+    rotations = np.array([frame.rotation for frame in frames])
+    # A quaternion and its negative are the same rotation.
+    rotations *= np.where(rotations @ rotations[0] < 0.0, -1.0, 1.0)[:, None]
+    return np.column_stack([positions, rotations / _TOLERANCE_ROTATION])
