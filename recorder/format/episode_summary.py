@@ -80,7 +80,7 @@ def add_up(rewards: NDArray[np.float64], start: float = 0.0) -> float:
 def add_up_each(
     rewards: NDArray[np.float64], starts: Iterable[int], stops: Iterable[int]
 ) -> list[float]:
-    """Add up the rewards of several ranges [start, stop), each in order."""
+    """Return the sum of the rewards in each range [start, stop), added up in order."""
     with np.errstate(all="ignore"):
         # Adding 0.0 turns a sum of -0.0 into 0.0.
         return [

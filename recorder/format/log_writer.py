@@ -1,6 +1,7 @@
 """Writer of logs of format version 1, specified by this text, `schema` and `metadata`.
 
-A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, all schemas `ros2msg`.
+A log is an MCAP file with the header profile `ros2`. All channels have the encoding `cdr`, and all
+schemas have the encoding `ros2msg`.
 
     topic                  type                      one message for each
     /rl/step               mcaprl_msgs/msg/Step...   observation; fields in `schema`
@@ -15,27 +16,27 @@ A log is an MCAP file with the header profile `ros2`; all channels are `cdr`, al
 
 Episodes. An episode of T transitions has T + 1 consecutive records of `/rl/step`. Record k < T
 contains observation k, the action taken at it, and the reward of that action; record T is `final`
-and contains only the last observation. `episode` counts from 0 in the recording, `step` from 0 in
-the episode. The last transition is `terminated`, `truncated` or both. An episode that the recorder
-ends is truncated with the reason `interrupted`. Episodes of a vector environment are written one
-after the other, in the order of their ends.
+and contains only the last observation. `episode` is the index in the recording, and `step` is the
+index in the episode; both start at 0. The last transition is `terminated`, `truncated` or both. An
+episode that the recorder ends is truncated with the reason `interrupted`. Episodes of a vector
+environment are written one after the other, in the order of their ends.
 
 Times. log_time and publish_time are the Unix time at the start of the recording plus the simulated
 time, in integer nanoseconds. log_time increases strictly from record to record of `/rl/step`, also
 across episodes. All messages of one observation have the same log_time, which joins the topics.
 `/rl/episode` has the log_time of the final record.
 
-Chunks. Each chunk contains one kind of topic, one line of the table above (`/rosout` and
-`/rl/phase` are in the chunks of `/rl/episode`). It is compressed by zstd, lz4 or not at all, and
-has a CRC and a MessageIndex for each of its channels. Schemas, channels, metadata and attachments
-are top-level records before the chunks that need them. The summary repeats schemas and channels,
-and indexes everything else. All CRCs of MCAP are present. When a log is closed, chunks below 64 KiB
-are merged into chunks of about 1 MiB of the same kind, if there are many; the messages of each
-channel keep their order.
+Chunks. Each line of the table above is one kind of topic, and each chunk contains one kind of topic
+only. Exceptions are `/rosout` and `/rl/phase`, which are in the chunks of `/rl/episode`. A chunk is
+compressed by zstd, lz4 or not at all, and has a CRC and a MessageIndex for each of its channels.
+Schemas, channels, metadata and attachments are top-level records before the chunks that need them.
+The summary repeats schemas and channels, and indexes everything else. All CRCs that MCAP defines
+are present. If a log has many chunks below 64 KiB when it is closed, chunks of the same kind are
+merged into chunks of about 1 MiB; the messages of each channel keep their order.
 
-Order. The metadata record `mcaprl.dataset` comes first. `/rl/step` is written last in each episode:
-a file with the `final` record contains the whole episode. A file without a summary is still being
-written, or its writer was killed; its finished episodes are complete. The attachment
+Order. The metadata record `mcaprl.dataset` comes first. `/rl/step` is written last in each episode,
+so a file that contains the `final` record contains the whole episode. A file without a summary is
+still being written, or its writer was killed; its finished episodes are complete. The attachment
 `foxglove-layout.json` comes with the first episode.
 
 Appending. An appended recording continues the episode numbers and starts after the last log_time of
@@ -139,7 +140,7 @@ class LogTopics:
         return self.sink.add_channel(topic, type_name, messages.definition(type_name))
 
     def step_rows(self, most: int = STEPS_PER_CHUNK) -> StepRows:
-        """Preallocate at most `most` rows of `/rl/step`, as many as fit into a chunk."""
+        """Preallocate rows of `/rl/step` for one chunk, at most `most`."""
         return StepRows.of_text(self._step_text, self._step_channel, most, self.sink.write_rows)
 
     def learner_rows(self, most: int = STEPS_PER_CHUNK) -> TopicRows:
@@ -169,7 +170,7 @@ class LogTopics:
         return ImageRows.of_shape(shape, encoding, channel, most, self.sink.write_rows)
 
     def write_episodes(self, summaries: list[EpisodeSummary], *, log_lines: bool = False) -> None:
-        """Write summaries to `/rl/episode`, each with the log_time of its episode's end.
+        """Write summaries to `/rl/episode`; the log_time of each is the end of its episode.
 
         Args:
             summaries: Summaries of the episodes.
@@ -247,7 +248,7 @@ class LogWriter(LogTopics):
         Raises:
             SpaceError: A log cannot contain these spaces; no file is created then.
             OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created, or cannot be appended to and stays unchanged.
+            LogError: The file cannot be created; or it cannot be appended to, and is unchanged.
         """
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.

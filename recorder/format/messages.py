@@ -1,7 +1,7 @@
 """ROS 2 messages of variable length: episodes, log lines, markers, frames.
 
-These topics have few messages or are read by viewers only, so rosbags encodes them. This module
-encodes the messages at each episode's end itself, because the environment waits for them.
+These topics have few messages or are read only by viewers, so rosbags encodes them. The messages at
+the end of an episode are encoded here without rosbags, because the environment waits for them.
 Transitions and images are encoded as fixed-size rows (`schema`).
 """
 
@@ -83,7 +83,7 @@ def decode(data: bytes, type_name: str) -> Any:
     """
     try:
         return typestore().deserialize_cdr(data, type_name)
-    # The library raises many types of errors; each means that the bytes do not fit.
+    # The library raises errors of many types when the bytes do not fit the type.
     except Exception as error:
         raise CorruptLogError(f"{len(data)} bytes are not a {type_name}: {error}") from error
 
@@ -122,7 +122,7 @@ def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
     # The 32-bit seconds of ROS wrap around; the log_time of the record does not.
     data += _LOG_START.pack(sec % 2**32, nanosec, level)
     _append_strings(data, "mcaprl", text, "", "")
-    # The value 0 of the field `line`.
+    # Align the last field, `line`, and set it to 0.
     data += bytes(-len(data) % 4 + 4)
     return bytes(data)
 
@@ -130,7 +130,7 @@ def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
 def _append_strings(data: bytearray, *texts: str) -> bytearray:
     """Append CDR strings: length, characters and NUL, each aligned to four bytes.
 
-    NUL ends a string of ROS; one inside of a text becomes the replacement character.
+    A NUL character ends a ROS string, so a NUL in a text is replaced by U+FFFD.
     """
     for text in texts:
         encoded = encodable(text).replace("\0", "\ufffd").encode() + b"\0"

@@ -4,15 +4,15 @@ The metadata is stored twice: in the metadata record `mcaprl.dataset`, the first
 header, and as the channel metadata of `/rl/step`. Both are string maps; other values are JSON.
 
     format_version      "1"
-    env_id              Gymnasium id, as `module:Name-v0` if the import of a module registers it;
+    env_id              Gymnasium id; `module:Name-v0` if the import of a module registers it;
                         empty if unknown
     env_kwargs          JSON object: keyword arguments of gymnasium.make
     observation_space   JSON, see `spaces.space_to_json`
     action_space        JSON
     observation_fields  JSON list of {"path": keys in a Dict space, "field" or "topic": name};
                         derived from the space by `spaces.observation_leaves`
-    observation_names   JSON list of names of a vector observation's elements; may be empty
-    action_meanings     JSON list of names of the discrete actions; may be empty
+    observation_names   JSON list: names of the elements of a vector observation; may be empty
+    action_meanings     JSON list: names of the discrete actions; may be empty
     success_reasons     JSON list of the reasons with which an episode succeeds; empty if unknown
     step_duration_ns    simulated time between two records
     policy, epsilon, seed   values at the start of the recording; empty if unknown
@@ -39,10 +39,11 @@ from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_jso
 from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
-# Numbers as names are of no use in a plot of more actions than this.
+# A plot of more actions than this is not readable if their names are only numbers.
 MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
-# Fields that all recordings in one file share; the others describe the first recording.
+# All recordings in one file have equal values of these fields. The other fields describe the first
+# recording.
 SAME_WHEN_APPENDED = (
     "format_version",
     "env_id",
@@ -54,7 +55,7 @@ SAME_WHEN_APPENDED = (
     "step_duration_ns",
 )
 DEFAULT_STEP_DURATION_NS = 100_000_000
-# Arguments of an `EnvSpec` that concern rendering or vectorization.
+# Arguments that concern rendering or vectorization and do not describe one environment.
 _NOT_OF_ONE_ENV = (
     "render_mode",
     "num_envs",
@@ -101,8 +102,8 @@ class LogMetadata:
     def action_names(self) -> dict[int, str]:
         """Return the names of the discrete actions by value; empty for other action spaces.
 
-        A name is the action's meaning if all meanings are distinct, otherwise its number.
-        More than `MAX_NUMBERED_ACTIONS` actions without meanings have no names.
+        The names are the meanings if all meanings are distinct; otherwise they are numbers. If
+        there are more than `MAX_NUMBERED_ACTIONS` actions, numbers are not used as names.
         """
         space = self.action_space
         if not isinstance(space, spaces.Discrete):
@@ -183,7 +184,7 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Return the fields that are equal in all parts, whose spaces have to be equal."""
+        """Keep the fields that are equal in all parts. The spaces of all parts must be equal."""
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
         differing = {
@@ -236,16 +237,16 @@ class LogMetadata:
 
 
 def _env_id(env: Any) -> str:
-    """Return the id by which Gymnasium makes an environment; empty if unknown."""
+    """Return the id that `gymnasium.make` needs for an environment; empty if unknown."""
     if env.spec is None:
         return ""
-    # The module whose import registers the id, if `make_sim` was given one.
+    # `make_sim` stores the module whose import registers the id, if the caller named a module.
     module = getattr(env.unwrapped, "env_module", "")
     return f"{module}:{env.spec.id}" if module else str(env.spec.id)
 
 
 def same_env(first: str, second: str) -> bool:
-    """Return whether two ids name the same environment; ids of older logs have no module.
+    """Return whether two ids name the same environment. The ids in older logs have no module.
 
     >>> same_env("highway_env:racetrack-v1", "racetrack-v1"), same_env("a:Env-v0", "b:Env-v0")
     (True, False)
@@ -280,11 +281,11 @@ def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
 
 
 def _one_of(env: Any) -> Any:
-    """Return a sub-environment of a vector environment, if there is one in this process."""
+    """Return a sub-environment if this process has one that describes `env`; else `env` itself."""
     if not isinstance(env, gym.vector.VectorEnv):
         return env
     inner = env.unwrapped
-    # Wrappers of the vector environment may have changed the spaces of the sub-environments.
+    # Vector wrappers may change the spaces; then a sub-environment does not describe `env`.
     same = inner.single_observation_space == env.single_observation_space and (
         inner.single_action_space == env.single_action_space
     )

@@ -19,7 +19,7 @@ from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
 Write = Callable[[NDArray[Any]], None]
 """Function that writes message records of one channel as one chunk."""
-# Values of a final record besides the episode's last observation.
+# Values of the other fields in a final record, which contains only an observation.
 _FINAL = {
     "action": 0,
     "reward": 0.0,
@@ -38,7 +38,7 @@ class TopicRows:
     """
 
     def __init__(self, rows: NDArray[Any], write: Write) -> None:
-        """View `rows`, whose constant fields are set."""
+        """Create views of `rows`. The caller has set the constant fields."""
         payload = rows["payload"]
         self.fields = {name: payload[name] for name in payload.dtype.names or ()}
         self._rows, self._write, self._log_time = rows, write, rows["log_time"]
@@ -80,7 +80,7 @@ class TopicRows:
         return type(self)(rows, self._write)
 
     def grown(self, length: int) -> Self:
-        """Return a longer block of several episodes that begins with the rows of this one."""
+        """Return a block with `length` rows for each episode that starts with copies of these."""
         block = self.blank(len(self._rows), length)
         block._rows[:, : len(self)] = self._rows
         return block
@@ -91,7 +91,7 @@ class TopicRows:
         Args:
             field: Name in the message.
             where: Index of K rows of the block.
-            values: (K, *shape), or one scalar for all of them.
+            values: (K, *shape) values, or one scalar for all K rows.
         """
         column = self.fields[field]
         if column.ndim > self._rows.ndim:
@@ -130,8 +130,8 @@ class StepRows(TopicRows):
 
         Args:
             where: Index of K rows.
-            episode: Number of the episode in the log, or (K,).
-            steps: (K,) steps since the episode's start.
+            episode: Index of the episode in the log, or one index for each row, (K,).
+            steps: (K,) index of each step in its episode.
         """
         fields = self.fields
         fields["episode"][where], fields["step"][where] = episode, steps
@@ -151,7 +151,7 @@ class ImageRows(TopicRows):
     def of_shape(
         cls, shape: tuple[int, ...], encoding: str, channel_id: int, most: int, write: Write
     ) -> Self:
-        """Preallocate rows of images of one shape; see `TopicRows.of_text` and `LogTopics`."""
+        """Preallocate rows for images of one shape; see `TopicRows.of_text` and `image_rows`."""
         height, width, channels = (*shape, 1)[:3]
         item_bytes = 2 if encoding == "16UC1" else 1
         dtype = image_dtype(height, width, channels, encoding, IMAGE_FRAME, item_bytes)
@@ -160,7 +160,7 @@ class ImageRows(TopicRows):
         return cls(rows, write)
 
     def write(self, where: Any, times_ns: Any) -> None:
-        """Set log_time and header stamp of consecutive rows, and write these as one chunk."""
+        """Set log_time and header stamp of consecutive rows, and write these rows as one chunk."""
         seconds, self.fields["nanosec"][where] = np.divmod(times_ns, 10**9)
         self.fields["sec"][where] = seconds
         super().write(where, times_ns)

@@ -194,7 +194,7 @@ def message_dtype(text: str) -> np.dtype[Any] | None:
     try:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
     except (ValueError, OverflowError):
-        # A repeated field name, or a size that overflows.
+        # A field name is repeated, or the size overflows.
         return None
 
 
@@ -260,7 +260,7 @@ def fill_image_constants(
 
 
 def stored_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the dtype of a leaf in a message: ROS has no float16, and bool is a byte."""
+    """Return the dtype of a leaf in a message: float16 becomes float32, and bool becomes uint8."""
     if dtype == np.float16:
         return np.dtype("<f4")
     return np.dtype("u1") if dtype == np.bool_ else dtype.newbyteorder("<")
@@ -298,5 +298,5 @@ def _digest(text: bytes) -> str:
 
 
 def _align(offset: int, alignment: int) -> int:
-    """Return the next aligned offset, relative to the end of the encapsulation header."""
+    """Align an offset upwards, relative to the end of the encapsulation header."""
     return offset + -(offset - ENCAPSULATION_BYTES) % alignment

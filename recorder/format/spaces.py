@@ -25,8 +25,8 @@ from mcaprl.files import parse_json
 # Nature CNN needs 36.
 MIN_IMAGE_EDGE = 8
 IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
-# Limits on the memory that a short description can make a reader allocate. An RGBA image of
-# 3840 x 2160 pixels and one network output per action fit.
+# These limits restrict the memory that a reader allocates for a short description of a space. They
+# permit an RGBA image of 3840 x 2160 pixels and a network with one output per action.
 MAX_ELEMENTS = 2**25
 MAX_ACTIONS = 2**20
 _MAX_DIMENSIONS = 64
@@ -37,7 +37,7 @@ class Leaf:
     """One array of an observation or action.
 
     Attributes:
-        name: Name of the field in `/rl/step`, or last part of an image's topic.
+        name: Name of the field in `/rl/step`; for an image, the last part of its topic.
         path: Keys from the root of a Dict space to the leaf; empty for the root itself.
         shape: Shape of one value; empty for a scalar.
         dtype: Data type of the environment's values.
@@ -71,7 +71,7 @@ def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
     """List the leaves of an observation space, in the space's order.
 
     Raises:
-        SpaceError: The space has no leaves, or a part of a kind that a log cannot store.
+        SpaceError: The space has no leaves, or a log cannot store a part of the space.
     """
     found = leaves_of(space)
     if not found:
@@ -80,10 +80,10 @@ def observation_leaves(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
-    """List the leaves of an observation space, in the space's order; none for an empty Dict.
+    """List the leaves of an observation space in order. An empty Dict has no leaves.
 
     Raises:
-        SpaceError: A part of the space is of a kind that a log cannot store.
+        SpaceError: A log cannot store a part of the space.
     """
     taken: set[str] = set()
     found: list[Leaf] = []
@@ -98,7 +98,9 @@ def leaves_of(space: spaces.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
-    """Select leaves of a Dict space by key: `joints/q`, or `joints` for all leaves below it.
+    """Select leaves of a Dict space by key.
+
+    The key `joints/q` selects one leaf, and the key `joints` selects all leaves below it.
 
     Args:
         leaves: Leaves to select from.
@@ -117,7 +119,7 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
 
 
 def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return (N,) whether each of N values (N, *shape) of a space without parts is outside it."""
+    """Return an (N,) mask of the values (N, *shape) that are outside a space other than a Dict."""
     match space:
         case spaces.Discrete():
             wrong = (values < space.start) | (values >= space.start + space.n)
@@ -134,7 +136,7 @@ def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]
 
 
 def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
-    """Return a Dict space with only these leaves of a Dict space."""
+    """Return a Dict space without the parts that are not in `leaves`."""
     groups: dict[str, list[Leaf]] = {}
     for leaf in leaves:
         groups.setdefault(leaf.path[0], []).append(replace(leaf, path=leaf.path[1:]))
@@ -151,7 +153,7 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
     """Return the single leaf of an action space.
 
     Raises:
-        SpaceError: The space is a Dict, too large, or of a kind that a log cannot store.
+        SpaceError: The space is a Dict or too large, or a log cannot store this kind of space.
     """
     shape, dtype = _shape_and_dtype(space, "action", ())
     check_elements(math.prod(shape))
@@ -160,14 +162,14 @@ def action_leaf(space: spaces.Space[Any]) -> Leaf:
 
 
 def check_actions(space: spaces.Space[Any]) -> None:
-    """Check that a space has few enough discrete actions for a log or a policy.
+    """Check that a space does not have too many discrete actions for a log or a policy.
 
     Raises:
-        SpaceError: There are too many.
+        SpaceError: The space has too many actions.
     """
     if isinstance(space, spaces.Discrete) and int(space.n) > MAX_ACTIONS:
         raise SpaceError(
-            f"the action space is Discrete({space.n}), too large: at most {MAX_ACTIONS} discrete"
+            f"the action space Discrete({space.n}) is too large: at most {MAX_ACTIONS} discrete"
             " actions can be used; group them, or use MultiDiscrete"
         )
 
@@ -179,7 +181,7 @@ def check_elements(count: float) -> None:
         count: Number of elements of one value.
 
     Raises:
-        SpaceError: There are too many.
+        SpaceError: The space has too many elements.
     """
     if not count <= MAX_ELEMENTS:
         raise SpaceError(
@@ -204,7 +206,7 @@ def space_to_json(space: spaces.Space[Any]) -> str:
     """Write a space as JSON text; `space_from_json` reads back an equal space.
 
     Raises:
-        SpaceError: The space, or a part of it, is of a kind that a log cannot store.
+        SpaceError: A log cannot store the space or a part of it.
     """
     return json.dumps(_to_plain(space))
 
@@ -217,12 +219,12 @@ def space_from_json(text: str) -> spaces.Space[Any]:
     """
     try:
         plain = parse_json(text)
-        # Checked first: the bounds of a Box take memory for each element.
+        # Check the size first, because the bounds of a Box take memory for each element.
         check_elements(_elements(plain))
         return _from_plain(plain)
     except SpaceError:
         raise
-    # NumPy and Gymnasium raise many types of errors; each means that the text is invalid.
+    # NumPy and Gymnasium raise errors of many types when the text is invalid.
     except Exception as error:
         raise SpaceError(f"not a description of a space: {text[:80]!r}") from error
 
@@ -253,7 +255,7 @@ def _shape_and_dtype(
         raise SpaceError(f"{where} is a {type(space).__name__} space; a log can store {allowed}")
     shape = tuple(space.shape or ())
     if math.prod(shape) == 0:
-        raise SpaceError(f"{where} has shape {shape}, so no elements; remove it from the space")
+        raise SpaceError(f"{where} has no elements: its shape is {shape}; remove it from the space")
     dtype = np.dtype(space.dtype)
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
         raise SpaceError(f"{where} has dtype {dtype}; a log can store bool, integers and floats")
@@ -333,7 +335,7 @@ def _from_plain(plain: dict[str, Any]) -> spaces.Space[Any]:
 
 
 def _dtype(plain: dict[str, Any]) -> np.dtype[Any]:
-    """Return the dtype of a described space; refuse strings, which can have any length."""
+    """Return the dtype in a description of a space; refuse strings, which can have any length."""
     dtype: np.dtype[Any] = np.dtype(plain["dtype"])
     if dtype.kind not in "biuf":
         raise ValueError(f"dtype {dtype}")
@@ -341,7 +343,7 @@ def _dtype(plain: dict[str, Any]) -> np.dtype[Any]:
 
 
 def _elements(plain: dict[str, Any]) -> int:
-    """Return the number of elements of a described space."""
+    """Return the number of elements of a described space; 1 if the description has no shape."""
     if plain["type"] == "Dict":
         return sum(_elements(part) for _, part in plain["spaces"])
     if plain["type"] not in ("Box", "MultiBinary"):
@@ -354,8 +356,8 @@ def _elements(plain: dict[str, Any]) -> int:
 
 
 def _numbers(bounds: NDArray[Any]) -> Any:
-    """Return bounds as JSON: a single number if all are equal; infinities as strings."""
-    # Image spaces have many bounds, nearly always equal: avoid the list.
+    """Return bounds for JSON. Equal bounds become one number, and infinities become strings."""
+    # Image spaces have many bounds, which are nearly always equal: do not build a list then.
     if bounds.size and (bounds == bounds.flat[0]).all():
         return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]

@@ -9,11 +9,11 @@ LOG_TOPIC = "/rosout"
 PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
 """Phase of an episode before its end; from then on the phase is the reason of the end."""
-# Maximum numbers of /rl/step rows, images and bytes in a chunk.
+# A chunk has at most this number of /rl/step rows, of images, and of bytes.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
 BYTES_PER_CHUNK = 8 * 2**20
-# Minimum number of rows in a buffer: the last transition, which stays in memory because it may turn
-# out to end its episode, a new one, and one more.
+# A buffer needs at least these rows: the last transition, a new one, and one more. The last
+# transition stays in memory because it may turn out to be the end of its episode.
 MIN_ROWS = 3
 IMAGE_FRAME = "camera"

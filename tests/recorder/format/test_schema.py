@@ -195,7 +195,7 @@ def test_unsupported_spaces_are_refused() -> None:
     cases = [
         (spaces.Tuple([discrete]), "observation is a Tuple space"),
         (spaces.Dict({"x": spaces.Graph(discrete, None)}), r"observation\['x'\] is a Graph space"),
-        (spaces.Box(-1, 1, (0,)), "so no elements"),
+        (spaces.Box(-1, 1, (0,)), "has no elements"),
         (spaces.Dict({}), "empty Dict"),
     ]
     for space, message in cases:
