@@ -13,10 +13,15 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.source import Definition, RawMessage, TopicSource
-from mcaprl.recorder.format.reading import MESSAGE_HEADER, McapReader, MessageRange, Topic
+from mcaprl.recorder.format.reading import (
+    MESSAGE_HEADER,
+    ROS_TO_NUMPY,
+    McapReader,
+    MessageRange,
+    Topic,
+)
 
-# Kinds whose columns are decoded one by one: bytes stay bytes, and lists of messages objects.
-_ONE_BY_ONE = ("uint8[", "byte[", "octet[")
+_BYTES = ("uint8", "byte", "octet")
 
 
 class McapFile:
@@ -88,7 +93,7 @@ class _McapTopic:
         if self._channel.message_encoding != "cdr":
             return None
         topic = self._columnar
-        if topic is None or not set(fields) <= set(topic.fields) or topic.channels > 1:
+        if topic is None or not all(_is_column(topic.kinds.get(field, "")) for field in fields):
             return None
         try:
             return dict(topic.read(list(fields), rows))
@@ -104,3 +109,14 @@ class _McapTopic:
         except LogError:
             return None
         return found if found.channels == 1 else None
+
+
+def _is_column(kind: str) -> bool:
+    """Return whether a field is read as a column: a number, a text, or an array of numbers.
+
+    Bytes stay bytes, and lists of texts or messages stay lists.
+    """
+    element, bracket, _ = kind.partition("[")
+    if bracket:
+        return element in ROS_TO_NUMPY and element not in _BYTES
+    return element in ROS_TO_NUMPY or element in ("string", "time")

@@ -22,9 +22,9 @@ import numpy as np
 from mcap.records import Schema
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.recorder.columns.definitions import TIME_TYPES, full_name, leaf_kinds, store_of
 
 # The encapsulation header of little-endian plain CDR, bytes 00 01 00 00, as a uint32.
 ENCAPSULATION = 0x0100
@@ -70,35 +70,44 @@ class Layout:
 
     def fits(self, payloads: NDArray[Any]) -> bool:
         """Return whether all messages have this layout."""
-        return all(bool((payloads[name] == value).all()) for name, value in self.constants.items())
+        return bool(self.matching(payloads).all())
+
+    def matching(self, payloads: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which messages have this layout."""
+        found = np.ones(len(payloads), bool)
+        for name, value in self.constants.items():
+            found &= payloads[name] == value
+        return found
 
 
 class MessageType:
     """Message type parsed from a schema."""
 
-    def __init__(self, name: str, text: str) -> None:
-        """Parse a ROS 2 message definition with its nested types.
+    def __init__(self, name: str, text: str, encoding: str = "ros2msg") -> None:
+        """Parse a ROS 2 definition; see `definitions.store_of`.
 
         Raises:
-            LogError: The definition does not parse.
+            LogError: The definition does not parse, or a type is not defined.
         """
-        self.name = name
+        self.name = name = full_name(name)
         self._layouts: dict[tuple[object, ...], Layout | None] = {}
-        self._store = get_typestore(Stores.EMPTY)
-        try:
-            types = get_types_from_msg(text, name)
-            own = {key: value for key, value in types.items() if key not in self._store.fielddefs}
-            self._store.register(own)
-            self._fields = dict(self._store.fielddefs[name][1])
-            self._store.get_msgdef(name)
-        # The library raises errors of many types when a definition does not parse.
-        except Exception as error:
-            raise LogError(f"the definition of {name} does not parse: {error}") from error
+        self._store = store_of(name, text, encoding)
+        self._fields = dict(self._store.fielddefs[name][1])
 
     @cached_property
     def dtypes(self) -> dict[str, np.dtype[Any]]:
-        """Dtype of each top-level field; `object` if it is neither a number nor an array."""
+        """Dtype of each top-level field; `object` for all but numbers, arrays and times."""
         return {name: _dtype_of(description) for name, description in self._fields.items()}
+
+    @cached_property
+    def kinds(self) -> dict[str, str]:
+        """Kind of each leaf field by its dotted path; see `definitions.leaf_kinds`."""
+        return leaf_kinds(self._store, self.name)
+
+    def leaf_dtype(self, path: str) -> np.dtype[Any]:
+        """Return the dtype of a leaf field; int64 for times, `object` for texts and messages."""
+        kind = self.kinds.get(path, "").split("[")[0]
+        return np.dtype(np.int64 if kind == "time" else ROS_TO_NUMPY.get(kind, object))
 
     def decode(self, data: bytes) -> Any:
         """Decode one message to an object with an attribute for each field.
@@ -134,25 +143,30 @@ class MessageType:
         walk = _Walk(example)
         try:
             for name, description in self._fields.items():
-                self._pass(walk, description, name if name in wanted else None)
+                self._pass(walk, description, name, wanted)
         except (struct.error, _NoLayout):
             return None
         if not walk.position <= len(example) <= walk.position + MAX_PADDING_BYTES:
             return None
         return walk.layout()
 
-    def _pass(self, walk: _Walk, description: Any, name: str | None) -> None:
-        """Skip one field; record its position under `name` unless `name` is None."""
+    def _pass(self, walk: _Walk, description: Any, path: str, wanted: Collection[str] = ()) -> None:
+        """Skip one field; record the positions of wanted paths in it."""
         kind, what = description
+        name = path if path in wanted else None
         match kind:
             case Nodetype.BASE if what[0] == "string":
                 walk.take(f"S{walk.length()}", 1, name, scalar=True)
             case Nodetype.BASE:
                 walk.take(_number(what[0]), 1, name, scalar=True)
+            case Nodetype.NAME if name is not None and what in TIME_TYPES:
+                walk.take_time(name, wanted)
             case Nodetype.NAME:
                 self._refuse(name)
-                for inner in self._store.fielddefs[what][1]:
-                    self._pass(walk, inner[1], None)
+                # Names are composed only where a wanted path may be.
+                within = wanted if any(each.startswith(f"{path}.") for each in wanted) else ()
+                for inner, found in self._store.fielddefs[what][1]:
+                    self._pass(walk, found, f"{path}.{inner}" if within else path, within)
             case Nodetype.ARRAY | Nodetype.SEQUENCE:
                 element, count = what
                 if kind == Nodetype.SEQUENCE:
@@ -160,14 +174,17 @@ class MessageType:
                 if element[0] == Nodetype.BASE and element[1][0] != "string":
                     walk.take(_number(element[1][0]), count, name)
                     return
+                if name is not None and element[0] == Nodetype.BASE:
+                    # Arrays of strings are decoded one by one.
+                    raise _NoLayout
                 self._refuse(name)
                 for _ in range(count):
-                    self._pass(walk, element, None)
+                    self._pass(walk, element, path)
 
     def _refuse(self, name: str | None) -> None:
-        """Raise LogError for a wanted field that is a nested message or a list of strings."""
+        """Raise LogError for a wanted field that is a message or a list of messages."""
         if name is not None:
-            raise LogError(f"field {name} of {self.name} is not a number, array or string")
+            raise LogError(f"field {name} of {self.name} is not a number, array, string or time")
 
 
 class _Walk:
@@ -197,6 +214,18 @@ class _Walk:
         if name is not None:
             self._fields[name] = (dtype if scalar else (dtype, (count,)), self.position)
         self.position += count * dtype.itemsize
+
+    def take_time(self, name: str, wanted: Collection[str]) -> None:
+        """Skip a time; record its two parts as one field, and as fields if they are wanted."""
+        self.position += -(self.position - ENCAPSULATION_BYTES) % 4
+        start, self.position = self.position, self.position + 8
+        if self.position > len(self._data):
+            raise _NoLayout
+        parts = [("sec", f"{self._order}i4"), ("nanosec", f"{self._order}u4")]
+        self._fields[name] = (np.dtype(parts), start)
+        for number, (part, code) in enumerate(parts):
+            if f"{name}.{part}" in wanted:
+                self._fields[f"{name}.{part}"] = (code, start + 4 * number)
 
     def length(self) -> int:
         """Read the length of a string or sequence, and make it a constant of the layout."""
@@ -230,11 +259,11 @@ def message_type(schema: Schema) -> MessageType:
     """Return the type of a schema; each schema is parsed once.
 
     Raises:
-        LogError: The encoding is not `ros2msg`, or the definition does not parse.
+        LogError: The encoding is neither `ros2msg` nor `ros2idl`, or the definition cannot be used.
     """
-    if schema.encoding != "ros2msg":
+    if schema.encoding not in ("ros2msg", "ros2idl"):
         raise LogError(f"schema {schema.name} has encoding {schema.encoding!r}, not 'ros2msg'")
-    return _parsed(schema.name, schema.data.decode(errors="replace"))
+    return _parsed(schema.name, schema.data.decode(errors="replace"), schema.encoding)
 
 
 _parsed = lru_cache(maxsize=64)(MessageType)
@@ -244,6 +273,8 @@ def _dtype_of(description: Any) -> np.dtype[Any]:
     kind, what = description
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         kind, what = what[0]
+    if kind == Nodetype.NAME and what in TIME_TYPES and description[0] == Nodetype.NAME:
+        return np.dtype(np.int64)
     if kind != Nodetype.BASE:
         return np.dtype(object)
     return np.dtype(ROS_TO_NUMPY.get(what[0], object))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.cdr import Layout, message_type
 from mcaprl.recorder.columns.chunks import Scratch
+from mcaprl.recorder.columns.definitions import TIME_TYPES
 from mcaprl.recorder.columns.message_rows import (
     MESSAGE_HEADER,
     MessageRange,
@@ -24,6 +25,8 @@ from mcaprl.recorder.columns.records import RECORD_HEADER
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
+# Messages of one length with more different layouts than this are decoded one by one.
+_MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]
 """Arrays of one length by field name; strings are arrays of `str` objects."""
@@ -101,7 +104,33 @@ class Decoder:
             alike = lengths == length
             if self._put_alike(columns, records, index[alike], rows[alike]):
                 index, rows, lengths = index[~alike], rows[~alike], lengths[~alike]
+                continue
+            # Two strings may change places, so that layouts differ and lengths do not.
+            for _ in range(_MAX_LAYOUTS):
+                alike = self._like_first(records, index, lengths == length, columns)
+                if not alike.any() or not self._put_alike(
+                    columns, records, index[alike], rows[alike]
+                ):
+                    break
+                index, rows, lengths = index[~alike], rows[~alike], lengths[~alike]
         return index, rows
+
+    def _like_first(
+        self,
+        records: memoryview,
+        index: NDArray[Any],
+        among: NDArray[np.bool_],
+        wanted: Collection[str],
+    ) -> NDArray[np.bool_]:
+        """Return which of some messages of equal length have the layout of the first."""
+        alike = np.zeros(len(index), bool)
+        places = np.flatnonzero(among)
+        if len(places):
+            layout = self.type.layout(self._message(records, index[places[0]]), wanted)
+            if layout is not None:
+                rows = gather(records, index[places], record_dtype(layout.dtype))
+                alike[places] = layout.matching(rows["payload"])
+        return alike
 
     def _put_alike(
         self, columns: Columns, records: memoryview, index: NDArray[Any], rows: Rows
@@ -115,6 +144,8 @@ class Decoder:
         for name, column in columns.items():
             if column.dtype.kind == "O":
                 column[rows] = self._texts(found[name])
+            elif found[name].dtype.names:
+                column[rows] = _nanoseconds(found[name])
             else:
                 _put(column, rows, found[name])
         return True
@@ -171,7 +202,10 @@ class Decoder:
                 f"{self._reader.path}: {self.channel.topic} at log_time {entry['log_time']}:"
                 f" {error}"
             ) from error
-        return {name: np.asarray(getattr(message, name), self.type.dtypes[name]) for name in wanted}
+        return {
+            name: np.asarray(_value_at(message, name), self.type.leaf_dtype(name))
+            for name in wanted
+        }
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
@@ -183,6 +217,24 @@ class Decoder:
             raise CorruptLogError(
                 f"{self._reader.path}: {self.channel.topic} has a string that is not UTF-8"
             ) from error
+
+
+def _nanoseconds(times: NDArray[Any]) -> NDArray[np.int64]:
+    """Return times with the fields `sec` and `nanosec` as nanoseconds."""
+    found: NDArray[np.int64] = times["sec"].astype(np.int64)
+    found *= 10**9
+    found += times["nanosec"]
+    return found
+
+
+def _value_at(message: Any, path: str) -> Any:
+    """Return a field by its dotted path; a time as nanoseconds."""
+    found = message
+    for name in path.split("."):
+        found = getattr(found, name)
+    if getattr(found, "__msgtype__", "") in TIME_TYPES:
+        return found.sec * 10**9 + found.nanosec
+    return found
 
 
 def _put(column: NDArray[Any], rows: Rows, values: NDArray[Any]) -> None:

@@ -118,13 +118,19 @@ class Topic:
             )
         return dtypes[0] if dtypes else {}
 
+    @cached_property
+    def kinds(self) -> dict[str, str]:
+        """Kinds of the leaf fields by dotted path; empty if channels differ."""
+        found = [decoder.type.kinds for decoder in self._decoders]
+        return found[0] if found and all(each == found[0] for each in found) else {}
+
     def read(
         self, wanted: Collection[str], order: NDArray[np.int64] | None = None, *, threads: int = 1
     ) -> Columns:
         """Read columns: `log_time` and the wanted fields.
 
         Args:
-            wanted: Names of fields.
+            wanted: Names of fields, or dotted paths of nested ones.
             order: Positions in `times` of the messages to read, by default all. Chunks without
                 such messages are not read.
             threads: Number of threads that decompress chunks and copy messages.

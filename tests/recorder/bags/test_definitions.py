@@ -86,7 +86,7 @@ def test_known_types_need_no_definition_and_others_are_named(tmp_path: Path) -> 
         problems = {name: topic.problem for name, topic in bag.topics.items()}
         assert problems["/known"] == ""
         assert "acme_msgs/msg/Robot: its definition is missing" in problems["/unknown"]
-        assert "the definition of the nested type acme_msgs/msg/Wheel is mi" in problems["/nested"]
+        assert "the definition of nested type acme_msgs/msg/Wheel is mi" in problems["/nested"]
         assert "encoding 'flatbuffer'" in problems["/flat"]
         assert bag.topics["/flat"].count == 1
         with pytest.raises(LogError, match="/unknown cannot be read: acme_msgs/msg/Robot"):

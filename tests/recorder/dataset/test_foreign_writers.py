@@ -277,7 +277,7 @@ def test_observations_of_several_lengths(log_path: Path) -> None:
     ("message_encoding", "schema_encoding", "reported"),
     [
         ("json", "jsonschema", "messages of /rl/step have encoding 'json'"),
-        ("cdr", "ros2idl", "'ros2idl'"),
+        ("cdr", "omgidl", "'omgidl'"),
     ],
 )
 def test_other_encodings(
