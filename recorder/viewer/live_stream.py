@@ -5,8 +5,8 @@ Viewers receive the topics of a log (see `log_writer` and `display`) and one mor
     /rl/training    mcaprl_msgs/msg/Telemetry...    metrics of the learner: loss, epsilon, ...
 
 An environment in training runs many times faster than real time. The stream therefore shows one
-whole episode at a given speed, and then the next one that begins: it encodes the messages while the
-environment runs, and a thread sends them at their times. The environment never waits for a viewer.
+whole episode at a given speed and skips the episodes that begin meanwhile. Messages are encoded
+while the environment runs, and a thread sends them later. The environment never waits for a viewer.
 Log times are wall-clock times. Nothing is stored.
 """
 
@@ -41,8 +41,10 @@ from mcaprl.recorder.record.display import (
     ShownTopics,
 )
 from mcaprl.recorder.record.layout import TRAINING_TOPIC, VALUES_TOPIC, layout_of
+from mcaprl.recorder.record.motion import Moment, motion_transforms
 from mcaprl.recorder.record.scene import (
     DepthSource,
+    Frame,
     MotionSource,
     SceneSource,
     TelemetrySource,
@@ -60,6 +62,8 @@ MAX_STEPS = 2_000
 """Number of steps of an episode that are shown; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
 _KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
+# Viewers draw no motion within a step shorter than this.
+_SHORTEST_MOTION_NS = 10_000_000
 _ROW = slice(1)
 """The only row that is reserved for each topic."""
 
@@ -199,6 +203,8 @@ class LiveStream(ViewerServer):
         }
         self._static_shapes: Sequence[Any] | None = None
         self._tracks = Tracks()
+        # Frames at the latest step, which are sent with the motion after it.
+        self._moment: Moment | None = None
         self._start_ns = self._time_ns = self._next_ns = self._picture_ns = 0
         self._steps_shown = 0
         if isinstance(source, SceneSource):
@@ -209,13 +215,14 @@ class LiveStream(ViewerServer):
     def begin_episode(self, episode: int, policy: str) -> bool:
         """Return whether to show the episode that begins now.
 
-        It is shown if a viewer subscribes, the previous one is over on screen, and there is time.
+        It is shown if a viewer subscribes, the previous one was sent completely, and `pace` allows.
         """
         now_ns = time.time_ns()
         if now_ns < self._next_ns or not self._pace.due() or not self._sink.has_viewers():
             return False
         self._start_ns = self._next_ns = now_ns
         self._steps_shown = self._picture_ns = 0
+        self._moment = None
         self._tracks.begin()
         self._sink.write_messages(self._log.begin_messages(episode, policy, now_ns))
         return True
@@ -224,7 +231,7 @@ class LiveStream(ViewerServer):
         """Start the timer of the stream, and send the display messages before a step.
 
         Returns:
-            Whether shapes and images were due, and the learner's values are.
+            Whether shapes and images were sent; then the learner's values are also due.
         """
         self._pace.begin()
         self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
@@ -266,6 +273,7 @@ class LiveStream(ViewerServer):
         """Send the end of the shown episode; its times are replaced by those of the stream."""
         self._pace.begin()
         summary = summary._replace(start_time_ns=self._start_ns, end_time_ns=self._next_ns)
+        self._send_motion([])
         self._log.write_episodes([summary])
         self._sink.write_messages(self._log.end_messages(summary))
         failed = self._log.metadata.is_failure(summary.reason)
@@ -300,7 +308,7 @@ class LiveStream(ViewerServer):
         )
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Send the current scene again, for the new viewer."""
+        """Send the current scene again, because the new viewer needs it."""
         self._sink.welcome()
 
     def close(self) -> None:
@@ -313,16 +321,22 @@ class LiveStream(ViewerServer):
         time_ns = self._time_ns
         if self._steps_shown == 0:
             self._send_static(source, time_ns)
-        if isinstance(source, MotionSource):
-            for left_s, frames in source.motion():
-                moment_ns = time_ns - round(left_s / self._speed * 1e9)
-                self._emit(TF, moment_ns, transforms(frames, moment_ns))
         frames = source.frames()
-        self._emit(TF, time_ns, transforms(frames, time_ns))
+        inner: Sequence[tuple[float, Sequence[Frame]]] = ()
+        if isinstance(source, MotionSource) and self._step_ns >= _SHORTEST_MOTION_NS:
+            inner = source.motion()
+        between = [(time_ns - round(s / self._speed * 1e9), each) for s, each in inner]
+        self._send_motion([*between, (time_ns, frames)])
         if frames:
             self._tracks.add(frames[0].position)
         if is_picture:
             self._emit(SCENE, time_ns, marker_array(source.scene()))
+
+    def _send_motion(self, moments: Sequence[Moment]) -> None:
+        """Send the frames at the previous step, and their motion until this one."""
+        if self._moment is not None:
+            self._emit(TF, self._moment[0], motion_transforms([self._moment, *moments]))
+        self._moment = moments[-1] if moments else None
 
     def _send_static(self, source: SceneSource, time_ns: int) -> None:
         """Send the static shapes and frames if they have changed."""
