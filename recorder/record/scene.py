@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -34,7 +35,6 @@ MARKER_TYPES = {
     "triangles": 11,
 }
 _ADD, _DELETE_ALL = 0, 3
-_FOREVER = (0, 0)
 # Values are rounded to binary fractions. This halves their size in a log and is invisible.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**8
@@ -255,12 +255,11 @@ def _marker(
     points: NDArray[np.float64] | Sequence[Vector] = (),
     text: str = "",
 ) -> Any:
-    sec, nanosec = _FOREVER
     red, green, blue, opacity = color
-    new = messages.new
+    new, point = messages.new, messages.typestore().types["geometry_msgs/msg/Point"]
     return new(
         "visualization_msgs/msg/Marker",
-        header=messages.header(0, frame),
+        header=_unstamped(frame),
         ns=name,
         id=0,
         type=kind,
@@ -272,29 +271,43 @@ def _marker(
         ),
         scale=_vector(size),
         color=new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=opacity),
-        lifetime=new("builtin_interfaces/msg/Duration", sec=sec, nanosec=nanosec),
         # The marker moves with its frame between messages; static bodies are sent only once.
         frame_locked=True,
-        points=[_point(point) for point in _rounded(points, _POINTS_PER_M)],
-        colors=[],
-        texture_resource="",
-        texture=new(
-            "sensor_msgs/msg/CompressedImage",
-            header=messages.header(0, ""),
-            format="",
-            data=np.empty(0, np.uint8),
-        ),
-        uv_coordinates=[],
+        points=[point(x=x, y=y, z=z) for x, y, z in _rounded_points(points)],
         text=text,
-        mesh_resource="",
-        mesh_file=new("visualization_msgs/msg/MeshFile", filename="", data=np.empty(0, np.uint8)),
-        mesh_use_embedded_materials=False,
+        **_unused_fields(),
     )
 
 
-def _rounded(numbers: Any, per_one: int) -> Any:
-    """Round numbers or arrays to multiples of 1 / per_one, and convert arrays to lists."""
-    return (np.rint(np.multiply(numbers, per_one)) / per_one).tolist()
+@lru_cache
+def _unstamped(frame: str) -> Any:
+    return messages.header(0, frame)
+
+
+@lru_cache(maxsize=1)
+def _unused_fields() -> dict[str, Any]:
+    """Return the fields that are equal in all markers; a lifetime of 0 has no end."""
+    new, nothing = messages.new, np.empty(0, np.uint8)
+    image = "sensor_msgs/msg/CompressedImage"
+    return {
+        "lifetime": new("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        "colors": [],
+        "texture_resource": "",
+        "texture": new(image, header=messages.header(0, ""), format="", data=nothing),
+        "uv_coordinates": [],
+        "mesh_resource": "",
+        "mesh_file": new("visualization_msgs/msg/MeshFile", filename="", data=nothing),
+        "mesh_use_embedded_materials": False,
+    }
+
+
+def _rounded_points(points: NDArray[np.float64] | Sequence[Vector]) -> Any:
+    return (np.rint(np.multiply(points, _POINTS_PER_M)) / _POINTS_PER_M).tolist()
+
+
+def _rounded(numbers: Iterable[float], per_one: int) -> list[float]:
+    """Round numbers to multiples of 1 / per_one."""
+    return [round(number * per_one) / per_one for number in numbers]
 
 
 def _point(xyz: Iterable[float]) -> Any:
