@@ -13,17 +13,21 @@ from mcaprl.errors import LogError
 
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
+# Definitions of a service's events may lack those of its request and response. The events can be
+# read nevertheless if they contain neither, which is the default of ROS.
+_EVENT, _PARTS = "_Event", ("_Request", "_Response")
+_UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
 _IDL_LINE = "=" * 80 + "\n"
 
 
 def full_name(name: str) -> str:
-    """Return the name of a type with its middle part, which ROS 1 and some writers leave out.
+    """Return the name of a type in the form that rosbags uses.
 
-    >>> full_name("geometry_msgs/Twist"), full_name("geometry_msgs/msg/Twist")
-    ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/Twist')
+    >>> full_name("geometry_msgs/Twist"), full_name("std_srvs/srv/Trigger_Event")
+    ('geometry_msgs/msg/Twist', 'std_srvs/srv/msg/Trigger_Event')
     """
-    package, _, rest = name.partition("/")
-    return name if "/" in rest or not rest else f"{package}/msg/{rest}"
+    folder, slash, last = name.rpartition("/")
+    return name if not slash or folder.endswith("/msg") else f"{folder}/msg/{last}"
 
 
 def store_of(name: str, text: str, encoding: str = "ros2msg", distribution: str = "") -> Typestore:
@@ -46,6 +50,8 @@ def store_of(name: str, text: str, encoding: str = "ros2msg", distribution: str 
         each = needed.pop()
         if each not in types:
             found = own.get(each) or _known(distribution, encoding == ROS1).fielddefs.get(each)
+            if name.endswith(_EVENT) and each.endswith(_PARTS) and not (found and found[1]):
+                found = _UNKNOWN
             if found is None:
                 what = "its definition" if each == name else f"the definition of nested type {each}"
                 raise LogError(f"{name}: {what} is missing and not known")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -113,3 +114,37 @@ def test_damaged_messages_name_their_topic(tmp_path: Path) -> None:
         pytest.raises(LogError, match="/v: 7 bytes are not a "),
     ):
         bag.read("/v", ["x"])
+
+
+EVENT = """\
+service_msgs/msg/ServiceEventInfo info
+std_srvs/srv/SetBool_Request[<=1] request
+std_srvs/srv/SetBool_Response[<=1] response
+"""
+
+
+@pytest.mark.parametrize("parts", ["", f"{'=' * 80}\nMSG: std_srvs/srv/SetBool_Request\n"])
+def test_service_events_are_read_without_their_request(parts: str, tmp_path: Path) -> None:
+    kind = "std_srvs/srv/SetBool_Event"
+    # Event 2, 3.5 s, client 16 times 7, sequence number 9, and neither request nor response.
+    info = struct.pack("<B3xiI16sxxxxq", 2, 3, 500_000_000, b"\7" * 16, 9)
+    data = b"\0\1\0\0" + info + struct.pack("<II", 0, 0)
+    other = ("/v", "geometry_msgs/msg/Vector3", "ros2msg", "", "cdr")
+    value = bytes(STORE2.serialize_cdr(vector(STORE2), other[1]))
+    path = write_mcap(
+        tmp_path / "events.mcap",
+        [
+            ("/set/_service_event", kind, "ros2msg", EVENT + parts, "cdr", data),
+            (*other, value),
+        ],
+    )
+    with closing(open_bag(path)) as bag:
+        assert not bag.topics["/set/_service_event"].problem
+        fields = ["info.event_type", "info.stamp", "info.sequence_number", "request"]
+        found = bag.read("/set/_service_event", fields).columns
+        assert found["info.event_type"].tolist() == [2]
+        assert found["info.stamp"].tolist() == [3_500_000_000]
+        assert found["info.sequence_number"].tolist() == [9]
+        assert len(found["request"][0]) == 0
+        assert bag.topics["/set/_service_event"].constants == {}
+        assert bag.read("/v", ["x"]).columns["x"].tolist() == [1.0]
