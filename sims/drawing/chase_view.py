@@ -68,7 +68,7 @@ class ChaseView:
             MissingExtraError: Pygame is not installed.
         """
         self._canvas = Canvas("rgb_array", SIZE_PX, "", 1)
-        self._prepared: tuple[Sequence[Shape], list[_Piece], Floats] | None = None
+        self._prepared: tuple[Sequence[Shape], list[_Piece], Floats, Floats] | None = None
 
     def draw(
         self,
@@ -115,10 +115,14 @@ class ChaseView:
         if self._prepared is None or self._prepared[0] is not static:
             pieces = [p for s in static if s.frame == "map" for p in _pieces(s, {})]
             middles = np.array([p.corners_m.mean(axis=0) for p in pieces]).reshape(-1, 3)
-            self._prepared = (static, pieces, middles)
-        _, pieces, middles = self._prepared
+            radii_m = [
+                np.linalg.norm(piece.corners_m - middle, axis=1).max() + piece.width_m
+                for piece, middle in zip(pieces, middles, strict=True)
+            ]
+            self._prepared = (static, pieces, middles, np.array(radii_m))
+        _, pieces, middles, radii_m = self._prepared
         near = np.hypot(*(middles - eye.at_m)[:, :2].T) < FAR_M
-        return [pieces[i] for i in np.flatnonzero(near)]
+        return [pieces[i] for i in np.flatnonzero(near & _in_view(middles, radii_m, eye))]
 
     def _write(self, texts: Iterable[_Piece], eye: Pose, lines: Sequence[str]) -> None:
         for piece in texts:
@@ -236,6 +240,16 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
     if heights_m.max() <= _FLAT_M and np.ptp(heights_m) < 0.01:
         return 0, float(heights_m[0])
     return 1, -float(np.linalg.norm(piece.corners_m.mean(axis=0) - eye_m))
+
+
+def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]:
+    """Return which spheres may be visible: those not beyond a border of the image."""
+    x_m, y_m, z_m = ((middles_m - eye.at_m) @ eye.axes).T
+    seen = z_m + radii_m > _NEAR_M
+    for aside_m, size_px in ((x_m, SIZE_PX[0]), (y_m, SIZE_PX[1])):
+        slope = size_px / 2 / _FOCAL_PX
+        seen &= np.abs(aside_m) - slope * z_m <= math.hypot(1.0, slope) * radii_m
+    return seen
 
 
 def _seen(piece: _Piece, eye: Pose) -> Floats | None:
