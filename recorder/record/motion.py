@@ -20,14 +20,14 @@ Moment = tuple[int, Sequence[Frame]]
 
 _TOLERANCE_M = 0.04
 _TOLERANCE_ROTATION = 0.01
-"""Difference of quaternion components; 0.01 rad for small angles."""
+"""Difference of quaternion components; 0.02 rad for small angles."""
 
 
 def motion_transforms(moments: Sequence[Moment]) -> bytes:
     """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
 
     Of the poses of a frame between the first and the last moment, only those are kept that linear
-    interpolation between the others misses by more than 0.02 m or 0.01 rad.
+    interpolation between the others misses by more than 0.04 m or 0.02 rad.
 
     Args:
         moments: Moments with the same frames each, in order of time.

@@ -120,9 +120,9 @@ class ChaseView:
                 for piece, middle in zip(pieces, middles, strict=True)
             ]
             self._prepared = (static, pieces, middles, np.array(radii_m))
-        _, pieces, middles, radii_m = self._prepared
+        _, pieces, middles, reach_m = self._prepared
         near = np.hypot(*(middles - eye.at_m)[:, :2].T) < FAR_M
-        return [pieces[i] for i in np.flatnonzero(near & _in_view(middles, radii_m, eye))]
+        return [pieces[i] for i in np.flatnonzero(near & _in_view(middles, reach_m, eye))]
 
     def _write(self, texts: Iterable[_Piece], eye: Pose, lines: Sequence[str]) -> None:
         for piece in texts:
@@ -245,7 +245,7 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
 def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]:
     """Return which spheres may be visible: those not beyond a border of the image."""
     x_m, y_m, z_m = ((middles_m - eye.at_m) @ eye.axes).T
-    seen = z_m + radii_m > _NEAR_M
+    seen: NDArray[np.bool_] = z_m + radii_m > _NEAR_M
     for aside_m, size_px in ((x_m, SIZE_PX[0]), (y_m, SIZE_PX[1])):
         slope = size_px / 2 / _FOCAL_PX
         seen &= np.abs(aside_m) - slope * z_m <= math.hypot(1.0, slope) * radii_m
