@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.drawing.scene import Frame, Shape
 
-DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "arrow": 2}
+DRAWN_BY_POINTS = {"line": 1, "segments": 2, "triangles": 3, "points": 1, "spheres": 1, "arrow": 2}
 
 
 def rotated(frame: Frame, vector: tuple[float, float, float]) -> NDArray[np.float64]:
