@@ -14,6 +14,7 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     observation_names   JSON list: names of the elements of a vector observation; may be empty
     action_meanings     JSON list: names of the discrete actions; may be empty
     success_reasons     JSON list of the reasons with which an episode succeeds; empty if unknown
+    view                JSON object of numbers for viewers; see `LogMetadata.view`
     step_duration_ns    simulated time between two records
     policy, epsilon, seed   values at the start of the recording; empty if unknown
     versions            JSON object: package -> version
@@ -22,6 +23,7 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -79,6 +81,10 @@ class LogMetadata:
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
         success_reasons: Reasons with which an episode succeeds; empty if unknown.
+        view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the camera
+            that follows; `world_m`, `world_x_m` and `world_y_m` are the size and middle of the
+            world; `depth_min_m` and `depth_max_m` limit the colors of depth; `speed_m_s` is the
+            highest speed.
         step_duration_ns: Simulated time between two records, nanoseconds.
         policy: Name of the first policy; each episode's summary names its own.
         epsilon: Probability of a random action, as text; empty if unknown.
@@ -93,6 +99,7 @@ class LogMetadata:
     observation_names: tuple[str, ...] = ()
     action_meanings: tuple[str, ...] = ()
     success_reasons: tuple[str, ...] = ()
+    view: Mapping[str, float] = field(default_factory=dict)
     step_duration_ns: int = DEFAULT_STEP_DURATION_NS
     policy: str = ""
     epsilon: str = ""
@@ -138,6 +145,7 @@ class LogMetadata:
             "observation_names": json.dumps(self.observation_names),
             "action_meanings": json.dumps(self.action_meanings),
             "success_reasons": json.dumps(self.success_reasons),
+            "view": json.dumps(dict(self.view)),
             "step_duration_ns": str(self.step_duration_ns),
             "policy": encodable(self.policy),
             "epsilon": self.epsilon,
@@ -171,6 +179,7 @@ class LogMetadata:
                 observation_names=_texts(strings, "observation_names"),
                 action_meanings=_texts(strings, "action_meanings"),
                 success_reasons=_texts(strings, "success_reasons"),
+                view=_numbers(_object(strings, "view")),
                 step_duration_ns=int(strings.get("step_duration_ns", DEFAULT_STEP_DURATION_NS)),
                 policy=strings.get("policy", ""),
                 epsilon=strings.get("epsilon", ""),
@@ -228,6 +237,7 @@ class LogMetadata:
             observation_names=_names(inner, "observation_names"),
             action_meanings=_names(inner, "action_meanings"),
             success_reasons=_names(inner, "success_reasons"),
+            view=_numbers(getattr(inner, "view_settings", {})),
             step_duration_ns=round(step_duration_s * 1e9),
             policy=policy,
             epsilon=epsilon,
@@ -266,6 +276,16 @@ def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ValueError(f"{name} is not a JSON object")
     return found
+
+
+def _numbers(values: Any) -> dict[str, float]:
+    """Return the finite numbers of a mapping by name; empty for anything else."""
+    pairs = values.items() if isinstance(values, Mapping) else ()
+    return {
+        str(name): float(value)
+        for name, value in pairs
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
 
 
 def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:

@@ -1,17 +1,21 @@
-"""A Foxglove layout for a log: its panels and plotted series.
+"""A Foxglove layout for a log: its screens and plotted series.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
 Foxglove and in Lichtblick. Each plotted series is a scalar, because viewers join all elements of an
-array slice into one line.
+array slice into one line. No series contains the `final` records, which have no action.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
+from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC, RUNNING
+from mcaprl.recorder.record import panels
+from mcaprl.recorder.record.panels import Panel
 
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
@@ -19,13 +23,19 @@ TRAINING_TOPIC = "/rl/training"
 # Maximum number of series in a plot; further series are left out.
 MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
-# Titles of telemetry plots; a plot shows the telemetry whose names have the given suffix.
-PLOTTED_ENDINGS = {"speed": "speed_m_s", "offsets": "offset_m"}
-# Range of the depth image's color map, millimeters.
-DEPTH_RANGE_MM = (0, 50_000)
-_COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
+_SPEED = "speed_m_s"
+# Telemetry of the first plot, by the ends of its names: what a driver looks at besides the speed.
+_WATCHED = ("offset_m", "steering_rad", "distance_m")
+_STEPS, _EPISODES = "/rl/step{final==false}", "/rl/episode"
+_SCENES = ("/scene", "/scene/static")
+_TRACKS = "/scene/tracks"
+_MAX_EPISODE = 100
+_DEPTH_M = (0.0, 50.0)
+_FIRST_METRICS = ("mean_return", "score")
+_METRICS_AFTER = ("loss", "epsilon")
 
 Node = dict[str, Any] | str
+Panels = dict[str, Panel]
 
 
 def layout_of(
@@ -33,35 +43,36 @@ def layout_of(
     topics: Sequence[str],
     telemetry_names: Sequence[str] = (),
     follow_frame: str = "",
-    training_names: Sequence[str] = (),
+    training: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the layout for a log with these topics.
+    """Return the layout for a log with these topics: the screens Drive, Learning and Data.
 
     Args:
         metadata: Metadata of the log.
         topics: Topics of the log besides `/rl/step` and `/rl/episode`.
         telemetry_names: Fields of `/telemetry`.
         follow_frame: Frame that the 3D view moves with; empty for a fixed view.
-        training_names: Fields of `/rl/training` in a live stream.
+        training: Labels of the fields of `/rl/training` in a live stream, by name.
     """
-    panels: dict[str, dict[str, Any]] = {}
-    views = _views(metadata, topics, follow_frame, panels)
-    learning = {name: f"{TRAINING_TOPIC}.{name}" for name in training_names}
-    plots = _plots(metadata, topics, telemetry_names, learning, panels)
-    panels["StateTransitions!actions"] = _state_transitions(metadata, topics)
-    below: list[Node] = ["StateTransitions!actions"]
-    if "/rosout" in topics:
-        panels["RosOut!log"] = {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/rosout"}
-        below.append("RosOut!log")
-    right = _stack([*plots, *below], "column")
-    root = _split(_stack(views, "column", first_percent=68), right, "row", 52) if views else right
+    found: Panels = {}
+    screens = {
+        "Drive": _drive(metadata, topics, telemetry_names, follow_frame, found),
+        "Learning": _learning(metadata, topics, telemetry_names, training or {}, found),
+        "Data": _data(metadata, topics, telemetry_names, found),
+    }
+    found["Tab!screens"] = panels.tabs(screens)
     return {
-        "configById": panels,
-        "globalVariables": {},
+        "configById": found,
+        "globalVariables": {"episode": 0},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": root,
+        "layout": "Tab!screens",
     }
+
+
+def layout_bytes(layout: dict[str, Any]) -> bytes:
+    """Return a layout as JSON without spaces: attachments are not compressed."""
+    return json.dumps(layout, separators=(",", ":")).encode()
 
 
 def is_values_topic(topic: str) -> bool:
@@ -69,78 +80,236 @@ def is_values_topic(topic: str) -> bool:
     return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 
-def _views(
+def _drive(
     metadata: LogMetadata,
     topics: Sequence[str],
+    telemetry: Sequence[str],
     follow_frame: str,
-    panels: dict[str, dict[str, Any]],
-) -> list[Node]:
-    """Add the 3D panel and the images."""
+    found: Panels,
+) -> Node:
+    """Add the views and what one reads while driving."""
+    beside = _instruments(metadata, topics, telemetry, found)
+    views = _images(metadata, topics, found)
+    if "/scene" not in topics:
+        return _split(_stack(views, "column"), beside, "row", 50) if views else beside
+    camera = {
+        "perspective": True,
+        "distance": metadata.view.get("distance_m", 22.0),
+        "phi": metadata.view.get("tilt_deg", 66.0),
+        "targetOffset": [4, 0, 0],
+    }
+    found["3D!scene"] = panels.three_d("scene", _SCENES, camera, follow_frame)
+    if _TRACKS in topics:
+        found["3D!above"] = panels.three_d(
+            "from above: tracks, yellow is the highest return",
+            (*_SCENES, _TRACKS),
+            _above(metadata),
+        )
+        views.append("3D!above")
+    left: Node = "3D!scene"
+    if views:
+        left = _split(left, _stack(views, "row"), "column", 62)
+    return _split(left, beside, "row", 62)
+
+
+def _above(metadata: LogMetadata) -> dict[str, Any]:
+    """Return the camera that looks down on the whole world."""
+    view = metadata.view
+    target = [view.get("world_x_m", 0.0), view.get("world_y_m", 0.0), 0]
+    return {
+        "perspective": False,
+        "distance": view.get("world_m", 100.0),
+        "phi": 0,
+        "thetaOffset": 0,
+        "target": target,
+    }
+
+
+def _instruments(
+    metadata: LogMetadata, topics: Sequence[str], telemetry: Sequence[str], found: Panels
+) -> Node:
+    rows: list[Node] = []
+    lights: list[Node] = []
+    if _SPEED in telemetry:
+        highest = metadata.view.get("speed_m_s", 30.0)
+        found["Gauge!speed"] = panels.gauge("speed, m/s", f"/telemetry.{_SPEED}", highest)
+        lights.append("Gauge!speed")
+    if PHASE_TOPIC in topics:
+        successes = metadata.success_reasons
+        found["Indicator!state"] = panels.indicator(
+            "state of the episode", f"{PHASE_TOPIC}.data", RUNNING, successes
+        )
+        lights.append("Indicator!state")
+    if lights:
+        rows.append(_stack(lights, "row"))
+    watched = [name for name in telemetry if name.endswith(_WATCHED)]
+    if watched:
+        paths = {name: f"/telemetry.{name}" for name in watched}
+        found["Plot!drive"] = panels.plot("offsets, steering", paths)
+        rows.append("Plot!drive")
+    _put_returns(telemetry, found)
+    rows.append(_stack(["Plot!reward", "Plot!return"], "row"))
+    rows.append(_actions_row(metadata, topics, found))
+    return _stack(rows, "column")
+
+
+def _put_returns(telemetry: Sequence[str], found: Panels) -> None:
+    found["Plot!reward"] = panels.plot("reward", {"reward": f"{_STEPS}.reward"})
+    returns = {"return of episode": f"{_EPISODES}.total_reward"}
+    if RETURN_SO_FAR in telemetry:
+        returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
+    found["Plot!return"] = panels.plot(next(iter(returns)), returns)
+
+
+def _actions_row(metadata: LogMetadata, topics: Sequence[str], found: Panels) -> Node:
+    """Add the actions of the last 20 s; not synchronized, since that would drag all plots along."""
+    rows = {}
+    if metadata.action_names():
+        rows["action"] = f"{_STEPS}.action"
+    if PHASE_TOPIC in topics:
+        rows["state"] = f"{PHASE_TOPIC}.data"
+    rows["episode"] = "/rl/step.episode"
+    found["StateTransitions!actions"] = panels.state_transitions(
+        "action and state, last 20 s", rows, xAxisRange=20, isSynced=False
+    )
+    return "StateTransitions!actions"
+
+
+def _images(metadata: LogMetadata, topics: Sequence[str], found: Panels) -> list[Node]:
+    """Add the depth camera and the image observations."""
     names: list[Node] = []
-    if "/scene" in topics:
-        panels["3D!scene"] = _three_d(follow_frame)
-        names.append("3D!scene")
     if "/camera/depth" in topics:
-        low, high = DEPTH_RANGE_MM
-        panels["Image!depth"] = _image(
-            "/camera/depth", colorMode="colormap", colorMap="turbo", minValue=low, maxValue=high
+        low = metadata.view.get("depth_min_m", _DEPTH_M[0])
+        high = metadata.view.get("depth_max_m", _DEPTH_M[1])
+        found["Image!depth"] = panels.image(
+            f"depth, {low:g} to {high:g} m; black is nothing",
+            "/camera/depth",
+            colorMode="colormap",
+            colorMap="turbo",
+            minValue=1000 * low,
+            maxValue=1000 * high,
         )
         names.append("Image!depth")
     for leaf in observation_leaves(metadata.observation_space):
         if leaf.encoding is not None:
-            panels[f"Image!{leaf.name}"] = _image(leaf.topic)
+            found[f"Image!{leaf.name}"] = panels.image(leaf.topic, leaf.topic)
             names.append(f"Image!{leaf.name}")
     return names
 
 
-def _plots(
+def _learning(
     metadata: LogMetadata,
     topics: Sequence[str],
-    telemetry_names: Sequence[str],
-    learning: Mapping[str, str],
-    panels: dict[str, dict[str, Any]],
-) -> list[Node]:
-    """Add plots of reward and return, and a tab panel with plots of all other numbers."""
-    returns = {"return of episode": "/rl/episode.total_reward"}
-    if RETURN_SO_FAR in telemetry_names:
-        returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
-    always = {"reward": {"reward": "/rl/step.reward"}, "return": returns}
-    tabs = {
-        **{name: {name: path} for name, path in learning.items()},
-        **_value_series(metadata, topics),
-        **{
-            title: {name: f"/telemetry.{name}" for name in telemetry_names if name.endswith(ending)}
-            for title, ending in PLOTTED_ENDINGS.items()
+    telemetry: Sequence[str],
+    training: Mapping[str, str],
+    found: Panels,
+) -> Node:
+    """Add the returns, the metrics of training, and the outputs of policies."""
+    found["Plot!returns"] = panels.plot(
+        "return of each episode", {"return": f"{_EPISODES}.total_reward"}
+    )
+    values = {
+        topic.removeprefix("/rl/"): _policy(metadata, topic, found)
+        for topic in filter(is_values_topic, topics)
+    }
+    rows: list[Node] = _metrics(training, found) if training else []
+    if not training:
+        rows.append("Plot!returns")
+    if len(values) > 1:
+        found["Tab!policies"] = panels.tabs(values)
+    node = "Tab!policies" if len(values) > 1 else next(iter(values.values()), None)
+    if LOG_TOPIC in topics and (training or not values):
+        found["RosOut!learning"] = panels.log_lines()
+        rows.append("RosOut!learning")
+    left = _stack(rows, "column")
+    if training:
+        # The returns are among the metrics.
+        del found["Plot!returns"]
+    return left if node is None else _split(left, node, "row", 40)
+
+
+def _metrics(training: Mapping[str, str], found: Panels) -> list[Node]:
+    """Add the metrics of training, the most important first."""
+    paths = {name: f"{TRAINING_TOPIC}.{name}" for name in training}
+    first = {training[name]: paths[name] for name in _FIRST_METRICS if name in training}
+    rows: list[Node] = []
+    if first:
+        found["Plot!training"] = panels.plot("mean return and score", first)
+        rows.append("Plot!training")
+    pair: list[Node] = []
+    for name in _METRICS_AFTER:
+        if name in training:
+            found[f"Plot!{name}"] = panels.plot(training[name], {training[name]: paths[name]})
+            pair.append(f"Plot!{name}")
+    rows += [_stack(pair, "row")] if pair else []
+    rest = [name for name in training if name not in (*_FIRST_METRICS, *_METRICS_AFTER)]
+    for name in rest:
+        found[f"Plot!{name}"] = panels.plot(training[name], {training[name]: paths[name]})
+    if rest:
+        found["Tab!metrics"] = panels.tabs({name: f"Plot!{name}" for name in rest})
+        rows.append("Tab!metrics")
+    return rows
+
+
+def _policy(metadata: LogMetadata, topic: str, found: Panels) -> Node:
+    """Add the outputs of one policy: values over time and now, errors, and its actions."""
+    title = topic.removeprefix("/rl/")
+    names = list(metadata.action_names().values())[:MAX_SERIES]
+    over_time = {name: f"{topic}.q[{index}]" for index, name in enumerate(names)}
+    found[f"Plot!{title}"] = panels.plot(f"{title}: Q over time", over_time)
+    legend = ", ".join(f"{index} {name}" for index, name in enumerate(names))
+    found[f"Plot!{title} now"] = panels.plot(
+        f"{title}: Q now ({legend})", {"Q": f"{topic}.q[:]"}, xAxisVal="index", isSynced=False
+    )
+    fields = ("td_error", "advantage", "entropy")
+    found[f"Plot!{title} errors"] = panels.plot(
+        f"{title}: errors", {field: f"{topic}.{field}" for field in fields}
+    )
+    found[f"StateTransitions!{title}"] = panels.state_transitions(
+        f"{title}: actions, last 20 s",
+        {
+            "action": f"{_STEPS}.action",
+            "would take": f"{topic}.policy_action",
+            "agrees": f"{topic}.agrees",
         },
+        xAxisRange=20,
+        isSynced=False,
+    )
+    rows = [f"Plot!{title}", f"Plot!{title} now", f"Plot!{title} errors"]
+    return _stack([*rows, f"StateTransitions!{title}"], "column")
+
+
+def _data(
+    metadata: LogMetadata, topics: Sequence[str], telemetry: Sequence[str], found: Panels
+) -> Node:
+    """Add the messages themselves, all numbers of the log, and its log lines."""
+    for topic in ("/rl/step", "/rl/episode"):
+        found[f"RawMessages!{topic[4:]}"] = panels.raw_messages(topic)
+    left = _stack(["RawMessages!step", "RawMessages!episode"], "column")
+    numbers = {
         "observations": _observation_series(metadata),
         "actions": _action_series(metadata),
+        "telemetry": {name: f"/telemetry.{name}" for name in telemetry[:MAX_SERIES]},
     }
-    for title, paths in [*always.items(), *tabs.items()]:
-        if paths:
-            panels[f"Plot!{title}"] = _plot(title, paths)
-    panels["Tab!numbers"] = {
-        "activeTabIdx": 0,
-        "tabs": [
-            {"title": title, "layout": f"Plot!{title}"} for title, paths in tabs.items() if paths
-        ],
-    }
-    return [*(f"Plot!{title}" for title in always), "Tab!numbers"]
-
-
-def _value_series(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return series of the Q-values, TD error, advantage and entropy on each values topic."""
-    series = {}
-    for topic in filter(is_values_topic, topics):
-        title = topic.removeprefix("/rl/")
-        q_values = enumerate(metadata.action_names().values())
-        series[title] = {f"Q {name}": f"{topic}.q[{index}]" for index, name in q_values}
-        fields = ("td_error", "advantage", "entropy")
-        series[f"{title}: errors"] = {field: f"{topic}.{field}" for field in fields}
-    return series
+    shown = {title: paths for title, paths in numbers.items() if paths}
+    for title, paths in shown.items():
+        found[f"Plot!{title}"] = panels.plot(title, paths)
+    rows: list[Node] = []
+    if shown:
+        found["Tab!numbers"] = panels.tabs({title: f"Plot!{title}" for title in shown})
+        rows.append("Tab!numbers")
+    found["GlobalVariableSliderPanel!episode"] = panels.slider("episode", _MAX_EPISODE)
+    chosen = "/rl/step{episode==$episode}{final==false}.reward"
+    found["Plot!episode"] = panels.plot("reward of the chosen episode", {"reward": chosen})
+    rows.append(_split("GlobalVariableSliderPanel!episode", "Plot!episode", "row", 30))
+    if LOG_TOPIC in topics:
+        found["RosOut!log"] = panels.log_lines()
+        rows.append("RosOut!log")
+    return _split(left, _stack(rows, "column"), "row", 35)
 
 
 def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return a series per action component, or per discrete action, with the steps that took it."""
+    """Return one series per component of an action, or one per discrete action at its steps."""
     names = metadata.action_names()
     if names:
         taken = {
@@ -150,7 +319,7 @@ def _action_series(metadata: LogMetadata) -> dict[str, str]:
         return dict(list(taken.items())[:MAX_SERIES])
     leaf = action_leaf(metadata.action_space)
     suffixes = [f"[{index}]" for index in range(leaf.size)] if leaf.shape else [""]
-    return {f"action{suffix}": f"/rl/step.action{suffix}" for suffix in suffixes[:MAX_SERIES]}
+    return {f"action{suffix}": f"{_STEPS}.action{suffix}" for suffix in suffixes[:MAX_SERIES]}
 
 
 def _observation_series(metadata: LogMetadata) -> dict[str, str]:
@@ -167,94 +336,11 @@ def _observation_series(metadata: LogMetadata) -> dict[str, str]:
     return dict(list(paths.items())[:MAX_SERIES])
 
 
-def _state_transitions(metadata: LogMetadata, topics: Sequence[str]) -> dict[str, Any]:
-    paths = [_state("/rl/step.episode", "episode")]
-    names = metadata.action_names()
-    if names:
-        legend = ", ".join(f"{value} {name}" for value, name in names.items())
-        paths.insert(0, _state("/rl/step.action", f"action ({legend})"))
-    for topic in filter(is_values_topic, topics):
-        title = topic.removeprefix("/rl/")
-        paths += [_state(f"{topic}.policy_action", f"{title} would take")]
-        paths += [_state(f"{topic}.agrees", f"{title} agrees")]
-    return {"foxglovePanelTitle": "Action and episode", "isSynced": True, "paths": paths}
-
-
-def _state(path: str, label: str) -> dict[str, Any]:
-    return {"value": path, "label": label, "enabled": True, "timestampMethod": "receiveTime"}
-
-
-def _plot(title: str, paths: Mapping[str, str]) -> dict[str, Any]:
-    return {
-        "foxglovePanelTitle": title,
-        "paths": [
-            {
-                "value": path,
-                "label": label,
-                "color": _COLORS[index % len(_COLORS)],
-                "enabled": True,
-                "timestampMethod": "receiveTime",
-            }
-            for index, (label, path) in enumerate(paths.items())
-        ],
-        "xAxisVal": "timestamp",
-        "isSynced": True,
-        "showLegend": True,
-        "legendDisplay": "floating",
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-        "showPlotValuesInLegend": True,
-    }
-
-
-def _image(topic: str, **mode: Any) -> dict[str, Any]:
-    return {
-        "foxglovePanelTitle": topic,
-        "cameraState": {},
-        "followMode": "follow-none",
-        "imageMode": {"imageTopic": topic, "synchronize": False, **mode},
-        "layers": {},
-        "publish": {},
-        "scene": {},
-        "topics": {},
-        "transforms": {},
-    }
-
-
-def _three_d(follow_frame: str) -> dict[str, Any]:
-    return {
-        "foxglovePanelTitle": "Scene",
-        "cameraState": {
-            "perspective": True,
-            "distance": 26,
-            "phi": 62,
-            "thetaOffset": 90,
-            "targetOffset": [4, 0, 0],
-            "target": [0, 0, 0],
-            "targetOrientation": [0, 0, 0, 1],
-            "fovy": 45,
-            "near": 0.5,
-            "far": 5000,
-        },
-        "followMode": "follow-pose" if follow_frame else "follow-none",
-        "followTf": follow_frame or "map",
-        "scene": {"backgroundColor": "#10141c"},
-        "transforms": {},
-        "topics": {"/scene": {"visible": True}, "/scene/static": {"visible": True}},
-        "layers": {},
-        "publish": {},
-        "imageMode": {},
-    }
-
-
 def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
     return {"first": first, "second": second, "direction": direction, "splitPercentage": percent}
 
 
-def _stack(nodes: Sequence[Node], direction: str, first_percent: float | None = None) -> Node:
-    """Stack panels; their sizes are equal unless `first_percent` sets the size of the first."""
+def _stack(nodes: Sequence[Node], direction: str) -> Node:
+    """Return panels of equal size in a row or column."""
     first, *rest = nodes
-    if not rest:
-        return first
-    percent = first_percent if first_percent is not None else 100 / len(nodes)
-    return _split(first, _stack(rest, direction), direction, percent)
+    return _split(first, _stack(rest, direction), direction, 100 / len(nodes)) if rest else first

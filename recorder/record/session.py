@@ -20,7 +20,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.reading import McapReader, Topic
 from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.record.display import Display
-from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_of
+from mcaprl.recorder.record.layout import LAYOUT_NAME, layout_bytes, layout_of
 from mcaprl.texts import encodable
 
 
@@ -131,9 +131,7 @@ class EpisodeLog:
         if not self._has_layout:
             topics, shown = (LOG_TOPIC, PHASE_TOPIC, *display.topics), display.shown
             layout = layout_of(self._description, topics, shown.telemetry_names, shown.follow_frame)
-            mcap.add_attachment(
-                LAYOUT_NAME, "application/json", json.dumps(layout).encode(), start_ns
-            )
+            mcap.add_attachment(LAYOUT_NAME, "application/json", layout_bytes(layout), start_ns)
             self._has_layout = True
 
     def close(self) -> None:

@@ -6,7 +6,6 @@ topics. Each new message has the log_time of its step.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,7 +24,7 @@ from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.format.topics import LOG_TOPIC
 from mcaprl.recorder.record.display import SCENE, Display
-from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC
+from mcaprl.recorder.record.layout import LAYOUT_NAME, VALUES_TOPIC, layout_bytes
 from mcaprl.recorder.viewer.log_layout import layout_of_log
 from mcaprl.recorder.viewer.verify import Verification, verify
 
@@ -128,7 +127,7 @@ class AnnotatedCopy:
         topics = sorted({channel.topic for channel in mcap.channels.values()})
         shown = None if self._display is None else self._display.shown
         layout = layout_of_log(self._source, topics, shown)
-        data, time_ns = json.dumps(layout).encode(), mcap.end_time_ns
+        data, time_ns = layout_bytes(layout), mcap.end_time_ns
         mcap.announce(Attachment(time_ns, time_ns, LAYOUT_NAME, "application/json", data))
 
 

@@ -304,7 +304,7 @@ class LiveStream(ViewerServer):
             sorted((LOG_TOPIC, PHASE_TOPIC, *self._topics)),
             self._shown.telemetry_names,
             self._shown.follow_frame,
-            tuple(self._training),
+            self._training,
         )
 
     def on_subscribe(self, client: Any, channel: Any) -> None:

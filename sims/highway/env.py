@@ -142,6 +142,13 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     metadata = METADATA
     success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
+    view_settings: ClassVar[dict[str, float]] = {
+        "distance_m": 22.0,
+        "tilt_deg": 66.0,
+        "world_m": 500.0,
+        "world_x_m": 240.0,
+        "speed_m_s": 15.0,
+    }
     action_meanings = ACTION_MEANINGS
     observation_names = OBSERVATION_NAMES
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,6 +153,16 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     metadata = METADATA
     fleet_type = LaneFleet
     success_reasons = ("time_limit",)
+    view_settings: ClassVar[dict[str, float]] = {
+        "distance_m": 22.0,
+        "tilt_deg": 66.0,
+        "world_m": 330.0,
+        "world_x_m": 65.0,
+        "world_y_m": 1.5,
+        "depth_min_m": 3.0,
+        "depth_max_m": 57.0,
+        "speed_m_s": 30.0,
+    }
 
     @property
     def car(self) -> Car:

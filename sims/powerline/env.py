@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +142,16 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     metadata = METADATA
     fleet_type = PowerlineFleet
     success_reasons = ("finished",)
+    view_settings: ClassVar[dict[str, float]] = {
+        "distance_m": 20.0,
+        "tilt_deg": 70.0,
+        "world_m": 620.0,
+        "world_x_m": 270.0,
+        "world_y_m": -40.0,
+        "depth_min_m": 8.0,
+        "depth_max_m": 51.0,
+        "speed_m_s": 8.0,
+    }
 
     @property
     def flight(self) -> Flight:

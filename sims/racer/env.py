@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +132,14 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     metadata = METADATA
     fleet_type = RacerFleet
     success_reasons = ("time_limit",)
+    view_settings: ClassVar[dict[str, float]] = {
+        "distance_m": 15.0,
+        "tilt_deg": 60.0,
+        "world_m": 90.0,
+        "world_x_m": 50.0,
+        "world_y_m": 30.0,
+        "speed_m_s": 10.0,
+    }
 
     @property
     def car(self) -> Car:

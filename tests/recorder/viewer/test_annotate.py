@@ -258,3 +258,23 @@ def test_commands(
         assert run(wrong) == 2
         assert why in capsys.readouterr().err
     assert not Path("b.mcap").exists()
+
+
+def test_layouts_of_annotated_logs_refer_to_paths_in_the_log(tmp_path: Path) -> None:
+    path, out = tmp_path / "lane.mcap", tmp_path / "annotated.mcap"
+    with closing(mcaprl.RecordMcap(make_sim("lane"), path, camera=True)) as env:
+        env.reset(seed=0)
+        for _ in range(4):
+            env.step(1)
+    (episode,) = mcaprl.open(path).episodes
+    columns: dict[str, Any] = {name: np.zeros((4, 6), np.float32) for name in ("q", "preference")}
+    columns |= {name: np.zeros(4) for name in ("value", "advantage", "td_error", "entropy")}
+    columns |= {"policy_action": np.zeros(4, np.int64), "agrees": np.ones(4, bool)}
+    with annotated_copy(path, out) as copy:
+        for topic in ("/rl/values/a", "/rl/values/b"):
+            copy.add_values(topic, [(episode, columns)])
+    layout = check_layout(out)
+    tabs = layout["configById"]["Tab!policies"]["tabs"]
+    assert [tab["title"] for tab in tabs] == ["values/a", "values/b"]
+    title = layout["configById"]["Plot!values/a now"]["foxglovePanelTitle"]
+    assert title.startswith("values/a: Q now (0 brake, 1 straight, ")

@@ -158,7 +158,15 @@ def test_layouts_are_combined_side_by_side(log: Path) -> None:
     assert len(panels) == 2 * len(layout["configById"])
     assert panels["3D!b scene"]["followTf"] == "b/car"
     assert panels["3D!b scene"]["topics"].keys() == {"/b/scene", "/b/scene/static"}
-    assert panels["Plot!a reward"]["paths"][0]["value"] == "/a/rl/step.reward"
+    reward = panels["Plot!a reward"]["paths"][0]["value"]
+    assert reward == "/a/rl/step{final==false}.reward"
+    assert panels["Gauge!b speed"]["path"] == "/b/telemetry.speed_m_s"
+    assert panels["RawMessages!a step"]["topicPath"] == "/a/rl/step"
+    assert {tab["title"] for tab in panels["Tab!b screens"]["tabs"]} == {
+        "Drive",
+        "Learning",
+        "Data",
+    }
     assert panels["Tab!a numbers"]["tabs"][0]["layout"].startswith("Plot!a ")
     assert panels["RosOut!b log"]["topicToRender"] == "/b/rosout"
     assert side_by_side([layout], [""]) == layout

@@ -236,12 +236,58 @@ def test_log_lines(log: Path) -> None:
 def test_layout_is_attached_and_classic(log: Path) -> None:
     layout = check_layout(log)
     kinds = {panel.split("!")[0] for panel in layout["configById"]}
-    assert kinds == {"3D", "Image", "Plot", "StateTransitions", "RosOut", "Tab"}
+    shown = {"3D", "Image", "Plot", "StateTransitions", "RosOut", "Tab", "Gauge", "Indicator"}
+    assert kinds == shown | {"RawMessages", "GlobalVariableSliderPanel"}
+    (screens,) = [layout["configById"][layout["layout"]]]
+    assert [tab["title"] for tab in screens["tabs"]] == ["Drive", "Learning", "Data"]
+    views = [layout["configById"][f"3D!{name}"] for name in ("scene", "above")]
+    for view in views:
+        assert view["scene"]["transforms"]["enablePreloading"] is True
+        assert view["scene"]["transforms"]["showLabel"] is False
+        assert not any(topic["showOutlines"] for topic in view["topics"].values())
+    assert views[1]["cameraState"]["perspective"] is False
+    assert "/scene/tracks" in views[1]["topics"]
+    rules = {rule["rawValue"]: rule["color"] for rule in _panel(layout, "Indicator")["rules"]}
+    assert rules.keys() == {"running", "time_limit"}
+    actions = _panel(layout, "StateTransitions")
+    assert (actions["xAxisRange"], actions["isSynced"]) == (20, False)
     assert layout["configById"]["3D!scene"]["followTf"] == "car"
     depth = layout["configById"]["Image!depth"]["imageMode"]
     assert depth["imageTopic"] == "/camera/depth"
     assert depth["colorMode"] == "colormap"
     assert depth["minValue"] < depth["maxValue"]
+
+
+def _panel(layout: dict[str, Any], kind: str) -> dict[str, Any]:
+    """Return the first panel of a kind."""
+    panels = layout["configById"].items()
+    found: dict[str, Any] = next(panel for name, panel in panels if name.startswith(f"{kind}!"))
+    return found
+
+
+def test_each_sim_has_its_own_camera_and_ranges(tmp_path: Path) -> None:
+    layouts = {}
+    for sim in ("lane", "powerline", "racer"):
+        path = tmp_path / f"{sim}.mcap"
+        with closing(mcaprl.RecordMcap(make_sim(sim), path, camera=sim != "racer")) as env:
+            env.reset(seed=0)
+            env.step(0)
+        layouts[sim] = mcaprl.layout(path)
+        without = tmp_path / f"{sim}-without.mcap"
+        mcaprl.open(path).save(without)
+        # The numbers come from the log, also if the layout is made anew.
+        assert LogMetadata.from_strings(McapReader(without).metadata["mcaprl.dataset"]).view
+    cameras = {
+        sim: layout["configById"]["3D!scene"]["cameraState"] for sim, layout in layouts.items()
+    }
+    assert {sim: camera["distance"] for sim, camera in cameras.items()} == {
+        "lane": 22,
+        "powerline": 20,
+        "racer": 15,
+    }
+    depth = layouts["lane"]["configById"]["Image!depth"]
+    assert (depth["imageMode"]["minValue"], depth["imageMode"]["maxValue"]) == (3000, 57_000)
+    assert depth["foxglovePanelTitle"] == "depth, 3 to 57 m; black is nothing"
 
 
 @pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
@@ -311,8 +357,9 @@ def test_layout_without_a_scene() -> None:
         for path in panel.get("paths", [])
     }
     assert series["x"] == "/rl/step.observation[0]"
-    assert series["Q right"] == "/rl/values.q[1]"
-    assert series["action (0 left, 1 right)"] == "/rl/step.action"
+    assert series["right"] == "/rl/step{action==1}{final==false}.action"
+    assert series["Q"] == "/rl/values.q[:]"
+    assert series["action"] == "/rl/step{final==false}.action"
 
 
 def test_each_kind_of_marker_has_its_position() -> None:
