@@ -23,20 +23,20 @@ _TOLERANCE_ROTATION = 0.01
 """Difference of quaternion components; 0.02 rad for small angles."""
 
 
-def motion_transforms(moments: Sequence[Moment]) -> bytes:
+def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes:
     """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
-
-    Of the poses of a frame between the first and the last moment, only those are kept that linear
-    interpolation between the others misses by more than 0.04 m or 0.02 rad.
 
     Args:
         moments: Moments with the same frames each, in order of time.
+        thins: Whether to leave out the poses between the first and the last moment that linear
+            interpolation between the others finds within 0.04 m and 0.02 rad.
     """
     times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
     kept = []
     for number in range(len(moments[0][1])):
         frames = [each[number] for _, each in moments]
-        for k in knots(times, _scaled(frames)) if len(moments) > 1 else [0]:
+        every = range(len(moments))
+        for k in knots(times, _scaled(frames)) if thins and len(moments) > 1 else every:
             kept.append((moments[k][0], number, frames[k]))
     kept.sort(key=lambda each: each[:2])
     stamped = [stamped_transform(frame, time_ns) for time_ns, _, frame in kept]

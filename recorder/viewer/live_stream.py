@@ -335,7 +335,9 @@ class LiveStream(ViewerServer):
     def _send_motion(self, moments: Sequence[Moment]) -> None:
         """Send the frames at the previous step, and their motion until this one."""
         if self._moment is not None:
-            self._emit(TF, self._moment[0], motion_transforms([self._moment, *moments]))
+            self._emit(
+                TF, self._moment[0], motion_transforms([self._moment, *moments], thins=False)
+            )
         self._moment = moments[-1] if moments else None
 
     def _send_static(self, source: SceneSource, time_ns: int) -> None:
