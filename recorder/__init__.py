@@ -5,6 +5,7 @@
     dataset      -> save                            -> log_writer -> mcap_writer -> file
     file -> mcap_reader -> reader -> dataset -> statistics, tables
                         -> check
+    bag -> bags -> mapping -> dataset                                                 (convert)
     damaged file -> salvage -> valid_copy -> whole_episodes -> file   (recover)
 
 `chunks`, `message_rows`, `schema` and `messages` are the codec of both directions, `spaces` and
