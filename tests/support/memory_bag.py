@@ -17,7 +17,7 @@ SECOND_NS = 10**9
 class MemoryBag:
     """Topics given as times in seconds and columns."""
 
-    paths = (Path("memory.bag"),)
+    paths: tuple[Path, ...] = (Path("memory.bag"),)
 
     def __init__(
         self,
@@ -26,7 +26,8 @@ class MemoryBag:
         types: Mapping[str, str] | None = None,
     ) -> None:
         """Store `(times_s, columns)` of each topic; lists of unequal parts become objects."""
-        self._times, self._columns = {}, {}
+        self._times: dict[str, NDArray[np.int64]] = {}
+        self._columns: dict[str, dict[str, NDArray[Any]]] = {}
         self.topics: dict[str, TopicInfo] = {}
         for name, (times_s, columns) in topics.items():
             times_ns = np.rint(np.array(times_s, np.float64) * SECOND_NS).astype(np.int64)

@@ -27,8 +27,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("foxglove") / "robot.mcap"
     context = foxglove.Context()
-    poses, scans = (kind(topic, context=context) for kind, topic in (
-        (PoseInFrameChannel, "/pose"), (LaserScanChannel, "/scan")))  # fmt: skip
+    poses = PoseInFrameChannel("/pose", context=context)
+    scans = LaserScanChannel("/scan", context=context)
     number = {"type": "number"}
     schema = {
         "type": "object",

@@ -154,7 +154,7 @@ def scene_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_viewers_find_the_names_of_the_actions(scene_log: Path, tmp_path: Path) -> None:
     annotated = tmp_path / "annotated.mcap"
-    values = {"q": np.zeros((3, 6)), "preference": np.full((3, 6), 1 / 6)}
+    values: dict[str, Any] = {"q": np.zeros((3, 6)), "preference": np.full((3, 6), 1 / 6)}
     values |= {name: np.zeros(3) for name in ("value", "advantage", "td_error", "entropy")}
     values |= {"policy_action": np.zeros(3, np.int64), "agrees": np.zeros(3, bool)}
     with annotated_copy(scene_log, annotated) as copy:

@@ -69,10 +69,10 @@ def test_depth_keeps_its_unit() -> None:
     millimeters = np.array([[0, 1500], [3000, 65535]], np.uint16)
     found = read(raw_bag([millimeters], "16UC1"), [0])
     assert found.dtype == np.float32
-    np.testing.assert_allclose(found[0, ..., 0], [[0, 1.5], [3, 65.535]], rtol=1e-6)
+    np.testing.assert_allclose(found[0, ..., 0], [[0.0, 1.5], [3.0, 65.535]], rtol=1e-6)
     meters = np.array([[np.nan, np.inf], [2.5, 0.5]], np.float32)
     np.testing.assert_allclose(
-        read(raw_bag([meters], "32FC1"), [0])[0, ..., 0], [[0, 0], [2.5, 0.5]]
+        read(raw_bag([meters], "32FC1"), [0])[0, ..., 0], [[0.0, 0.0], [2.5, 0.5]]
     )
     scaled = read(raw_bag([millimeters], "16UC1"), [0], range_m=(0.0, 3.0))
     assert scaled[0, ..., 0].tolist() == [[255, 128], [255, 255]]

@@ -110,7 +110,8 @@ def test_values_are_scaled_wrapped_clipped_and_sliced() -> None:
     np.testing.assert_allclose(
         data.observations[1], [2.0, 9.0, 30.0, 4.0 - 2 * math.pi, -1.0], rtol=1e-6
     )
-    assert data.observation_space.low.tolist() == [-np.inf, -np.inf, 0.0, -np.inf, -np.inf]
+    space: Any = data.observation_space
+    assert space.low.tolist() == [-np.inf, -np.inf, 0.0, -np.inf, -np.inf]
     assert report.fields["none"].missing == 1.0
     assert report.fields["last"].missing == 0.0
 

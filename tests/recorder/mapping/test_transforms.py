@@ -61,7 +61,7 @@ def test_chains_of_moving_and_static_frames() -> None:
     # Before the first message there is no pose.
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(
-        found[1:], [[11, 0, 0], [11, 0, 0], [10, 5, math.pi / 2]], atol=1e-12
+        found[1:], [[11.0, 0.0, 0.0], [11.0, 0.0, 0.0], [10.0, 5.0, math.pi / 2]], atol=1e-12
     )
     np.testing.assert_allclose(age_s[1:], [0, 1, 0])
     # The map as seen from the camera is the inverse.
