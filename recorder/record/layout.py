@@ -1,41 +1,55 @@
-"""A Foxglove layout for a log: its screens and plotted series.
+"""A Foxglove layout for a log: its screens Drive, Learning and Data.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
-Foxglove and in Lichtblick. Each plotted series is a scalar, because viewers join all elements of an
-array slice into one line. No series contains the `final` records, which have no action.
+Foxglove and in Lichtblick. The screens are the tabs of one panel, so that each has few panels, also
+in a window of 1280 x 720 pixels.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+from mcaprl.recorder.format.episode_summary import INTERRUPTED
 from mcaprl.recorder.format.metadata import LogMetadata
-from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
-from mcaprl.recorder.format.topics import LOG_TOPIC, PHASE_TOPIC, RUNNING
-from mcaprl.recorder.record import panels
-from mcaprl.recorder.record.panels import Panel
+from mcaprl.recorder.format.spaces import observation_leaves
+from mcaprl.recorder.format.topics import (
+    EPISODE_TOPIC,
+    IMAGE_FRAME,
+    LOG_TOPIC,
+    PHASE_TOPIC,
+    RUNNING,
+    STEP_TOPIC,
+)
+from mcaprl.recorder.record import panels, series
+from mcaprl.recorder.record.panels import Node, Panel
 
 LAYOUT_NAME = "foxglove-layout.json"
 VALUES_TOPIC = "/rl/values"
 TRAINING_TOPIC = "/rl/training"
-# Maximum number of series in a plot; further series are left out.
-MAX_SERIES = 24
 RETURN_SO_FAR = "return_so_far"
+_SCENE, _STATIC, _TRACKS, _DEPTH = "/scene", "/scene/static", "/scene/tracks", "/camera/depth"
+_WORLD = "map"
+_STILL = (_WORLD, "follow-none")
+_NONE: Sequence[str] = ()
 _SPEED = "speed_m_s"
-# Telemetry of the first plot, by the ends of its names: what a driver looks at besides the speed.
+# Telemetry in the first plot besides the speed, by the ends of its names.
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
-_STEPS, _EPISODES = "/rl/step{final==false}", "/rl/episode"
-_SCENES = ("/scene", "/scene/static")
-_TRACKS = "/scene/tracks"
+# Values for environments without `view_settings`.
+_CAMERA_M, _TILT_DEG, _AROUND_M, _DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
+# Length of the vehicle's axes in the view from above, as a share of the visible height.
+_MARK = 0.03
+# Reasons of failures in the sims and of Gymnasium; their names are shown by the indicator.
+_REASONS = (
+    *("off_lane", "off_line", "collision", "crash", "stall", "no_gate", "slow", "low_reward"),
+    *("terminated", "time_limit"),
+)
+_LAST_S = 20
 _MAX_EPISODE = 100
-_DEPTH_M = (0.0, 50.0)
 _FIRST_METRICS = ("mean_return", "score")
-_METRICS_AFTER = ("loss", "epsilon")
-
-Node = dict[str, Any] | str
-Panels = dict[str, Panel]
+_NEXT_METRICS = ("loss", "epsilon")
 
 
 def layout_of(
@@ -45,7 +59,7 @@ def layout_of(
     follow_frame: str = "",
     training: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Return the layout for a log with these topics: the screens Drive, Learning and Data.
+    """Return the layout for a log with these topics.
 
     Args:
         metadata: Metadata of the log.
@@ -54,16 +68,11 @@ def layout_of(
         follow_frame: Frame that the 3D view moves with; empty for a fixed view.
         training: Labels of the fields of `/rl/training` in a live stream, by name.
     """
-    found: Panels = {}
-    screens = {
-        "Drive": _drive(metadata, topics, telemetry_names, follow_frame, found),
-        "Learning": _learning(metadata, topics, telemetry_names, training or {}, found),
-        "Data": _data(metadata, topics, telemetry_names, found),
-    }
-    found["Tab!screens"] = panels.tabs(screens)
+    screens = _Screens(metadata, topics, telemetry_names, follow_frame, training or {})
+    nodes = {"Drive": screens.drive(), "Learning": screens.learning(), "Data": screens.data()}
     return {
-        "configById": found,
-        "globalVariables": {"episode": 0},
+        "configById": {"Tab!screens": panels.tabs(nodes), **screens.found},
+        "globalVariables": {series.EPISODE_VARIABLE: 0},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
         "layout": "Tab!screens",
@@ -80,267 +89,259 @@ def is_values_topic(topic: str) -> bool:
     return topic == VALUES_TOPIC or topic.startswith(f"{VALUES_TOPIC}/")
 
 
-def _drive(
-    metadata: LogMetadata,
-    topics: Sequence[str],
-    telemetry: Sequence[str],
-    follow_frame: str,
-    found: Panels,
-) -> Node:
-    """Add the views and what one reads while driving."""
-    beside = _instruments(metadata, topics, telemetry, found)
-    views = _images(metadata, topics, found)
-    if "/scene" not in topics:
-        return _split(_stack(views, "column"), beside, "row", 50) if views else beside
-    camera = {
-        "perspective": True,
-        "distance": metadata.view.get("distance_m", 22.0),
-        "phi": metadata.view.get("tilt_deg", 66.0),
-        "targetOffset": [4, 0, 0],
-    }
-    found["3D!scene"] = panels.three_d("scene", _SCENES, camera, follow_frame)
-    if _TRACKS in topics:
-        found["3D!above"] = panels.three_d(
-            "from above: tracks, yellow is the highest return",
-            (*_SCENES, _TRACKS),
-            _above(metadata),
-        )
-        views.append("3D!above")
-    left: Node = "3D!scene"
-    if views:
-        left = _split(left, _stack(views, "row"), "column", 62)
-    return _split(left, beside, "row", 62)
+@dataclass
+class _Screens:
+    """The screens of a layout. Each method returns a node and adds its panels to `found`."""
 
+    metadata: LogMetadata
+    topics: Sequence[str]
+    telemetry: Sequence[str]
+    follow_frame: str
+    training: Mapping[str, str]
+    found: dict[str, Panel] = field(default_factory=dict)
 
-def _above(metadata: LogMetadata) -> dict[str, Any]:
-    """Return the camera that looks down on the whole world."""
-    view = metadata.view
-    target = [view.get("world_x_m", 0.0), view.get("world_y_m", 0.0), 0]
-    return {
-        "perspective": False,
-        "distance": view.get("world_m", 100.0),
-        "phi": 0,
-        "thetaOffset": 0,
-        "target": target,
-    }
+    def drive(self) -> Node:
+        """Return what one watches while the vehicle drives."""
+        beside = self._instruments()
+        views = self._images()
+        if _SCENE not in self.topics:
+            if not views:
+                return beside
+            return panels.split(panels.stack(views, "column"), beside, "row", 50)
+        # The view from above is wide, and images are square.
+        below = [(view, 0.4) for view in views] + [(self._above(), 0.6)]
+        if _TRACKS not in self.topics and "/tf" in self.topics and "y_m" in self.telemetry:
+            below.append((self._track_so_far(), 0.4))
+        left = panels.split(self._scene(), panels.weighted(below, "row"), "column", 62)
+        return panels.split(left, beside, "row", 60)
 
+    def learning(self) -> Node:
+        """Return the returns or the metrics of training, and the outputs of policies."""
+        rows = self._metrics() if self.training else self._returns()
+        if LOG_TOPIC in self.topics:
+            rows.append((self._put("RosOut!learning", panels.log_lines(LOG_TOPIC)), 0.25))
+        values = self._values_topics()
+        nodes = {topic.removeprefix("/rl/"): self._policy(topic) for topic in values}
+        left = panels.weighted(rows, "column")
+        if not nodes:
+            return left
+        right = next(iter(nodes.values()))
+        if len(nodes) > 1:
+            right = self._put("Tab!policies", panels.tabs(nodes))
+        return panels.split(left, right, "row", 42)
 
-def _instruments(
-    metadata: LogMetadata, topics: Sequence[str], telemetry: Sequence[str], found: Panels
-) -> Node:
-    rows: list[Node] = []
-    lights: list[Node] = []
-    if _SPEED in telemetry:
-        highest = metadata.view.get("speed_m_s", 30.0)
-        found["Gauge!speed"] = panels.gauge("speed, m/s", f"/telemetry.{_SPEED}", highest)
-        lights.append("Gauge!speed")
-    if PHASE_TOPIC in topics:
-        successes = metadata.success_reasons
-        found["Indicator!state"] = panels.indicator(
-            "state of the episode", f"{PHASE_TOPIC}.data", RUNNING, successes
-        )
-        lights.append("Indicator!state")
-    if lights:
-        rows.append(_stack(lights, "row"))
-    watched = [name for name in telemetry if name.endswith(_WATCHED)]
-    if watched:
-        paths = {name: f"/telemetry.{name}" for name in watched}
-        found["Plot!drive"] = panels.plot("offsets, steering", paths)
-        rows.append("Plot!drive")
-    _put_returns(telemetry, found)
-    rows.append(_stack(["Plot!reward", "Plot!return"], "row"))
-    rows.append(_actions_row(metadata, topics, found))
-    return _stack(rows, "column")
-
-
-def _put_returns(telemetry: Sequence[str], found: Panels) -> None:
-    found["Plot!reward"] = panels.plot("reward", {"reward": f"{_STEPS}.reward"})
-    returns = {"return of episode": f"{_EPISODES}.total_reward"}
-    if RETURN_SO_FAR in telemetry:
-        returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
-    found["Plot!return"] = panels.plot(next(iter(returns)), returns)
-
-
-def _actions_row(metadata: LogMetadata, topics: Sequence[str], found: Panels) -> Node:
-    """Add the actions of the last 20 s; not synchronized, since that would drag all plots along."""
-    rows = {}
-    if metadata.action_names():
-        rows["action"] = f"{_STEPS}.action"
-    if PHASE_TOPIC in topics:
-        rows["state"] = f"{PHASE_TOPIC}.data"
-    rows["episode"] = "/rl/step.episode"
-    found["StateTransitions!actions"] = panels.state_transitions(
-        "action and state, last 20 s", rows, xAxisRange=20, isSynced=False
-    )
-    return "StateTransitions!actions"
-
-
-def _images(metadata: LogMetadata, topics: Sequence[str], found: Panels) -> list[Node]:
-    """Add the depth camera and the image observations."""
-    names: list[Node] = []
-    if "/camera/depth" in topics:
-        low = metadata.view.get("depth_min_m", _DEPTH_M[0])
-        high = metadata.view.get("depth_max_m", _DEPTH_M[1])
-        found["Image!depth"] = panels.image(
-            f"depth, {low:g} to {high:g} m; black is nothing",
-            "/camera/depth",
-            colorMode="colormap",
-            colorMap="turbo",
-            minValue=1000 * low,
-            maxValue=1000 * high,
-        )
-        names.append("Image!depth")
-    for leaf in observation_leaves(metadata.observation_space):
-        if leaf.encoding is not None:
-            found[f"Image!{leaf.name}"] = panels.image(leaf.topic, leaf.topic)
-            names.append(f"Image!{leaf.name}")
-    return names
-
-
-def _learning(
-    metadata: LogMetadata,
-    topics: Sequence[str],
-    telemetry: Sequence[str],
-    training: Mapping[str, str],
-    found: Panels,
-) -> Node:
-    """Add the returns, the metrics of training, and the outputs of policies."""
-    found["Plot!returns"] = panels.plot(
-        "return of each episode", {"return": f"{_EPISODES}.total_reward"}
-    )
-    values = {
-        topic.removeprefix("/rl/"): _policy(metadata, topic, found)
-        for topic in filter(is_values_topic, topics)
-    }
-    rows: list[Node] = _metrics(training, found) if training else []
-    if not training:
-        rows.append("Plot!returns")
-    if len(values) > 1:
-        found["Tab!policies"] = panels.tabs(values)
-    node = "Tab!policies" if len(values) > 1 else next(iter(values.values()), None)
-    if LOG_TOPIC in topics and (training or not values):
-        found["RosOut!learning"] = panels.log_lines()
-        rows.append("RosOut!learning")
-    left = _stack(rows, "column")
-    if training:
-        # The returns are among the metrics.
-        del found["Plot!returns"]
-    return left if node is None else _split(left, node, "row", 40)
-
-
-def _metrics(training: Mapping[str, str], found: Panels) -> list[Node]:
-    """Add the metrics of training, the most important first."""
-    paths = {name: f"{TRAINING_TOPIC}.{name}" for name in training}
-    first = {training[name]: paths[name] for name in _FIRST_METRICS if name in training}
-    rows: list[Node] = []
-    if first:
-        found["Plot!training"] = panels.plot("mean return and score", first)
-        rows.append("Plot!training")
-    pair: list[Node] = []
-    for name in _METRICS_AFTER:
-        if name in training:
-            found[f"Plot!{name}"] = panels.plot(training[name], {training[name]: paths[name]})
-            pair.append(f"Plot!{name}")
-    rows += [_stack(pair, "row")] if pair else []
-    rest = [name for name in training if name not in (*_FIRST_METRICS, *_METRICS_AFTER)]
-    for name in rest:
-        found[f"Plot!{name}"] = panels.plot(training[name], {training[name]: paths[name]})
-    if rest:
-        found["Tab!metrics"] = panels.tabs({name: f"Plot!{name}" for name in rest})
-        rows.append("Tab!metrics")
-    return rows
-
-
-def _policy(metadata: LogMetadata, topic: str, found: Panels) -> Node:
-    """Add the outputs of one policy: values over time and now, errors, and its actions."""
-    title = topic.removeprefix("/rl/")
-    names = list(metadata.action_names().values())[:MAX_SERIES]
-    over_time = {name: f"{topic}.q[{index}]" for index, name in enumerate(names)}
-    found[f"Plot!{title}"] = panels.plot(f"{title}: Q over time", over_time)
-    legend = ", ".join(f"{index} {name}" for index, name in enumerate(names))
-    found[f"Plot!{title} now"] = panels.plot(
-        f"{title}: Q now ({legend})", {"Q": f"{topic}.q[:]"}, xAxisVal="index", isSynced=False
-    )
-    fields = ("td_error", "advantage", "entropy")
-    found[f"Plot!{title} errors"] = panels.plot(
-        f"{title}: errors", {field: f"{topic}.{field}" for field in fields}
-    )
-    found[f"StateTransitions!{title}"] = panels.state_transitions(
-        f"{title}: actions, last 20 s",
-        {
-            "action": f"{_STEPS}.action",
-            "would take": f"{topic}.policy_action",
-            "agrees": f"{topic}.agrees",
-        },
-        xAxisRange=20,
-        isSynced=False,
-    )
-    rows = [f"Plot!{title}", f"Plot!{title} now", f"Plot!{title} errors"]
-    return _stack([*rows, f"StateTransitions!{title}"], "column")
-
-
-def _data(
-    metadata: LogMetadata, topics: Sequence[str], telemetry: Sequence[str], found: Panels
-) -> Node:
-    """Add the messages themselves, all numbers of the log, and its log lines."""
-    for topic in ("/rl/step", "/rl/episode"):
-        found[f"RawMessages!{topic[4:]}"] = panels.raw_messages(topic)
-    left = _stack(["RawMessages!step", "RawMessages!episode"], "column")
-    numbers = {
-        "observations": _observation_series(metadata),
-        "actions": _action_series(metadata),
-        "telemetry": {name: f"/telemetry.{name}" for name in telemetry[:MAX_SERIES]},
-    }
-    shown = {title: paths for title, paths in numbers.items() if paths}
-    for title, paths in shown.items():
-        found[f"Plot!{title}"] = panels.plot(title, paths)
-    rows: list[Node] = []
-    if shown:
-        found["Tab!numbers"] = panels.tabs({title: f"Plot!{title}" for title in shown})
-        rows.append("Tab!numbers")
-    found["GlobalVariableSliderPanel!episode"] = panels.slider("episode", _MAX_EPISODE)
-    chosen = "/rl/step{episode==$episode}{final==false}.reward"
-    found["Plot!episode"] = panels.plot("reward of the chosen episode", {"reward": chosen})
-    rows.append(_split("GlobalVariableSliderPanel!episode", "Plot!episode", "row", 30))
-    if LOG_TOPIC in topics:
-        found["RosOut!log"] = panels.log_lines()
-        rows.append("RosOut!log")
-    return _split(left, _stack(rows, "column"), "row", 35)
-
-
-def _action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return one series per component of an action, or one per discrete action at its steps."""
-    names = metadata.action_names()
-    if names:
-        taken = {
-            name: f"/rl/step{{action=={value}}}{{final==false}}.action"
-            for value, name in names.items()
+    def data(self) -> Node:
+        """Return the messages themselves, all numbers of the log, and its log lines."""
+        raw = [
+            (self._put(f"RawMessages!{topic[4:]}", panels.raw_messages(topic)), weight)
+            for topic, weight in ((STEP_TOPIC, 0.6), (EPISODE_TOPIC, 0.4))
+        ]
+        others = [name for name in self.telemetry if name != RETURN_SO_FAR]
+        numbers = {
+            "observations": series.observation_series(self.metadata),
+            "actions": series.action_series(self.metadata),
+            **series.telemetry_groups(others),
         }
-        return dict(list(taken.items())[:MAX_SERIES])
-    leaf = action_leaf(metadata.action_space)
-    suffixes = [f"[{index}]" for index in range(leaf.size)] if leaf.shape else [""]
-    return {f"action{suffix}": f"{_STEPS}.action{suffix}" for suffix in suffixes[:MAX_SERIES]}
+        shown = {title: paths for title, paths in numbers.items() if paths}
+        plots: dict[str, Node] = {title: self._plot(title, title, shown[title]) for title in shown}
+        rows: list[tuple[Node, float]] = [(self._chosen_episode(), 0.27)]
+        if plots:
+            rows.insert(0, (self._put("Tab!numbers", panels.tabs(plots)), 0.45))
+        if LOG_TOPIC in self.topics:
+            rows.append((self._put("RosOut!log", panels.log_lines(LOG_TOPIC)), 0.28))
+        left, right = panels.weighted(raw, "column"), panels.weighted(rows, "column")
+        return panels.split(left, right, "row", 30)
 
+    def _put(self, name: str, panel: Panel) -> str:
+        self.found[name] = panel
+        return name
 
-def _observation_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return a series per component of the vector observations, up to `MAX_SERIES`."""
-    paths = {}
-    for leaf in observation_leaves(metadata.observation_space):
-        if leaf.encoding is not None:
-            continue
-        named = leaf.path == () and len(metadata.observation_names) == leaf.size
-        for index in range(leaf.size):
-            label = metadata.observation_names[index] if named else f"{leaf.name}[{index}]"
-            suffix = f"[{index}]" if leaf.shape else ""
-            paths[label] = f"/rl/step.{leaf.name}{suffix}"
-    return dict(list(paths.items())[:MAX_SERIES])
+    def _plot(self, name: str, title: str, paths: Mapping[str, str]) -> str:
+        return self._put(f"Plot!{name}", panels.plot(title, paths))
 
+    def _values_topics(self) -> list[str]:
+        return [topic for topic in self.topics if is_values_topic(topic)]
 
-def _split(first: Node, second: Node, direction: str, percent: float) -> Node:
-    return {"first": first, "second": second, "direction": direction, "splitPercentage": percent}
+    def _scene(self) -> Node:
+        view = self.metadata.view
+        camera = {
+            "perspective": True,
+            "distance": view.get("distance_m", _CAMERA_M),
+            "phi": view.get("tilt_deg", _TILT_DEG),
+            "targetOffset": [4, 0, 0],
+        }
+        followed = (self.follow_frame, "follow-pose") if self.follow_frame else _STILL
+        shown = dict.fromkeys(self._of(_SCENE, _STATIC), _NONE)
+        return self._put("3D!scene", panels.three_d("scene", shown, camera, followed))
 
+    def _above(self) -> Node:
+        """Add the view from above: the whole world, or what is around the vehicle if unknown."""
+        view = self.metadata.view
+        height_m = view.get("world_m", _AROUND_M)
+        camera = {
+            "perspective": False,
+            "distance": height_m,
+            "phi": 0,
+            "thetaOffset": 0,
+            "targetOffset": [view.get("world_x_m", 0), view.get("world_y_m", 0), 0],
+        }
+        follows = self.follow_frame and "world_m" not in view
+        followed = (self.follow_frame, "follow-position") if follows else _STILL
+        shown = dict.fromkeys(self._of(_STATIC, _TRACKS), _NONE)
+        title = "from above; tracks: yellow is the highest return, red marks are failures"
+        panel = panels.three_d(
+            title if _TRACKS in shown else "from above",
+            {_SCENE: ["speed"], **shown},
+            camera,
+            followed,
+            # The vehicle is too small to see, but its axes are not.
+            axes_m=_MARK * height_m,
+            without_axes=(_WORLD, IMAGE_FRAME),
+        )
+        return self._put("3D!above", panel)
 
-def _stack(nodes: Sequence[Node], direction: str) -> Node:
-    """Return panels of equal size in a row or column."""
-    first, *rest = nodes
-    return _split(first, _stack(rest, direction), direction, 100 / len(nodes)) if rest else first
+    def _track_so_far(self) -> Node:
+        x_path = "/tf.transforms[0].transform.translation.x"
+        panel = panels.curve("track, y over x in m", x_path, "/telemetry.y_m")
+        return self._put("Plot!track", panel)
+
+    def _of(self, *topics: str) -> list[str]:
+        return [topic for topic in topics if topic in self.topics]
+
+    def _images(self) -> list[Node]:
+        """Add the depth camera and the image observations."""
+        names: list[Node] = []
+        if _DEPTH in self.topics:
+            low = self.metadata.view.get("depth_min_m", _DEPTH_M[0])
+            high = self.metadata.view.get("depth_max_m", _DEPTH_M[1])
+            colors = {"colorMode": "colormap", "colorMap": "turbo"}
+            limits_mm = {"minValue": 1000 * low, "maxValue": 1000 * high}
+            title = f"depth, {low:g} to {high:g} m; black: nothing in range"
+            panel = panels.image(title, _DEPTH, **colors, **limits_mm)
+            names.append(self._put("Image!depth", panel))
+        for leaf in observation_leaves(self.metadata.observation_space):
+            if leaf.encoding is not None:
+                panel = panels.image(f"observation: {leaf.name}", leaf.topic)
+                names.append(self._put(f"Image!{leaf.name}", panel))
+        return names
+
+    def _instruments(self) -> Node:
+        """Add the gauge and the indicator, the plots of this moment, and the actions."""
+        lights = [*self._gauge(), *self._indicator()]
+        returns = {"return of each episode": f"{EPISODE_TOPIC}.total_reward"}
+        if RETURN_SO_FAR in self.telemetry:
+            returns = {"return so far": f"/telemetry.{RETURN_SO_FAR}"}
+        plots: list[Node] = [
+            self._plot("reward", "reward", {"reward": f"{series.STEPS}.reward"}),
+            self._plot("return", next(iter(returns)), returns),
+        ]
+        rows = [[*lights, *plots]] if len(lights) < 2 else [lights, plots]
+        watched = [name for name in self.telemetry if name.endswith(_WATCHED)]
+        if watched:
+            title = "offsets, steering" if len(watched) > 1 else watched[0]
+            rows.insert(1, [self._plot("drive", title, series.telemetry_series(watched))])
+        elif observed := series.observation_series(self.metadata):
+            rows.append([self._plot("drive", "observation", observed)])
+        transitions = self._actions()
+        share = panels.share_of_transitions(len(self.found[transitions]["paths"]))
+        sizes = [(panels.stack(row, "row"), (1 - share) / len(rows)) for row in rows]
+        return panels.weighted([*sizes, (transitions, share)], "column")
+
+    def _gauge(self) -> list[Node]:
+        if _SPEED not in self.telemetry:
+            return []
+        highest = self.metadata.view.get(_SPEED, _HIGHEST_M_S)
+        panel = panels.gauge("speed, m/s", f"/telemetry.{_SPEED}", highest)
+        return [self._put("Gauge!speed", panel)]
+
+    def _indicator(self) -> list[Node]:
+        """Add the state of the episode: red for a failure, if the successes are known."""
+        if PHASE_TOPIC not in self.topics:
+            return []
+        successes = self.metadata.success_reasons
+        other = (panels.BAD, "failed") if successes else (panels.NEUTRAL, "ended")
+        colors = {
+            **dict.fromkeys((RUNNING, INTERRUPTED), panels.NEUTRAL),
+            **dict.fromkeys(_REASONS, other[0]),
+            **dict.fromkeys(successes, panels.GOOD),
+        }
+        panel = panels.indicator("state of the episode", f"{PHASE_TOPIC}.data", colors, other)
+        return [self._put("Indicator!state", panel)]
+
+    def _actions(self) -> str:
+        """Add the actions of the last seconds, and those of the policies."""
+        rows = {"action": f"{series.STEPS}.action"} if self.metadata.action_names() else {}
+        for topic in self._values_topics():
+            name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
+            rows[f"{name} would take".strip()] = f"{topic}.policy_action"
+            rows[f"{name} agrees".strip()] = f"{topic}.agrees"
+        panel = panels.state_transitions(
+            f"actions of the last {_LAST_S} s",
+            rows or {"episode": f"{series.STEPS}.episode"},
+            _LAST_S,
+        )
+        return self._put("StateTransitions!actions", panel)
+
+    def _returns(self) -> list[tuple[Node, float]]:
+        """Add the return of each episode, and an overview of the episodes."""
+        paths = {"return": f"{EPISODE_TOPIC}.total_reward"}
+        rows: dict[str, str] = {"episode": f"{series.STEPS}.episode"}
+        if PHASE_TOPIC in self.topics:
+            rows["state"] = f"{PHASE_TOPIC}.data"
+        overview = panels.state_transitions("episodes", rows)
+        share = panels.share_of_transitions(len(rows))
+        return [
+            (self._plot("returns", "return of each episode", paths), 0.4),
+            (self._put("StateTransitions!episodes", overview), share),
+        ]
+
+    def _metrics(self) -> list[tuple[Node, float]]:
+        """Add the metrics of training, the most important first."""
+        paths = {name: f"{TRAINING_TOPIC}.{name}" for name in self.training}
+        rows: list[tuple[Node, float]] = []
+        first = {self.training[name]: paths.pop(name) for name in _FIRST_METRICS if name in paths}
+        if first:
+            rows.append((self._plot("training", "mean return and score", first), 0.3))
+        plots: dict[str, Node] = {
+            name.replace("_", " "): self._plot(name, self.training[name], {name: path})
+            for name, path in paths.items()
+        }
+        pair = [plots.pop(name) for name in _NEXT_METRICS if name in plots]
+        if pair:
+            rows.append((panels.stack(pair, "row"), 0.25))
+        if plots:
+            rows.append((self._put("Tab!metrics", panels.tabs(plots)), 0.27))
+        return rows
+
+    def _policy(self, topic: str) -> Node:
+        """Add the outputs of one policy: values over time and now, errors, and its agreement."""
+        title = topic.removeprefix("/rl/")
+        names = list(self.metadata.action_names().values())[: series.MAX_SERIES]
+        over_time: dict[str, Node] = {}
+        for label, array in (("Q-values", "q"), ("probabilities", "preference")):
+            paths = {name: f"{topic}.{array}[{index}]" for index, name in enumerate(names)}
+            panel = panels.plot(f"{title}: {label} over time", paths, values=True)
+            over_time[label] = self._put(f"Plot!{title} {array}", panel)
+        legend = ", ".join(f"{index} {name}" for index, name in enumerate(names))
+        now = panels.points_by_index(f"{title}: Q now ({legend})", {"Q": f"{topic}.q[:]"})
+        fields = ("td_error", "advantage", "entropy")
+        errors = {name: f"{topic}.{name}" for name in fields}
+        pair: list[Node] = [
+            self._put(f"Plot!{title} now", now),
+            self._plot(f"{title} errors", f"{title}: TD error, advantage, entropy", errors),
+        ]
+        agreement = panels.state_transitions(
+            f"{title}: agreement with the actions of the log", {"agrees": f"{topic}.agrees"}
+        )
+        rows = [
+            (self._put(f"Tab!{title} over time", panels.tabs(over_time)), 0.46),
+            (panels.stack(pair, "row"), 0.3),
+            (self._put(f"StateTransitions!{title}", agreement), 0.24),
+        ]
+        return panels.weighted(rows, "column")
+
+    def _chosen_episode(self) -> Node:
+        chosen, title = series.EPISODE_VARIABLE, "reward of the chosen episode"
+        knob = panels.slider("episode to plot", chosen, _MAX_EPISODE)
+        plot = self._plot("episode", title, {"reward": series.CHOSEN_REWARD})
+        return panels.split(self._put("GlobalVariableSliderPanel!episode", knob), plot, "row", 30)

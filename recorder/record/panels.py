@@ -1,4 +1,4 @@
-"""Panels of a Foxglove layout: the configuration of each kind.
+"""Panels of a Foxglove layout: the configuration of each kind, and their arrangement.
 
 Titles have two keys, since Foxglove and Lichtblick read different ones.
 """
@@ -9,109 +9,149 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 Panel = dict[str, Any]
+Node = dict[str, Any] | str
+"""Name of a panel, or two nodes that share a rectangle."""
+FIELD_OF_VIEW_DEG = 45
+"""Vertical angle of view of a 3D panel, degrees."""
 
+NEUTRAL, GOOD, BAD = "#4e98e2", "#31b57b", "#d64545"
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
-_NEUTRAL, _GOOD, _BAD = "#4e98e2", "#31b57b", "#d64545"
-# Viewers warn of transforms that are not loaded ahead.
-_TRANSFORMS = {"showLabel": False, "axisScale": 0, "lineWidth": 0, "enablePreloading": True}
+# Width of a legend in pixels: of labels, and of labels with the values at the current time.
+_LEGEND_PX, _LEGEND_WITH_VALUES_PX = 160, 220
+# Height in pixels of each row of state transitions, and of their title and time axis.
+_TRANSITIONS_ROW_PX, _TRANSITIONS_REST_PX = 64, 60
+# Height of a screen in the smallest window, 1280 x 720 pixels.
+_SCREEN_PX = 590
 
 
-def titled(title: str, **panel: Any) -> Panel:
-    """Return a panel with a title."""
-    return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title, **panel}
-
-
-def tabs(nodes: Mapping[str, Any]) -> Panel:
+def tabs(nodes: Mapping[str, Node]) -> Panel:
     """Return a panel of tabs, each with a layout of its own."""
     parts = [{"title": title, "layout": node} for title, node in nodes.items()]
     return {"activeTabIdx": 0, "tabs": parts}
 
 
-def plot(title: str, paths: Mapping[str, str], **options: Any) -> Panel:
-    """Return a plot of series by label; the legend stands beside several series."""
-    series = [
-        {
-            "value": path,
-            "label": label,
-            "color": _COLORS[index % len(_COLORS)],
-            "enabled": True,
-            "timestampMethod": "receiveTime",
-        }
-        for index, (label, path) in enumerate(paths.items())
-    ]
-    return titled(
+def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **options: Any) -> Panel:
+    """Return a plot of series by label; the legend is left of the plot, if there are several.
+
+    Args:
+        title: Title of the panel.
+        paths: Message path of each series, by label.
+        values: Whether the legend has the values at the current time.
+        options: Fields of the panel to replace.
+    """
+    several = len(paths) > 1
+    return _titled(
         title,
-        paths=series,
+        paths=[
+            _series(label, path, color=_COLORS[index % len(_COLORS)])
+            for index, (label, path) in enumerate(paths.items())
+        ],
         xAxisVal="timestamp",
         isSynced=True,
-        showLegend=len(paths) > 1,
-        legendDisplay="left" if len(paths) > 1 else "none",
+        showLegend=several,
+        legendDisplay="left" if several else "none",
+        sidebarDimension=_LEGEND_WITH_VALUES_PX if values else _LEGEND_PX,
         showXAxisLabels=True,
         showYAxisLabels=True,
-        showPlotValuesInLegend=False,
+        showPlotValuesInLegend=values,
     ) | dict(options)
 
 
-def state_transitions(title: str, paths: Mapping[str, str], **options: Any) -> Panel:
-    """Return rows of discrete values by label."""
-    rows = [
-        {"value": path, "label": label, "enabled": True, "timestampMethod": "receiveTime"}
-        for label, path in paths.items()
-    ]
-    return titled(title, paths=rows, isSynced=True) | dict(options)
+def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
+    """Return a plot of the elements of the latest message's arrays as points over their index."""
+    panel = plot(title, paths, xAxisVal="index", isSynced=False)
+    for series in panel["paths"]:
+        series |= {"showLine": False, "lineSize": 4}
+    return panel
+
+
+def curve(title: str, x_path: str, y_path: str) -> Panel:
+    """Return a plot of one number over another, which must be of another topic.
+
+    Lichtblick draws nothing if both are numbers of one topic.
+    """
+    x_axis = {"value": x_path, "enabled": True}
+    return plot(title, {"y": y_path}, xAxisVal="custom", xAxisPath=x_axis, isSynced=False)
+
+
+def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None = None) -> Panel:
+    """Return rows of discrete values by label.
+
+    Args:
+        title: Title of the panel.
+        paths: Message path of each row, by label.
+        last_s: Seconds before the current time to show; None shows all. Rows of the last seconds
+            are not synchronized with other panels: all plots would show these seconds only.
+    """
+    rows = [_series(label, path) for label, path in paths.items()]
+    if last_s is None:
+        return _titled(title, paths=rows, isSynced=True)
+    return _titled(title, paths=rows, isSynced=False, xAxisRange=last_s)
+
+
+def share_of_transitions(rows: int) -> float:
+    """Return the share of a screen's height that shows this number of rows, 0.45 at most."""
+    return min(0.45, (rows * _TRANSITIONS_ROW_PX + _TRANSITIONS_REST_PX) / _SCREEN_PX)
 
 
 def gauge(title: str, path: str, highest: float) -> Panel:
     """Return a gauge of a number from 0 to its highest value."""
-    return titled(
+    return _titled(
         title,
         path=path,
         minValue=0,
         maxValue=highest,
         colorMap="turbo",
         colorMode="colormap",
-        gradient=[_NEUTRAL, _BAD],
+        gradient=[NEUTRAL, BAD],
         reverse=False,
     )
 
 
-def indicator(title: str, path: str, running: str, successes: Sequence[str]) -> Panel:
-    """Return a light: neutral while an episode runs, then green for a success, red otherwise."""
-    colors = {running: _NEUTRAL, **dict.fromkeys(successes, _GOOD)}
+def indicator(title: str, path: str, colors: Mapping[str, str], other: tuple[str, str]) -> Panel:
+    """Return a light with the color of a text.
+
+    Args:
+        title: Title of the panel.
+        path: Message path of the text.
+        colors: Color of each text.
+        other: Color and label of any other text.
+    """
     rules = [
-        {"operator": "=", "rawValue": value, "color": color, "label": value.replace("_", " ")}
-        for value, color in colors.items()
+        {"operator": "=", "rawValue": text, "color": color, "label": text.replace("_", " ")}
+        for text, color in colors.items()
     ]
-    fallback = {"fallbackColor": _BAD, "fallbackLabel": "failed"}
-    return titled(title, path=path, style="background", rules=rules, **fallback)
+    fallback = dict(zip(("fallbackColor", "fallbackLabel"), other, strict=True))
+    return _titled(title, path=path, style="background", rules=rules, **fallback)
 
 
 def raw_messages(topic: str) -> Panel:
     """Return the latest message of a topic as a tree."""
     options = {"diffEnabled": False, "diffMethod": "custom", "diffTopicPath": ""}
-    return titled(topic, topicPath=topic, showFullMessageForDiff=False, **options)
+    return _titled(topic, topicPath=topic, showFullMessageForDiff=False, **options)
 
 
-def slider(variable: str, highest: int) -> Panel:
-    """Return a slider that sets a variable of the layout, from 0."""
+def slider(title: str, variable: str, highest: int) -> Panel:
+    """Return a slider that sets a variable of the layout to an integer from 0."""
     bounds = {"min": 0, "max": highest, "step": 1}
-    return titled(variable, globalVariableName=variable, sliderProps=bounds)
+    return _titled(title, globalVariableName=variable, sliderProps=bounds)
 
 
-def log_lines() -> Panel:
+def log_lines(topic: str) -> Panel:
     """Return the list of log lines."""
-    return titled("log", searchTerms=[], minLogLevel=1, topicToRender="/rosout")
+    return _titled("log", searchTerms=[], minLogLevel=1, topicToRender=topic)
 
 
 def image(title: str, topic: str, **mode: Any) -> Panel:
     """Return an image, with options of its colors."""
-    return titled(
+    return _titled(
         title,
         cameraState={},
         followMode="follow-none",
         imageMode={"imageTopic": topic, "synchronize": False, **mode},
         layers={},
         publish={},
+        # Viewers report transforms that are not preloaded.
         scene={"transforms": {"enablePreloading": True}},
         topics={},
         transforms={},
@@ -119,37 +159,86 @@ def image(title: str, topic: str, **mode: Any) -> Panel:
 
 
 def three_d(
-    title: str, topics: Sequence[str], camera: Mapping[str, Any], follow_frame: str = ""
+    title: str,
+    topics: Mapping[str, Sequence[str]],
+    camera: Mapping[str, Any],
+    follow: tuple[str, str],
+    *,
+    axes_m: float = 0.0,
+    without_axes: Sequence[str] = (),
 ) -> Panel:
-    """Return a 3D view without outlines and names of frames.
+    """Return a 3D view without outlines, and without names and connections of frames.
 
     Args:
         title: Title of the panel.
-        topics: Topics of markers to show.
+        topics: Topics of markers to show, each with the namespaces to hide.
         camera: Fields of the camera state.
-        follow_frame: Frame that the view moves with; empty for a fixed view.
+        follow: Frame to follow, and the mode: `follow-pose`, `follow-position` or `follow-none`.
+        axes_m: Length of the frames' axes; 0 for none.
+        without_axes: Frames whose axes are hidden.
     """
-    return titled(
+    return _titled(
         title,
         cameraState={
             "thetaOffset": 90,
             "target": [0, 0, 0],
             "targetOffset": [0, 0, 0],
             "targetOrientation": [0, 0, 0, 1],
-            "fovy": 45,
+            "fovy": FIELD_OF_VIEW_DEG,
             "near": 0.5,
             "far": 5000,
             **camera,
         },
-        followMode="follow-pose" if follow_frame else "follow-none",
-        followTf=follow_frame or "map",
-        scene={"backgroundColor": "#10141c", "transforms": _TRANSFORMS},
-        transforms={},
+        followTf=follow[0],
+        followMode=follow[1],
+        scene={
+            "backgroundColor": "#10141c",
+            "transforms": {
+                "showLabel": False,
+                # Axes have a length of 0.2 m at a scale of 1.
+                "axisScale": axes_m / 0.2,
+                "lineWidth": 0,
+                "enablePreloading": True,
+            },
+        },
+        transforms={f"frame:{frame}": {"visible": False} for frame in without_axes},
         topics={
-            topic: {"visible": True, "showOutlines": False, "settings": {"showOutlines": False}}
-            for topic in topics
+            topic: {
+                "visible": True,
+                "showOutlines": False,
+                **({"namespaces": {name: {"visible": False} for name in names}} if names else {}),
+            }
+            for topic, names in topics.items()
         },
         layers={},
         publish={},
         imageMode={},
     )
+
+
+def split(first: Node, second: Node, direction: str, percent: float) -> Node:
+    """Return two nodes in a `row` or a `column`; the first one has a percentage of the size."""
+    return {"first": first, "second": second, "direction": direction, "splitPercentage": percent}
+
+
+def stack(nodes: Sequence[Node], direction: str) -> Node:
+    """Return nodes of equal size in a `row` or a `column`."""
+    return weighted([(node, 1.0) for node in nodes], direction)
+
+
+def weighted(nodes: Sequence[tuple[Node, float]], direction: str) -> Node:
+    """Return nodes in a `row` or a `column`, whose sizes are proportional to their weights."""
+    (first, weight), *rest = nodes
+    if not rest:
+        return first
+    total = sum(each for _, each in nodes)
+    return split(first, weighted(rest, direction), direction, round(100 * weight / total, 2))
+
+
+def _titled(title: str, **panel: Any) -> Panel:
+    return {"foxglovePanelTitle": title, "lichtblickPanelTitle": title, **panel}
+
+
+def _series(label: str, path: str, **options: Any) -> dict[str, Any]:
+    shown = {"enabled": True, "timestampMethod": "receiveTime"}
+    return {"value": path, "label": label, **shown, **options}

@@ -58,25 +58,53 @@ def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) ->
 
 
 def side_by_side(layouts: Sequence[dict[str, Any]], prefixes: Sequence[str]) -> dict[str, Any]:
-    """Return a layout that shows several logs side by side."""
+    """Return a layout that shows several logs side by side, on each of its screens."""
     parts = [_prefixed_layout(*pair) for pair in zip(layouts, prefixes, strict=True)]
-    *firsts, root = [part.get("layout") for part in parts]
+    if len(parts) == 1:
+        return parts[0]
+    panels = {name: panel for part in parts for name, panel in part.get("configById", {}).items()}
+    variables = {
+        name: value for part in parts for name, value in part.get("globalVariables", {}).items()
+    }
+    roots = [part.get("layout") for part in parts]
+    screens = [_screens(panels, root) for root in roots]
+    root = _in_a_row(roots)
+    if all(screens) and len({tuple(each) for each in screens}) == 1:
+        panels = {name: panel for name, panel in panels.items() if name not in roots}
+        shown = {title: _in_a_row([each[title] for each in screens]) for title in screens[0]}
+        tabs = [{"title": title, "layout": node} for title, node in shown.items()]
+        root = "Tab!screens"
+        panels[root] = {"activeTabIdx": 0, "tabs": tabs}
+    return {**parts[0], "configById": panels, "globalVariables": variables, "layout": root}
+
+
+def _screens(panels: dict[str, Any], root: Any) -> dict[str, Any]:
+    """Return the nodes of the screens by title; empty if the root is not a panel of tabs."""
+    panel = panels.get(root) if isinstance(root, str) else None
+    tabs = panel.get("tabs", []) if isinstance(panel, dict) else []
+    return {tab["title"]: tab["layout"] for tab in tabs}
+
+
+def _in_a_row(nodes: Sequence[Any]) -> Any:
+    *firsts, root = nodes
     for count, first in enumerate(reversed(firsts), start=2):
         root = {"first": first, "second": root, "direction": "row", "splitPercentage": 100 / count}
-    panels = {name: panel for part in parts for name, panel in part.get("configById", {}).items()}
-    return {**parts[0], "configById": panels, "layout": root}
+    return root
 
 
 def _prefixed_layout(layout: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Add a prefix to the topics, frames, variables and panels of a layout."""
     if not prefix:
         return layout
     text = json.dumps(layout)
     # Strings that begin with a slash are topics. Names of panels have the form `Kind!title`.
     text = re.sub(r'"(/[a-z])', rf'"/{prefix}\1', text)
     text = re.sub(r'"(\w+)!', rf'"\1!{prefix} ', text)
-    text = re.sub(r'("followTf": ")(?!map")', rf"\1{prefix}/", text)
+    text = re.sub(r'("followTf": "|"frame:)(?!map")', rf"\g<1>{prefix}/", text)
+    text = re.sub(r'(\{\w+==\$|"globalVariableName": ")', rf"\g<1>{prefix}_", text)
     found: dict[str, Any] = json.loads(text)
-    return found
+    variables = found.get("globalVariables", {})
+    return {**found, "globalVariables": {f"{prefix}_{name}": variables[name] for name in variables}}
 
 
 def _below(prefix: str, frame: str) -> str:

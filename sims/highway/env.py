@@ -144,9 +144,10 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     success_reasons: ClassVar[tuple[str, ...]] = ("finished", "time_limit")
     view_settings: ClassVar[dict[str, float]] = {
         "distance_m": 22.0,
-        "tilt_deg": 66.0,
-        "world_m": 500.0,
-        "world_x_m": 240.0,
+        "tilt_deg": 73.0,
+        "world_m": 260.0,
+        "world_x_m": 250.0,
+        "world_y_m": -22.0,
         "speed_m_s": 15.0,
     }
     action_meanings = ACTION_MEANINGS

@@ -144,12 +144,12 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     success_reasons = ("finished",)
     view_settings: ClassVar[dict[str, float]] = {
         "distance_m": 20.0,
-        "tilt_deg": 70.0,
-        "world_m": 620.0,
+        "tilt_deg": 72.0,
+        "world_m": 350.0,
         "world_x_m": 270.0,
         "world_y_m": -40.0,
         "depth_min_m": 8.0,
-        "depth_max_m": 51.0,
+        "depth_max_m": 56.0,
         "speed_m_s": 8.0,
     }
 

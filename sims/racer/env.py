@@ -134,8 +134,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     success_reasons = ("time_limit",)
     view_settings: ClassVar[dict[str, float]] = {
         "distance_m": 15.0,
-        "tilt_deg": 60.0,
-        "world_m": 90.0,
+        "tilt_deg": 72.0,
+        "world_m": 66.0,
         "world_x_m": 50.0,
         "world_y_m": 30.0,
         "speed_m_s": 10.0,

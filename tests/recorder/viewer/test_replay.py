@@ -248,7 +248,9 @@ def test_layout_is_attached_and_classic(log: Path) -> None:
     assert views[1]["cameraState"]["perspective"] is False
     assert "/scene/tracks" in views[1]["topics"]
     rules = {rule["rawValue"]: rule["color"] for rule in _panel(layout, "Indicator")["rules"]}
-    assert rules.keys() == {"running", "time_limit"}
+    assert rules["running"] == rules["interrupted"] == "#4e98e2"
+    assert rules["time_limit"] == "#31b57b", "that is success in this sim"
+    assert rules["off_lane"] == rules["crash"] == "#d64545"
     actions = _panel(layout, "StateTransitions")
     assert (actions["xAxisRange"], actions["isSynced"]) == (20, False)
     assert layout["configById"]["3D!scene"]["followTf"] == "car"
@@ -286,8 +288,8 @@ def test_each_sim_has_its_own_camera_and_ranges(tmp_path: Path) -> None:
         "racer": 15,
     }
     depth = layouts["lane"]["configById"]["Image!depth"]
-    assert (depth["imageMode"]["minValue"], depth["imageMode"]["maxValue"]) == (3000, 57_000)
-    assert depth["foxglovePanelTitle"] == "depth, 3 to 57 m; black is nothing"
+    assert (depth["imageMode"]["minValue"], depth["imageMode"]["maxValue"]) == (3000, 56_000)
+    assert depth["foxglovePanelTitle"] == "depth, 3 to 56 m; black: nothing in range"
 
 
 @pytest.mark.parametrize("sim", [*SIMS, "CartPole-v1", "Pendulum-v1"])
@@ -300,7 +302,7 @@ def test_layouts_refer_to_paths_in_the_log(sim: str, tmp_path: Path) -> None:
     data = mcaprl.open(path)
     labels = series_of(check_layout(path))
     assert "reward" in labels
-    assert {"return so far", "return of episode"} & set(labels)
+    assert {"return so far", "return of each episode"} & set(labels)
     assert "episode" in labels
     assert set(data.observation_names[:24]) <= set(labels)
     assert set(data.action_names.values()) or "action[0]" in labels
@@ -356,7 +358,7 @@ def test_layout_without_a_scene() -> None:
         for panel in layout["configById"].values()
         for path in panel.get("paths", [])
     }
-    assert series["x"] == "/rl/step.observation[0]"
+    assert series["x"] == "/rl/step{final==false}.observation[0]"
     assert series["right"] == "/rl/step{action==1}{final==false}.action"
     assert series["Q"] == "/rl/values.q[:]"
     assert series["action"] == "/rl/step{final==false}.action"

@@ -1,0 +1,286 @@
+"""Layouts: every message path exists in the log, and every panel is large enough to read."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import mcaprl
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.record.layout import layout_of
+from mcaprl.recorder.record.panels import share_of_transitions
+from mcaprl.recorder.viewer.annotate import annotated_copy
+from mcaprl.recorder.viewer.log_layout import layout_of_log
+from mcaprl.recorder.viewer.prefix import side_by_side
+from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.pilots import make_pilot
+from tests.support.layouts import (
+    AREA_PX,
+    Topics,
+    check_layout,
+    check_panels,
+    paths_of,
+    series_of,
+    sizes_of,
+)
+
+SIMS: list[tuple[str, dict[str, Any]]] = [
+    ("lane", {}),
+    ("lane", {"observation": "rays"}),
+    ("lane", {"observation": "depth"}),
+    ("powerline", {}),
+    ("racer", {}),
+    ("highway-lane", {}),
+    ("CartPole-v1", {}),
+    ("Pendulum-v1", {}),
+]
+
+
+def recorded(path: Path, sim: str, steps: int = 3, **options: Any) -> Path:
+    """Record two short episodes of a sim, with its depth camera if it has one."""
+    env = make_sim(sim, **options)
+    camera = hasattr(env.unwrapped, "depth_image_m")
+    with closing(mcaprl.RecordMcap(env, path, camera=camera)) as recorder:
+        for seed in range(2):
+            recorder.reset(seed=seed)
+            for _ in range(steps):
+                recorder.step(env.action_space.sample())
+    return path
+
+
+def annotated(source: Path, out: Path, names: list[str]) -> Path:
+    """Add the outputs of policies, all zero."""
+    data = mcaprl.open(source)
+    actions = len(data.action_names)
+    with annotated_copy(source, out) as copy:
+        for name in names:
+            found = []
+            for episode in data.episodes:
+                zeros = np.zeros(episode.length, np.float32)
+                columns: dict[str, Any] = {
+                    name: np.zeros((episode.length, actions), np.float32)
+                    for name in ("q", "preference")
+                }
+                columns |= dict.fromkeys(("value", "advantage", "td_error", "entropy"), zeros)
+                columns |= {"policy_action": zeros.astype(np.int64), "agrees": zeros.astype(bool)}
+                found.append((episode, columns))
+            copy.add_values(name, found)
+    return out
+
+
+@pytest.mark.parametrize(("sim", "options"), SIMS)
+def test_paths_are_in_the_log(sim: str, options: dict[str, Any], tmp_path: Path) -> None:
+    path = recorded(tmp_path / "log.mcap", sim, **options)
+    attached = check_layout(path)
+    # A layout that is made from the log alone has the same panels.
+    again = layout_of_log(McapReader(path))
+    check_panels(again, Topics.of_log(path))
+    assert again["configById"].keys() == attached["configById"].keys()
+    screens = attached["configById"][attached["layout"]]["tabs"]
+    assert [tab["title"] for tab in screens] == ["Drive", "Learning", "Data"]
+
+
+@pytest.mark.parametrize("names", [["/rl/values"], ["/rl/values/a", "/rl/values/b"]])
+@pytest.mark.parametrize("sim", ["lane", "highway-lane", "CartPole-v1"])
+def test_paths_are_in_annotated_logs(sim: str, names: list[str], tmp_path: Path) -> None:
+    source = recorded(tmp_path / "log.mcap", sim)
+    path = annotated(source, tmp_path / "annotated.mcap", names)
+    panels = check_layout(path)["configById"]
+    rows = [row["label"] for row in panels["StateTransitions!actions"]["paths"]]
+    expected = {
+        1: ["action", "would take", "agrees"],
+        2: ["action", "a would take", "a agrees", "b would take", "b agrees"],
+    }
+    assert rows == expected[len(names)]
+    if sim == "lane":
+        constants = Topics.of_log(path).constants(names[0])
+        assert (constants["BRAKE"], constants["SLIGHTLY_LEFT"]) == (0, 5)
+
+
+@pytest.mark.parametrize("prefixes", [["a", "b"], ["1_lane", "2_lane"]])
+def test_paths_are_in_several_logs(prefixes: list[str], tmp_path: Path) -> None:
+    first = recorded(tmp_path / "a.mcap", "lane")
+    second = annotated(first, tmp_path / "b.mcap", ["/rl/values"])
+    both = side_by_side([layout_of_log(McapReader(path)) for path in (first, second)], prefixes)
+    logs = [Topics.of_log(*pair) for pair in zip((first, second), prefixes, strict=True)]
+    logs[0].names |= logs[1].names
+    logs[0].types |= logs[1].types
+    # Two logs need a window of 1600 pixels.
+    check_panels(both, logs[0], (1600, AREA_PX[1]))
+    a, b = prefixes
+    panels = both["configById"]
+    assert both["globalVariables"] == {f"{a}_episode": 0, f"{b}_episode": 0}
+    assert panels[f"GlobalVariableSliderPanel!{b} episode"]["globalVariableName"] == f"{b}_episode"
+    chosen = f"/{b}/rl/step{{episode==${b}_episode}}{{final==false}}.reward"
+    assert paths_of(panels[f"Plot!{b} episode"]) == [chosen]
+    hidden = panels[f"3D!{a} above"]["transforms"]
+    assert hidden.keys() == {"frame:map", f"frame:{a}/camera"}
+    screens = panels["Tab!screens"]["tabs"]
+    assert [tab["title"] for tab in screens] == ["Drive", "Learning", "Data"]
+    assert all(tab["layout"]["direction"] == "row" for tab in screens)
+
+
+def test_logs_with_other_layouts_are_shown_in_a_row(tmp_path: Path) -> None:
+    own = {"configById": {"Plot!x": {"paths": []}}, "layout": "Plot!x"}
+    path = recorded(tmp_path / "a.mcap", "CartPole-v1")
+    both = side_by_side([layout_of_log(McapReader(path)), own], ["a", "b"])
+    assert both["layout"]["first"] == "Tab!a screens"
+    assert both["layout"]["second"] == "Plot!b x"
+
+
+def test_sizes_are_shares_of_the_area() -> None:
+    panels: dict[str, Any] = {"Tab!x": {"tabs": [{"layout": "Plot!c"}]}, "Plot!a": {}, "Plot!c": {}}
+    tree = {"first": "Plot!a", "second": "Tab!x", "direction": "column", "splitPercentage": 25.0}
+    found = dict(sizes_of(tree, panels, (960, 600)))
+    # A quarter of 600 px; the other tab has a row of tabs of 30 px.
+    assert found == {"Plot!a": (960, 150), "Tab!x": (960, 450), "Plot!c": (960, 420)}
+    # One row of 64 px, and 60 px for the title and the axis, of 590 px.
+    assert share_of_transitions(1) == 124 / 590
+    assert share_of_transitions(9) == 0.45
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/nothing.data",
+        "/rl/step{final==false}.nothing",
+        "/rl/step{nothing==1}.reward",
+        "/rl/step{final==0}.reward",
+        "/rl/step{episode==$nothing}.reward",
+        "/rl/step.observation[4]",
+        "/rl/step.reward[0]",
+        "/rl/phase",
+    ],
+)
+def test_wrong_paths_are_found(path: str, tmp_path: Path) -> None:
+    topics = Topics.of_log(recorded(tmp_path / "log.mcap", "CartPole-v1"))
+    with pytest.raises(AssertionError):
+        topics.resolve(path, {"episode": 0})
+    assert topics.resolve("/rl/step{episode==$episode}.observation[3]", {"episode": 0}) == (
+        "float32",
+        False,
+    )
+
+
+@pytest.mark.parametrize("sim", ["lane", "powerline", "racer", "highway-lane"])
+def test_the_whole_track_is_in_view_from_above(sim: str) -> None:
+    """The view from above has the size of its panel; the pilot's positions are within it."""
+    env = make_sim(sim)
+    source: Any = env.unwrapped
+    metadata = LogMetadata.of_env(env)
+    topics = ["/scene", "/scene/static", "/scene/tracks"]
+    topics += ["/camera/depth"] if hasattr(source, "depth_image_m") else []
+    layout = layout_of(metadata, topics, ["speed_m_s", "offset_m"], "car")
+    sizes = dict(sizes_of(layout["layout"], layout["configById"], AREA_PX))
+    width_px, height_px = sizes["3D!above"]
+    camera = layout["configById"]["3D!above"]["cameraState"]
+    # The title bar is 30 px high.
+    half_m = camera["distance"] / 2 * np.array([width_px / (height_px - 30), 1.0])
+    pilot = make_pilot(env)
+    observation, _ = env.reset(seed=1)
+    is_over = False
+    while not is_over:
+        offset_m = np.array(source.frames()[0].position[:2]) - camera["targetOffset"][:2]
+        assert (np.abs(offset_m) < half_m).all()
+        observation, _, terminated, truncated, _ = env.step(pilot.act(observation[None])[0])
+        is_over = terminated or truncated
+
+
+def test_depth_fills_the_range_of_its_colors() -> None:
+    """The range of the colors is that of the depth, from the 1st to the 99th percentile."""
+    for sim in ("lane", "powerline"):
+        env = make_sim(sim)
+        source: Any = env.unwrapped
+        pilot, seen = make_pilot(env), []
+        for seed in range(2):
+            observation, _ = env.reset(seed=seed)
+            for _ in range(150):
+                observation, _, terminated, _, _ = env.step(pilot.act(observation[None])[0])
+                depth_m = source.depth_image_m()
+                seen.append(depth_m[depth_m < 65.5])
+                if terminated:
+                    break
+        low, high = np.percentile(np.concatenate(seen), [1, 99])
+        view = LogMetadata.of_env(env).view
+        assert view["depth_min_m"] == pytest.approx(low, abs=1.0), sim
+        assert view["depth_max_m"] == pytest.approx(high, abs=3.0), sim
+
+
+def test_old_logs_without_tracks_have_a_track_as_a_plot() -> None:
+    metadata = LogMetadata(spaces.Box(-1, 1, (2,)), spaces.Discrete(2))
+    old = layout_of(metadata, ["/scene", "/scene/static", "/tf"], ["x_m", "y_m"], "car")
+    plot = old["configById"]["Plot!track"]
+    assert plot["xAxisPath"]["value"] == "/tf.transforms[0].transform.translation.x"
+    assert series_of(old)["y"] == "/telemetry.y_m"
+    # The world is unknown: the view from above follows the vehicle.
+    above = old["configById"]["3D!above"]
+    assert (above["followTf"], above["followMode"]) == ("car", "follow-position")
+    assert above["cameraState"]["distance"] == 100
+
+
+def test_the_vehicle_is_marked_from_above(tmp_path: Path) -> None:
+    panels = check_layout(recorded(tmp_path / "log.mcap", "lane"))["configById"]
+    scale = panels["3D!above"]["scene"]["transforms"]["axisScale"]
+    # Axes of 0.2 m at a scale of 1: 3 % of the 300 m of the world are 9 m.
+    assert 0.2 * scale == pytest.approx(9.0)
+    assert panels["3D!scene"]["scene"]["transforms"]["axisScale"] == 0
+    assert panels["3D!above"]["topics"]["/scene"]["namespaces"] == {"speed": {"visible": False}}
+
+
+def test_failures_are_unknown_without_reasons_of_success(tmp_path: Path) -> None:
+    panels = check_layout(recorded(tmp_path / "log.mcap", "CartPole-v1"))["configById"]
+    light = panels["Indicator!state"]
+    assert {rule["color"] for rule in light["rules"]} == {light["fallbackColor"]} == {"#4e98e2"}
+    assert light["fallbackLabel"] == "ended"
+
+
+def test_steering_is_in_the_first_plot_of_highway_lane(tmp_path: Path) -> None:
+    panels = check_layout(recorded(tmp_path / "log.mcap", "highway-lane"))["configById"]
+    labels = [path["label"] for path in panels["Plot!drive"]["paths"]]
+    assert labels == ["lateral_offset_m", "steering_rad"]
+    assert panels["Plot!drive"]["legendDisplay"] == "left"
+    assert panels["Plot!reward"]["legendDisplay"] == "none"
+
+
+def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
+    class Pictures(gym.Env[Any, Any]):
+        observation_space = spaces.Dict(
+            {
+                "front": spaces.Box(0, 255, (8, 9, 3), np.uint8),
+                "speed": spaces.Box(0, 1, (1,), np.float32),
+            }
+        )
+        action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+            return self.observation_space.sample(), {}
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            return self.observation_space.sample(), 1.0, False, False, {}
+
+    path = tmp_path / "log.mcap"
+    with closing(mcaprl.RecordMcap(Pictures(), path)) as env:
+        env.reset(seed=0)
+        env.step(np.zeros(2, np.float32))
+    layout = check_layout(path)
+    images = [name for name in layout["configById"] if name.startswith("Image!")]
+    assert len(images) == 1
+    assert series_of(layout)["action[1]"] == "/rl/step{final==false}.action[1]"
+
+
+def test_view_settings_are_numbers_of_the_log(tmp_path: Path) -> None:
+    strings = LogMetadata(spaces.Discrete(2), spaces.Discrete(2)).to_strings()
+    view = '{"world_m": 80, "tilt_deg": "x", "distance_m": Infinity, "depth_min_m": true}'
+    found = LogMetadata.from_strings({**strings, "view": view}).view
+    assert found["world_m"] == 80.0
+    assert not {"tilt_deg", "distance_m"} & set(found)
+    assert LogMetadata.from_strings({**strings, "view": "{}"}).view == {}
+    del strings["view"]
+    assert LogMetadata.from_strings(strings).view == {}, "a log of an older version"
