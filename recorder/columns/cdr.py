@@ -105,9 +105,9 @@ class MessageType:
         return leaf_kinds(self._store, self.name)
 
     def leaf_dtype(self, path: str) -> np.dtype[Any]:
-        """Return the dtype of a leaf field; int64 for times, `object` for texts and messages."""
+        """Return the dtype of a leaf field; int64 for times, `object` for strings and lists."""
         kind = self.kinds.get(path, "").split("[")[0]
-        return np.dtype(np.int64 if kind == "time" else ROS_TO_NUMPY.get(kind, object))
+        return np.dtype("i8") if kind == "time" else np.dtype(ROS_TO_NUMPY.get(kind, object))
 
     def decode(self, data: bytes) -> Any:
         """Decode one message to an object with an attribute for each field.
@@ -162,7 +162,6 @@ class MessageType:
             case Nodetype.NAME if name is not None and what in TIME_TYPES:
                 walk.take_time(name, wanted)
             case Nodetype.NAME:
-                self._refuse(name)
                 # Names are composed only where a wanted path may be.
                 within = wanted if any(each.startswith(f"{path}.") for each in wanted) else ()
                 for inner, found in self._store.fielddefs[what][1]:
@@ -175,16 +174,13 @@ class MessageType:
                     walk.take(_number(element[1][0]), count, name)
                     return
                 if name is not None and element[0] == Nodetype.BASE:
-                    # Arrays of strings are decoded one by one.
+                    walk.take_texts(name, count)
+                    return
+                if name is not None:
+                    # Lists of messages are decoded one by one.
                     raise _NoLayout
-                self._refuse(name)
                 for _ in range(count):
                     self._pass(walk, element, path)
-
-    def _refuse(self, name: str | None) -> None:
-        """Raise LogError for a wanted field that is a message or a list of messages."""
-        if name is not None:
-            raise LogError(f"field {name} of {self.name} is not a number, array, string or time")
 
 
 class _Walk:
@@ -226,6 +222,22 @@ class _Walk:
         for number, (part, code) in enumerate(parts):
             if f"{name}.{part}" in wanted:
                 self._fields[f"{name}.{part}"] = (code, start + 4 * number)
+
+    def take_texts(self, name: str, count: int) -> None:
+        """Skip an array of strings; record it as one field with a part for each string."""
+        start, codes, offsets = self.position, [], []
+        for _ in range(count):
+            size = self.length()
+            codes.append(f"S{size}")
+            offsets.append(self.position - start)
+            self.take(codes[-1], 1, None, scalar=True)
+        parts: Any = {
+            "names": [str(number) for number in range(count)],
+            "formats": codes,
+            "offsets": offsets,
+            "itemsize": self.position - start,
+        }
+        self._fields[name] = (np.dtype(parts), start)
 
     def length(self) -> int:
         """Read the length of a string or sequence, and make it a constant of the layout."""

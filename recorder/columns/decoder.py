@@ -29,7 +29,7 @@ _MAX_LENGTHS = 16
 _MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]
-"""Arrays of one length by field name; strings are arrays of `str` objects."""
+"""Arrays of one length by field name; strings are `str` objects, arrays of strings are lists."""
 Rows = slice | NDArray[np.int64]
 """Rows of a column."""
 
@@ -142,8 +142,10 @@ class Decoder:
         if any(found[name].shape[1:] != column.shape[1:] for name, column in columns.items()):
             return False
         for name, column in columns.items():
-            if column.dtype.kind == "O":
+            if found[name].dtype.kind == "S":
                 column[rows] = self._texts(found[name])
+            elif column.dtype.kind == "O":
+                column[rows] = self._lists_of_texts(found[name])
             elif found[name].dtype.names:
                 column[rows] = _nanoseconds(found[name])
             else:
@@ -203,9 +205,15 @@ class Decoder:
                 f" {error}"
             ) from error
         return {
-            name: np.asarray(_value_at(message, name), self.type.leaf_dtype(name))
-            for name in wanted
+            name: _as_array(_value_at(message, name), self.type.leaf_dtype(name)) for name in wanted
         }
+
+    def _lists_of_texts(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return arrays of strings, which have a part for each string, as lists."""
+        texts = [self._texts(values[part]) for part in values.dtype.names or ()]
+        lists = np.empty(len(values), object)
+        lists[:] = [[text[row] for text in texts] for row in range(len(values))]
+        return lists
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
@@ -234,6 +242,15 @@ def _value_at(message: Any, path: str) -> Any:
         found = getattr(found, name)
     if getattr(found, "__msgtype__", "") in TIME_TYPES:
         return found.sec * 10**9 + found.nanosec
+    return found
+
+
+def _as_array(value: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a value as an array; a list of strings or messages as an array of one object."""
+    if not isinstance(value, list):
+        return np.asarray(value, dtype)
+    found = np.empty((), object)
+    found[()] = value
     return found
 
 

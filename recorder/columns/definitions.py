@@ -56,7 +56,9 @@ def store_of(name: str, text: str, encoding: str = "ros2msg", distribution: str 
                 what = "its definition" if each == name else f"the definition of nested type {each}"
                 raise LogError(f"{name}: {what} is missing and not known")
             types[each] = found
-            needed += [inner for field in found[1] for inner in _nested(field[1])]
+            for field, description in found[1]:
+                _refuse_wide(name, field, description)
+                needed += _nested(description)
     store = get_typestore(Stores.EMPTY)
     try:
         store.register({key: found for key, found in types.items() if key not in store.fielddefs})
@@ -116,6 +118,19 @@ def _parsed(name: str, text: str, encoding: str) -> dict[str, Any]:
     # The library raises errors of many types when a definition does not parse.
     except Exception as error:
         raise LogError(f"the definition of {name} does not parse: {error}") from error
+
+
+def _refuse_wide(name: str, field: str, description: Any) -> None:
+    kind, what = description
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        kind, what = what[0]
+    # `get_types_from_msg` takes the word for a message.
+    word = what[0] if kind == Nodetype.BASE else str(what).rpartition("/")[2]
+    if word == "wstring":
+        raise LogError(
+            f"{name}: field {field} is a wide string, whose encoding depends on the DDS of the"
+            " robot: record a string instead"
+        )
 
 
 def _nested(description: Any) -> list[str]:

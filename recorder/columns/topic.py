@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import CorruptLogError, LogError
+from mcaprl.errors import CorruptLogError, LogError, UnknownNameError
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.decoder import Columns, Decoder, Rows
 from mcaprl.recorder.columns.message_rows import MessageRange
@@ -106,7 +106,7 @@ class Topic:
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
-        """Dtypes of the fields; `object` for strings.
+        """Dtypes of the top-level fields; `object` for all but numbers, arrays and times.
 
         Raises:
             LogError: The channels of the topic have different types.
@@ -129,16 +129,20 @@ class Topic:
     ) -> Columns:
         """Read columns: `log_time` and the wanted fields.
 
+        A time or duration is an int64 in nanoseconds. Arrays of strings and of messages are lists.
+
         Args:
-            wanted: Names of fields, or dotted paths of nested ones.
+            wanted: Names of fields, or dotted paths of nested ones; `kinds` has all of them.
             order: Positions in `times` of the messages to read, by default all. Chunks without
                 such messages are not read.
             threads: Number of threads that decompress chunks and copy messages.
 
         Raises:
             CorruptLogError: A chunk is damaged, or a message does not fit its type.
-            LogError: The shape of a field is not the same in all messages.
+            LogError: The shape or type of a field is not the same in all messages.
+            UnknownNameError: The type has no such field, or the field is a message.
         """
+        self._check(wanted)
         selected = self._all() if order is None else self._select(order)
         first = next(selected, None)
         if first is None:
@@ -171,6 +175,18 @@ class Topic:
                         pool.shutdown(cancel_futures=True)
                         raise
         return {LOG_TIME: times, **columns}
+
+    def _check(self, wanted: Collection[str]) -> None:
+        """Check that all channels have the wanted fields, with equal dtypes."""
+        for decoder in self._decoders:
+            for name in wanted:
+                if name not in decoder.type.kinds:
+                    raise UnknownNameError(f"field of {self.name}", name, decoder.type.kinds)
+                if decoder.type.leaf_dtype(name) != self._decoders[0].type.leaf_dtype(name):
+                    raise LogError(
+                        f"{self._reader.path}: the channels of {self.name} have values of"
+                        f" different types in {name}"
+                    )
 
     def _all(self) -> Iterator[_Selected]:
         for (decoder, part), stop in zip(self.parts, self._stops.tolist(), strict=True):

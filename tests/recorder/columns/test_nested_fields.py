@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_typestore
 
-from mcaprl.errors import LogError
+from mcaprl.errors import UnknownNameError
 from mcaprl.recorder.columns.reader import McapReader
 from mcaprl.recorder.columns.topic import Topic
 
@@ -123,8 +123,13 @@ def test_leaves_of_a_nested_type(log: Path) -> None:
 
 
 def test_a_message_as_a_whole_is_no_column(log: Path) -> None:
-    with pytest.raises(LogError, match="field pose of nav_msgs/msg/Odometry is not a number"):
+    with pytest.raises(UnknownNameError, match="unknown field of /odometry 'pose'"):
         Topic(McapReader(log), "/odometry").read(["pose"])
+
+
+def test_unknown_fields_name_the_nearest(log: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"did you mean pose\.pose\.position\.x"):
+        Topic(McapReader(log), "/odometry").read(["pose.pose.positio.x"])
 
 
 def test_selected_rows_of_nested_fields(log: Path) -> None:
