@@ -205,6 +205,10 @@ class _FileBag:
         found = self._topic(topic)
         if found.info.problem:
             raise LogError(f"{topic} cannot be read: {found.info.problem}")
+        known = found.info.fields
+        for field in fields:
+            if known and field not in known and field != _PUBLISH_TIME:
+                raise UnknownNameError(f"field of {topic}", field, known)
         return found.read(fields, rows)
 
     def close(self) -> None:

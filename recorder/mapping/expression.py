@@ -121,6 +121,8 @@ class Expression:
         if not isinstance(node, allowed):
             raise self._refused(node)
         match node:
+            case ast.Name(id=name) if name in FUNCTIONS or name == NEXT:
+                raise UsageError(f"'{self.text}': {name} is a function: {name}(...)")
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
                 raise self._refused(node)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):

@@ -112,3 +112,8 @@ def test_missing_files_topics_and_types_are_clear_errors(tmp_path: Path) -> None
         pytest.raises(UnknownNameError, match=r"unknown topic '/odo'.*did you mean /odom"),
     ):
         bag.read("/odo", ["x"])
+    with (
+        closing(open_bag(tmp_path / "bag")) as bag,
+        pytest.raises(UnknownNameError, match="unknown field of /odom"),
+    ):
+        bag.read("/odom", ["twist.twist.linear.w"])

@@ -81,6 +81,8 @@ def test_values_by_hand(text: str, expected: list[float]) -> None:
         "pose",
         "'text'",
         "abs()",
+        "next",
+        "min + 1",
         "(" * 300 + "1" + ")" * 300,
         "+".join(["1"] * 3000),
         "-" * 200 + "1",
