@@ -188,7 +188,7 @@ class _Screens:
         follows = self.follow_frame and "world_m" not in view
         followed = (self.follow_frame, "follow-position") if follows else _STILL
         shown = dict.fromkeys(self._of(_STATIC, _TRACKS), _NONE)
-        title = "from above; tracks: yellow is the highest return, red marks are failures"
+        title = "from above; tracks: yellow is best, red marks are failures"
         panel = panels.three_d(
             title if _TRACKS in shown else "from above",
             {_SCENE: ["speed"], **shown},
@@ -242,10 +242,9 @@ class _Screens:
             rows.insert(1, [self._plot("drive", title, series.telemetry_series(watched))])
         elif observed := series.observation_series(self.metadata):
             rows.append([self._plot("drive", "observation", observed)])
-        transitions = self._actions()
-        share = panels.share_of_transitions(len(self.found[transitions]["paths"]))
+        actions, share = self._actions()
         sizes = [(panels.stack(row, "row"), (1 - share) / len(rows)) for row in rows]
-        return panels.weighted([*sizes, (transitions, share)], "column")
+        return panels.weighted([*sizes, (actions, share)], "column")
 
     def _gauge(self) -> list[Node]:
         if _SPEED not in self.telemetry:
@@ -268,19 +267,21 @@ class _Screens:
         panel = panels.indicator("state of the episode", f"{PHASE_TOPIC}.data", colors, other)
         return [self._put("Indicator!state", panel)]
 
-    def _actions(self) -> str:
-        """Add the actions of the last seconds, and those of the policies."""
-        rows = {"action": f"{series.STEPS}.action"} if self.metadata.action_names() else {}
+    def _actions(self) -> tuple[Node, float]:
+        """Add the actions of the last seconds, and those of the policies; return their share."""
+        title = f"actions of the last {_LAST_S} s"
+        if not self.metadata.action_names():
+            paths = series.action_series(self.metadata)
+            panel = panels.plot(title, paths, isSynced=False, followingViewWidth=_LAST_S)
+            return self._put("Plot!action", panel), 0.25
+        rows = {"action": f"{series.STEPS}.action"}
         for topic in self._values_topics():
             name = topic.removeprefix(VALUES_TOPIC).removeprefix("/")
             rows[f"{name} would take".strip()] = f"{topic}.policy_action"
             rows[f"{name} agrees".strip()] = f"{topic}.agrees"
-        panel = panels.state_transitions(
-            f"actions of the last {_LAST_S} s",
-            rows or {"episode": f"{series.STEPS}.episode"},
-            _LAST_S,
-        )
-        return self._put("StateTransitions!actions", panel)
+        panel = panels.state_transitions(title, rows, _LAST_S)
+        share = panels.share_of_transitions(len(rows))
+        return self._put("StateTransitions!actions", panel), share
 
     def _returns(self) -> list[tuple[Node, float]]:
         """Add the return of each episode, and an overview of the episodes."""

@@ -16,13 +16,14 @@ import pytest
 import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import UsageError
-from mcaprl.online.live import TRAINING_NAMES, LiveTraining
+from mcaprl.online.live import TRAINING_LABELS, TRAINING_NAMES, LiveTraining
 from mcaprl.online.task import Task
 from mcaprl.online.train import train
 from mcaprl.progress import TrainingProgress
 from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.schema import message_dtype
 from mcaprl.recorder.viewer.live_stream import Pace
+from tests.support.layouts import Topics, check_panels
 from tests.support.learner_topic import read_learner
 from tests.support.watcher import Watcher
 
@@ -199,6 +200,17 @@ def test_other_algorithms_and_environments(
     np.testing.assert_allclose(values["preference"].sum(1), 1.0, rtol=1e-5)
     assert ((values["entropy"] >= 0) & (values["entropy"] <= 1.0001)).all()
     assert ("/scene" in seen["topics"]) == (sim != "CartPole-v1")
+    schemas = {
+        topic: (found["schemaName"], found["schema"]) for topic, found in seen["topics"].items()
+    }
+    layout = json.loads((tmp_path / "run" / "foxglove-layout.json").read_text())
+    check_panels(layout, Topics(schemas))
+    # The metrics that one wants first have the first place.
+    first = [path["value"] for path in layout["configById"]["Plot!training"]["paths"]]
+    assert first == ["/rl/training.mean_return", "/rl/training.score"]
+    loss = layout["configById"]["Plot!loss"]["lichtblickPanelTitle"]
+    assert loss == TRAINING_LABELS["loss"] == "loss of the last update"
+    assert layout["configById"]["Tab!metrics"]["tabs"][0]["title"] == "mean q"
 
 
 def test_the_command_prints_the_url(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -249,6 +249,13 @@ def test_steering_is_in_the_first_plot_of_highway_lane(tmp_path: Path) -> None:
     assert panels["Plot!reward"]["legendDisplay"] == "none"
 
 
+def test_continuous_actions_are_plotted(tmp_path: Path) -> None:
+    panels = check_layout(recorded(tmp_path / "log.mcap", "Pendulum-v1"))["configById"]
+    assert paths_of(panels["Plot!action"]) == ["/rl/step{final==false}.action[0]"]
+    assert panels["Plot!action"]["followingViewWidth"] == 20
+    assert "StateTransitions!actions" not in panels
+
+
 def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
     class Pictures(gym.Env[Any, Any]):
         observation_space = spaces.Dict(
