@@ -56,10 +56,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the program and exit.
 
     Args:
-        arguments: Command-line arguments; None for those of the process.
+        arguments: Command-line arguments; default: `sys.argv[1:]`.
     """
-    # On SIGTERM and SIGHUP, a recording closes its file as on Ctrl-C. SIGHUP stays ignored under
-    # nohup.
+    # SIGTERM and SIGHUP act like Ctrl-C, so that a recording closes its file. Under nohup, SIGHUP
+    # stays ignored.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
         signal.signal(signal.SIGHUP, signal.default_int_handler)
@@ -101,7 +101,7 @@ def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def _on_thread_error(arguments: threading.ExceptHookArgs) -> None:
-    """Print the error of a thread, unless it is that of a write."""
-    # TensorBoard raises the OSError of its thread again in the thread that trains.
+    """Print an exception raised in a thread, unless it is an OSError."""
+    # An OSError comes from TensorBoard's writer, which raises it again in the training thread.
     if not issubclass(arguments.exc_type, OSError):
         threading.__excepthook__(arguments)

@@ -1,4 +1,4 @@
-"""`mcaprl evaluate`: returns of policies with intervals, in a sim or estimated from logs."""
+"""`mcaprl evaluate`: returns of policies, measured in a sim or estimated from logs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads", "mapping", "trust_code")
 @click.command()
 @click.argument("policies", nargs=-1, required=True, metavar="POLICY...")
 @click.option("--sim", help="lane, powerline, racer, highway-lane, or any Gymnasium id.")
-@click.option("--data", help="Logs to estimate from, without a sim.")
+@click.option("--data", help="Logs to estimate returns from, instead of --sim.")
 @integer_option(
     "--episodes", "Number of episodes for each policy and training seed.", least=1, default=30
 )
@@ -71,13 +71,13 @@ def evaluate(
     """Evaluate each POLICY on the same episodes of SIM, or estimate its return from logs.
 
     POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
-    Scores are normalized to random = 0 and pilot = 1 if the sim has a pilot. Without a sim, values
-    are estimates of discounted returns, each with a verdict on whether the logs suffice.
+    If the sim has a pilot, scores are normalized so that random scores 0 and pilot 1. With --data,
+    discounted returns are estimated, and a verdict says whether the logs suffice for the estimate.
     """
     given = {name: value for name, value in others.items() if value}
     if data is not None and sim is None:
         _refuse_unused(given, [name for name in others if name not in _OF_DATA], "sim")
-        # 0 is a valid value of these options.
+        # Compare with None, because 0 is a valid value of these options.
         given = {name: others[name] for name in _OF_DATA if others[name] is not None}
         estimates = mcaprl.estimate(policies, data, seed=seed, progress=terminal_bar, **given)
         print_json(estimates.to_json()) if as_json else _print_estimates(estimates)

@@ -13,14 +13,13 @@ F = TypeVar("F", bound=Callable[..., Any])
 trust_option = click.option(
     "--trust-env",
     is_flag=True,
-    help="Trust in FILE: import the module in its environment's id, and pass on all arguments.",
+    help="Trust FILE: import the module that its environment id names, and pass on all arguments.",
 )
 origin_option = click.option(
     "--allow-origin",
     multiple=True,
     metavar="ORIGIN",
-    help="Another web page that may connect, such as https://viewer.example; may be given"
-    " repeatedly.",
+    help="Allow another web page to connect, such as https://viewer.example; may be repeated.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 
@@ -30,7 +29,7 @@ def mapping_options(command: F) -> F:
     code = click.option(
         "--trust-code",
         is_flag=True,
-        help="Trust in the mapping: import the Python function that it names.",
+        help="Trust the mapping: import the Python function that it names.",
     )
     return click.option(
         "--mapping",
@@ -50,6 +49,6 @@ def sim_options(command: F) -> F:
 def integer_option(
     name: str, help: str, *, least: int, most: int | None = None, default: int | None = None
 ) -> Callable[[F], F]:
-    """Return an option of an integer from `least` to `most`, which is `least` by default."""
+    """Return an option for an integer from `least` to `most`; without `default`, it is `least`."""
     default, kind = least if default is None else default, click.IntRange(least, most)
     return click.option(name, default=default, show_default=True, type=kind, help=help)

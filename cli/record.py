@@ -1,4 +1,4 @@
-"""`mcaprl record`: logs of a policy in a sim."""
+"""`mcaprl record`: record a policy in a sim."""
 
 from __future__ import annotations
 

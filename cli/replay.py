@@ -1,4 +1,4 @@
-"""`mcaprl replay`: logged episodes in Foxglove, as a video, or compared with the sim."""
+"""`mcaprl replay`: show logged episodes in Foxglove or as a video, or compare them with the sim."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _print_open(address: LiveAddress) -> None:
 
 
 def _verify(path: Path, episode: int | None, sim: str | None, trust_env: bool) -> bool:
-    """Compare one file with the sim, and print the result; return whether all is the same."""
+    """Compare one file with the sim, print the result, and return whether all steps match."""
     found = mcaprl.verify(
         path, episode=episode, sim=sim, trust_env=trust_env, progress=terminal_bar
     )

@@ -1,4 +1,4 @@
-"""Command-line options from the fields of the settings of algorithms."""
+"""Command-line options for the settings of algorithms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mcaprl.settings import Settings, field_help, flag
 
 
 class SettingsCommand(click.Command):
-    """Command with an option for each setting of the algorithms, which are loaded when needed."""
+    """Command with an option for each algorithm setting; algorithms are loaded when needed."""
 
     def __init__(
         self,
@@ -25,7 +25,7 @@ class SettingsCommand(click.Command):
         Args:
             *arguments: Arguments of `click.Command`.
             configs: Function that loads the algorithms and returns their default settings.
-            tuned: Function that returns, by sim, the settings that differ from the defaults.
+            tuned: Function that returns, for each sim, the settings that differ from the defaults.
             **others: Arguments of `click.Command`.
         """
         super().__init__(*arguments, **others)
@@ -39,7 +39,7 @@ class SettingsCommand(click.Command):
 def setting_options(
     configs: Iterable[Settings], tuned: Mapping[str, Mapping[str, Any]]
 ) -> list[click.Option]:
-    """Return an option for each field of several algorithms' settings.
+    """Return one option for each field of the given settings.
 
     Help and default come from the first algorithm that has the field. An omitted option is None,
     so that the default of the algorithm, or of the sim, is used.

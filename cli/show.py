@@ -22,13 +22,13 @@ _PIPE_WIDTH = 120
 
 
 def echo(text: object, *, err: bool = False) -> None:
-    """Print a line to stdout or stderr; texts from data cannot control the terminal."""
+    """Print a line to stdout or stderr, with control characters escaped."""
     click.echo(printable(text).replace("\n", r"\n"), err=err)
 
 
 def print_json(value: Any) -> None:
     """Print one JSON object to stdout; NaN and infinities become null."""
-    # JSON need not escape this control character.
+    # JSON allows DEL unescaped, but terminals treat it as a control character.
     click.echo(json_text(value).replace("\x7f", r"\u007f"))
 
 

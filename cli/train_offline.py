@@ -1,4 +1,4 @@
-"""`mcaprl train-offline` and `export`: policies from logs, and as one file for a robot."""
+"""`mcaprl train-offline` and `export`: train a policy on logs, and export it for a robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _configs() -> list[Settings]:
 @click.option("--out", required=True, type=click.Path(path_type=Path), help="Run folder to create.")
 @click.option(
     "--algo",
-    help="dqn, double-dqn, cql, bc, bcq, iql, or one of an installed package.  [default: cql]",
+    help="dqn, double-dqn, cql, bc, bcq, iql, or one from another package.  [default: cql]",
 )
 @integer_option("--seeds", "Number of networks to train.", least=1)
 @integer_option("--seed", "Seed of the first network; network k uses seed + k.", least=0)
@@ -40,7 +40,7 @@ def _configs() -> list[Settings]:
     "--device",
     default="cpu",
     show_default=True,
-    help="Device of the data and networks: cpu or cuda.",
+    help="Device that holds the data and networks: cpu or cuda.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")

@@ -1,4 +1,4 @@
-"""`mcaprl train-online`: training of policies in a sim."""
+"""`mcaprl train-online`: train a policy in a sim."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def _tuned() -> dict[str, dict[str, Any]]:
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
-    help="Log of all transitions; with several seeds, a folder.",
+    help="Log to write with all transitions; with several seeds, a folder of logs.",
 )
 @click.option(
     "--from",
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Logs for the replay buffer, or a policy that initializes the agents (each seed of a"
-    " run one agent); may be given twice.",
+    help="Logs to put into the replay buffer, or a policy that initializes the agents (one seed of"
+    " a run per agent); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
@@ -77,9 +77,9 @@ def train_online(sim: str | None, out: Path, **request: Any) -> None:
     """Train a policy in SIM: lane, powerline, racer, highway-lane, or any Gymnasium id.
 
     Omitted settings default to those of the preset, else those tuned for SIM, else those of
-    Stable-Baselines3; with --resume, to those of the run. The defaults of sims are those of dqn and
-    double-dqn with default rules and without images. The best checkpoint is kept; it is
-    selected on some episodes and scored on others.
+    Stable-Baselines3; with --resume, to those of the run. Settings are tuned only for dqn and
+    double-dqn with default rules and without images. The best checkpoint is kept: it is selected
+    on one set of episodes and scored on another.
     """
     given = {name: value for name, value in request.items() if value is not None}
     with terminal_progress("steps", "score") as progress:

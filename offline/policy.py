@@ -58,7 +58,7 @@ class Scores(nn.Module):
         self.threshold = threshold
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
-        """Return values or logits (B, A), minus infinity for actions that are not allowed."""
+        """Return values or logits (B, A), with minus infinity for actions that are not allowed."""
         outputs = mean_values(self.networks[name](observations))
         return allowed_only(outputs, observations.mask)
 
@@ -106,7 +106,7 @@ class Policy:
         self._seen.clear()
 
     def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the best actions (B,), values of `action_space`; ties go to the lowest.
+        """Return the best actions (B,) in `action_space`; a tie selects the lowest action.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since `begin`.
         It also accepts (B, k, *shape), oldest first, and then stores nothing.
@@ -172,7 +172,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations and return the stack that ends with them, padded with the first."""
+        """Store observations; return the stack that ends with them, padded with the first ones."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
@@ -237,7 +237,7 @@ def read_policy(folder: Path) -> Policy:
         return _build(folder, description, read_tensors(folder / _WEIGHTS_NAME)[0])
     except FileNotFoundError as error:
         raise PolicyError(
-            f"{folder} has no policy: no {POLICY_NAME} and {_WEIGHTS_NAME}; "
+            f"{folder} has no policy: {POLICY_NAME} or {_WEIGHTS_NAME} is missing; "
             "training writes them with its first checkpoint"
         ) from error
     except (OSError, SafetensorError, *_BAD_CONTENT) as error:
@@ -292,7 +292,7 @@ def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> 
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()
     if shift.shape != image.shape:
-        raise ValueError(f"the mean image has shape {shift.shape}, images have {image.shape}")
+        raise ValueError(f"the mean image is {shift.shape}, but images are {image.shape}")
     return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
 
 

@@ -73,7 +73,7 @@ class Agent:
             seed: Seed of the agent.
             scale: Scale of scores.
             record: Log to write; None records neither training nor evaluations.
-            resume: Whether to resume from the folder's checkpoint and append to the log, where they
+            resume: Whether to resume from the folder's checkpoint and append to the log, if they
                 exist.
             live: Live view of the training.
 
@@ -203,7 +203,7 @@ class Agent:
     def _load(self, evaluation: Evaluation) -> None:
         extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
         if best:
-            # An evaluation after the checkpoint is repeated; its file may exist.
+            # Evaluations after the checkpoint are repeated, so this file may exist.
             write_atomically(self._folder / BEST_NAME, best, TrainingError)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:

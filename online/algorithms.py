@@ -110,7 +110,7 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
 
 
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return SB3's arguments; for images and stacks, the buffer stores each frame once."""
+    """Return arguments for SB3; with images or stacks, the buffer stores each frame once."""
     arguments = config.arguments()
     if isinstance(config, DQNConfig) and (config.frame_stack > 1 or _has_images(space)):
         extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
@@ -125,7 +125,7 @@ def _has_images(space: spaces.Space[Any]) -> bool:
 
 @dataclass(frozen=True)
 class ExponentialSchedule:
-    """Exponential decay per step down to `last`, as a function of the remaining progress."""
+    """Schedule that decays exponentially to `last` with SB3's remaining progress."""
 
     first: float
     last: float
@@ -133,7 +133,7 @@ class ExponentialSchedule:
     steps: int
 
     def __call__(self, remaining: float) -> float:
-        """Return the value when this fraction of the steps remains, from 1 to 0."""
+        """Return the value for a remaining fraction of the steps, from 1 (start) to 0 (end)."""
         return max(self.last, self.first * float(self.factor ** ((1 - remaining) * self.steps)))
 
 

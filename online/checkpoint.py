@@ -1,9 +1,9 @@
 """Checkpoints from which a killed run resumes.
 
-`checkpoint.safetensors` contains weights, target network, optimizer, replay buffer and generators,
-and in its header the counters, the curve so far and the task. All are in one file, because a kill
-between two writes would leave them inconsistent. Environments start new episodes, because Gymnasium
-has no interface for their state.
+`checkpoint.safetensors` contains weights, target network, optimizer, replay buffer and generators.
+Its header contains the counters, the curve so far and the task. All are in one file, because a kill
+between two writes would leave them inconsistent. A resumed run starts new episodes, because
+Gymnasium has no interface for the state of an environment.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _load_buffer(model: BaseAlgorithm, tensors: dict[str, Tensor]) -> None:
 
 
 def _generators(model: BaseAlgorithm) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return the states of the random generators: tensors, and plain JSON values."""
+    """Return the states of the random generators, as tensors and as JSON values."""
     state = _NUMPY_RANDOM.get_bit_generator().state
     version, words, next_gauss = random.getstate()
     tensors = {

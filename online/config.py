@@ -104,7 +104,7 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # Never reached: episodes are counted instead.
+            # SB3 never reaches this interval; a callback updates the network after episodes.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.

@@ -36,7 +36,7 @@ class CurvePoint:
     Attributes:
         step: Number of finished environment steps.
         mean_return: Mean return of the evaluation's episodes.
-        score: Mean return on the scale random = 0, pilot = 1; NaN without a pilot.
+        score: Mean return, scaled so that random is 0 and pilot is 1; NaN without a pilot.
         lowest_return: Lowest return of an episode.
         highest_return: Highest return of an episode.
         mean_length: Mean number of steps of an episode.
@@ -62,7 +62,7 @@ class RunCurve:
     Attributes:
         name: Name of the run folder.
         seeds: Columns of each seed's curve.
-        finals: Scores of the seeds' best checkpoints on new episodes, where known.
+        finals: Scores of the best checkpoint of each seed on new episodes, if known.
     """
 
     name: str
@@ -94,13 +94,13 @@ def read_run(folder: Path) -> RunCurve:
 def draw_curves(path: Path, runs: Sequence[RunCurve], title: str, value: str | None = None) -> None:
     """Draw curves of runs: each seed, the median over the seeds, and their range.
 
-    Dots to the right of score curves are the best checkpoints on new episodes.
+    Dots to the right of score curves are scores of the best checkpoints on new episodes.
 
     Args:
         path: PNG file to write.
         runs: Runs to compare.
         title: Title of the image.
-        value: Key of `VALUES`; None selects the score where there is one, else the mean return.
+        value: Key of `VALUES`; None selects the score if it is known, else the mean return.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

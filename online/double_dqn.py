@@ -2,8 +2,8 @@
 
     https://arxiv.org/abs/1509.06461    target r + gamma Q'(s', argmax_a Q(s', a))
 
-With `n_steps` n the target is the sum of n discounted rewards plus gamma^n times that value; SB3's
-replay buffer returns both, with fewer steps where the episode ends earlier.
+With `n_steps` n, the target is the sum of n discounted rewards plus gamma^n times that value. SB3's
+replay buffer returns the sum and gamma^n; n is smaller if the episode ends earlier.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ class WarmDQN(DQN):
     """SB3's DQN with an option for pretrained weights.
 
     Attributes:
-        skips_random_steps: Whether the policy, instead of random actions, fills the buffer before
-            learning starts. Learning from too few steps destroys the pretraining
+        skips_random_steps: Whether the policy fills the buffer before learning starts, instead of
+            random actions. Learning from too few steps destroys the pretraining
             (https://arxiv.org/abs/2412.07762).
     """
 

@@ -1,4 +1,4 @@
-"""Evaluation during training, in a separate environment, on the scale random = 0, pilot = 1."""
+"""Evaluation during training in separate environments; random scores 0, and the pilot 1."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Scale:
 
     Attributes:
         random: Mean return of random actions.
-        pilot: Mean return of the pilot; NaN where the sim has none.
+        pilot: Mean return of the pilot; NaN if the sim has no pilot.
     """
 
     random: float
@@ -195,7 +195,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         return result
 
     def dataset(self) -> Dataset:
-        """Return the episodes by environment, with behavior probability 1 (greedy policy)."""
+        """Return the episodes, ordered by environment; behavior probabilities are 1 (greedy)."""
         environments = np.concatenate([step.environments for step in self._steps])
         order = np.argsort(environments, kind="stable")
         columns = {
@@ -212,7 +212,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _rows(values: Any, numbers: NDArray[np.int64]) -> Any:
-    """Return a copy of rows of an array, or of each array in a dict."""
+    """Copy the numbered rows of an array, or of each array in a dict."""
     if isinstance(values, dict):
         return {key: _rows(part, numbers) for key, part in values.items()}
     return values[numbers]

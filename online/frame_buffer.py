@@ -1,9 +1,9 @@
 """Replay buffer that stores each image once, with n-step returns for any observations.
 
 SB3's buffers store every observation twice, as the next observation of one step and the observation
-of the following step: 7 GB for 500,000 depth images of 84x84. Here the next observation is that of
-the following row; only the last observation of an episode is stored separately. Each frame of
-stacked observations is also stored once.
+of the following step: 7 GB for 500,000 depth images of 84x84. Here, the next observation is read
+from the following row, and only the last observation of an episode is stored separately. Each frame
+of stacked observations is also stored once.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class FrameReplayBuffer(BaseBuffer):
         return columns
 
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
-        """Restore the contents that `columns` returned, after `pos` and `full` are set."""
+        """Restore the contents that `columns` returned; set `pos` and `full` before this call."""
         rows = self.size()
         for name in _COLUMNS:
             getattr(self, name)[:rows] = columns[name]
@@ -144,7 +144,7 @@ class FrameReplayBuffer(BaseBuffer):
         self._free = sorted(set(range(slots)) - set(self.final_of[self.final_of >= 0].tolist()))
 
     def _free_slot(self) -> int:
-        """Return a free index of `finals`, whose length doubles if there is none."""
+        """Return a free index of `finals`; if there is none, double the length first."""
         if not self._free:
             count = len(next(iter(self.finals.values())))
             self.finals = {
@@ -155,7 +155,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._free.pop()
 
     def _get_samples(self, batch_inds: NDArray[Any], env: VecNormalize | None = None) -> Any:
-        """Return one transition per row index; SB3's generator draws the environment of each."""
+        """Return one transition per row index, from a randomly drawn environment."""
         assert env is None
         envs = np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
         rows, returns, discounts = self._look_ahead(batch_inds, envs)
@@ -175,7 +175,7 @@ class FrameReplayBuffer(BaseBuffer):
     def _look_ahead(
         self, rows: NDArray[Any], envs: NDArray[Any]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-        """Sum n rewards, or fewer where the episode or the buffer ends earlier.
+        """Sum n rewards, or fewer if the episode or the buffer ends earlier.
 
         Returns:
             Last row of each sum, the sum, and gamma to the power of the number of rewards.
@@ -191,14 +191,14 @@ class FrameReplayBuffer(BaseBuffer):
         return ahead[np.arange(len(rows)), last], returns, discounts
 
     def _stacks(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return the observations before the steps of rows."""
+        """Return the observations before the steps in these rows."""
         if self.frame_stack == 1:
             return {key: part[rows, envs] for key, part in self.frames.items()}
         places = self._places(rows, envs, np.arange(self.frame_stack)[::-1])
         return self._joined({key: part[places, envs[:, None]] for key, part in self.frames.items()})
 
     def _following(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return the observations after the steps of rows."""
+        """Return the observations after the steps in these rows."""
         following = self._frames_after(rows, envs)
         if self.frame_stack == 1:
             return following
@@ -210,7 +210,7 @@ class FrameReplayBuffer(BaseBuffer):
         return self._joined(stacks)
 
     def _frames_after(self, rows: NDArray[Any], envs: NDArray[Any]) -> dict[str, NDArray[Any]]:
-        """Return the frames after the steps of rows."""
+        """Return the frames after the steps in these rows."""
         slots = self.final_of[rows, envs]
         ended = slots >= 0
         newest = ~ended & (rows == (self.pos - 1) % self.buffer_size)
@@ -232,7 +232,7 @@ class FrameReplayBuffer(BaseBuffer):
         return places % self.buffer_size
 
     def _ages_after(self, row: int) -> NDArray[np.int64]:
-        """Return the numbers of earlier frames in the episode for the frame after a row."""
+        """Return the ages (N,) of the frames that follow a row; see `ages`."""
         if not self.size():
             return np.zeros(self.n_envs, np.int64)
         ages = np.minimum(self.ages[row] + 1, self.frame_stack)

@@ -1,6 +1,6 @@
 """Frame stacking: several successive observations as one, for example to show velocities.
 
-The order is oldest first, along the channels of images and along the last axis of other arrays, as
+Frames are joined oldest first, along the channels of images and the last axis of other arrays, as
 in `offline/`. Frames before an episode's first observation are copies of that observation.
 """
 
@@ -53,7 +53,7 @@ def stacked_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
 
 
 def joined(frames: Any, space: spaces.Space[Any]) -> Any:
-    """Join the frames of each row to one observation.
+    """Join the frames of each row into one observation.
 
     Args:
         frames: Arrays (B, k, *shape), oldest first, or a dict of such arrays.
@@ -97,7 +97,7 @@ class FrameMemory:
         return self.stacked()
 
     def begin_one(self, row: int) -> None:
-        """Start a new episode in a row, with the row's last observation."""
+        """Start a new episode in a row; the newest observation of the row is its first."""
         for part in self.frames.values():
             part[row] = part[row, -1:]
 

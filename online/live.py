@@ -50,7 +50,7 @@ WATCHED = 0
 
 
 class LiveTraining:
-    """Live view of a run, for one seed after the other."""
+    """Live view of a run; it shows one seed after the other."""
 
     def __init__(
         self,
@@ -102,9 +102,9 @@ class LiveTraining:
             self.stream.close()
 
     def _source_of(self, batch: Any) -> Callable[[int | None], object]:
-        """Return a function that returns an environment with the scene of the watched one.
+        """Return a function that provides an environment with the scene of the watched one.
 
-        Its argument is the last action of the watched environment; None after a reset.
+        The function takes the last action of the watched environment; None after a reset.
         """
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
@@ -246,7 +246,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
-    """Return the learner's values in the watched environment: fields of `values_schema`."""
+    """Return the learner's values in the watched environment, as fields of `values_schema`."""
     observation = _row(model._last_obs, slice(WATCHED, WATCHED + 1))
     tensor: Any = model.policy.obs_to_tensor(observation)[0]
     start = int(cast(spaces.Discrete, model.action_space).start)

@@ -58,7 +58,7 @@ class OnlinePolicy:
     Attributes:
         name: Name of the file, or of the folders of the run and the seed.
         algo: Name of the algorithm that trained it.
-        observation_space: Space of one observation; None where the file has no bounds.
+        observation_space: Space of one observation; None if the file lacks its bounds.
         action_space: Space of one action.
         env_id: Gymnasium id of the training environment; empty if unknown.
         env_kwargs: Arguments of that environment.
@@ -82,7 +82,7 @@ class OnlinePolicy:
             self._memory.frames = {}
 
     def act(self, observations: Any) -> NDArray[np.int64]:
-        """Return the best actions (B,), values of `action_space`.
+        """Return the best actions (B,) in `action_space`.
 
         A policy with `frame_stack` k > 1 stores the observations of the last k calls since
         `begin`.
@@ -106,7 +106,7 @@ class OnlinePolicy:
         return cast(NDArray[np.float32], self._tried(self._outputs, observations))
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """Return the probabilities (B, A) of all actions; 1 for the best action of a Q-network.
+        """Return the probabilities (B, A) of all actions; a Q-network's best action has 1.
 
         Args:
             observations: Observations as for `q_values`.
@@ -122,7 +122,7 @@ class OnlinePolicy:
         return probabilities
 
     def _predicted(self, observations: Any, deterministic: bool) -> Any:
-        """Return the best actions for the stored observations and these."""
+        """Return the actions that the network selects for these and the stored observations."""
         memory = self._memory
         if memory is not None:
             seen, now = (
@@ -133,7 +133,7 @@ class OnlinePolicy:
         return self.network.predict(observations, deterministic=deterministic)
 
     def _outputs(self, observations: Any, deterministic: bool) -> NDArray[np.float32]:
-        """Return Q-values, or probabilities."""
+        """Return the Q-values or probabilities of all actions."""
         if self._memory is not None:
             observations = joined(observations, self._memory.space)
         tensor = self.network.obs_to_tensor(observations)[0]

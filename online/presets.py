@@ -1,8 +1,8 @@
 """Settings of each preset and of each sim.
 
-Presets are published settings, unchanged, for the sims with their published rules: images or rays,
-one environment, classic rules. The presets also reproduce
-faults of the published programs; docs/online.md lists these faults.
+A preset contains published settings without changes, for a sim with the published rules: images or
+rays, one environment, classic rules. Presets also reproduce faults of the published programs, which
+docs/online.md lists.
 
     autonomysim-car, autonomysim-drone      https://github.com/nervosys/AutonomySim
     ddqn-racer                              Double DQN on a ray-cast track
@@ -153,7 +153,7 @@ def find_preset(name: str) -> Preset:
 
 
 def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a sim; empty for other environments, classic rules or images.
+    """Return the tuned settings of a sim; for other environments, classic rules or images, none.
 
     Args:
         config_type: Type of the algorithm's settings; only algorithms with `n_steps` and

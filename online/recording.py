@@ -129,7 +129,7 @@ class ActionDescriber:
 
 
 def exploration(model: BaseAlgorithm) -> float:
-    """Return epsilon of the next step; NaN where the policy is stochastic."""
+    """Return epsilon of the next step; NaN if the policy is stochastic."""
     if not isinstance(model, DQN):
         return math.nan
     at_random = model.num_timesteps < model.learning_starts

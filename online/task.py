@@ -143,7 +143,7 @@ def choose_task(
     Raises:
         UnknownNameError: There is no such algorithm or preset.
         UsageError: No sim is given, or the arguments contradict the preset.
-        TrainingError: The arguments contradict the run, or the folder holds none.
+        TrainingError: The arguments contradict the run, or the folder contains no run.
     """
     if resumed is not None and run_to_resume(resumed):
         task = Task.of_run(resumed, **given)

@@ -46,8 +46,8 @@ class OnlineSummary(RunSummary):
     Attributes:
         best_step: Number of environment steps before the best checkpoint.
         mean_return: Mean return of the best checkpoint on new episodes.
-        score: Mean return on the scale random = 0, pilot = 1; NaN without a pilot.
-        ends: Number of these episodes for each reason of their end.
+        score: Mean return, scaled so that random is 0 and pilot is 1; NaN without a pilot.
+        ends: Number of these episodes by the reason for their end.
     """
 
     best_step: int
@@ -76,7 +76,7 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of agents to train, one after the other.
         seed: Seed of the first agent; agent k uses seed + k.
-        record: Log of every transition, written during training; a folder for several seeds.
+        record: Log of every transition, written during training; with several seeds, a folder.
         data: Logged transitions that initialize the replay buffer.
         policy: Trained policy with Q-values whose weights initialize the agents, or a list with one
             policy for each seed.
@@ -92,8 +92,8 @@ def train(
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
-        TrainingError: `out` cannot be written, is being written by another training, or has a run
-            of another task; or it has no run to resume.
+        TrainingError: `out` cannot be written, is being written by another training, or contains a
+            run of another task; or there is no run to resume.
     """
     if seeds < 1 or seed < 0:
         raise UsageError(f"seeds must be at least 1 and seed at least 0, got {seeds} and {seed}")

@@ -23,9 +23,9 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 class BatchedVecEnv(VecEnv):
     """A `gymnasium.vector.VectorEnv` with SB3's interface.
 
-    At an episode's end `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
-    `TimeLimit.truncated`, and under `episode` those of SB3's `Monitor`; also `reason` and
-    `progress_m` where the environment reports them. At other steps the dicts are empty.
+    At an episode's end, `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
+    `TimeLimit.truncated`, and `episode` with the entries of SB3's `Monitor`. It also contains
+    `reason` and `progress_m` if the environment reports them. At other steps, the dicts are empty.
 
     Attributes:
         before_step: Callback with the actions (N,) before each step.
@@ -49,7 +49,7 @@ class BatchedVecEnv(VecEnv):
         self._began_s = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of environment i for its next reset: the seed of episode i in `rollout`."""
+        """Seed the next reset of environment i with the seed of episode i in `rollout`."""
         if seed is not None:
             self._seeds = [episode_seed(seed, i) for i in range(self.num_envs)]
         return self._seeds
@@ -103,7 +103,7 @@ class BatchedVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the batch, once for each of the environments."""
+        """Return an attribute of the batch, repeated for each environment."""
         return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:

@@ -77,13 +77,13 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
 
     Args:
         model: Fresh model.
-        policy: Policy with the attributes `name` and `q_values`, and one that is its network.
+        policy: Policy with the attributes `name` and `q_values`, and with a network.
         space: Space of a single observation, sampled to verify that both networks produce the
             same values.
 
     Raises:
         UsageError: The algorithm has no Q-network.
-        PolicyError: The policy has no Q-network, or one of another architecture.
+        PolicyError: The policy has no Q-network, or its Q-network has another architecture.
     """
     if not isinstance(model, DQN):
         raise UsageError(f"{type(model).__name__} has no Q-values to copy from a policy")
@@ -100,7 +100,8 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
     own = [tuple(layer.weight.shape) for layer in ours]
     if shapes != own:
         raise PolicyError(
-            f"{policy.name} has layers {_chain(shapes)}, the agent has {_chain(own)}: pass --hidden"
+            f"{policy.name} has layers {_chain(shapes)}, but the agent has {_chain(own)}:"
+            " pass --hidden"
         )
     for source, target in zip(theirs, ours, strict=True):
         target.load_state_dict(source.state_dict())
@@ -135,7 +136,7 @@ def _check_space(role: str, space: spaces.Space[Any], model: BaseAlgorithm) -> N
 
 
 def _channels_first(values: Any, space: spaces.Space[Any]) -> Any:
-    """Transpose images (N, height, width, channels) for SB3's networks; pass on other values."""
+    """Transpose images (N, height, width, channels) for SB3; return other values unchanged."""
     if isinstance(space, spaces.Dict):
         return {key: _channels_first(values[key], part) for key, part in space.items()}
     if is_image_space(space) and channels_first(space) != space:

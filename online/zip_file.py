@@ -1,7 +1,7 @@
 """Stable-Baselines3's `.zip` files: written for plain SB3, read without executing code from them.
 
 SB3 writes an algorithm as a zip of `data` (JSON in which some values are pickled), `policy.pth`
-(weights) and more. Its own loader unpickles; this one reads only the plain values and the weights.
+(weights) and more. SB3's loader unpickles; this module reads only the plain values and the weights.
 Files of this package also contain `mcaprl.json`, a full description of the policy, which SB3
 ignores. For files of plain SB3, the description is derived from the names of the weights and from
 the text beside pickled spaces and classes; dict observations are not supported.
@@ -61,8 +61,8 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     """Read a model's file.
 
     Returns:
-        Description given to `write_model`, empty in files of plain SB3; SB3's own data, with
-        pickled values left as they are; and the weights by name.
+        The description given to `write_model`, which is empty in files of plain SB3; SB3's own
+        data, in which pickled values stay pickled; and the weights by name.
 
     Raises:
         PolicyError: The file is not a model of SB3, or is broken.

@@ -6,7 +6,7 @@ G clones the behavior policy. Neither the target nor the policy selects actions 
 according to G.
 
 Departures from the paper: Q and G are separate networks even for images; the target network is
-synced at intervals instead of averaged; otherwise as in `dqn`.
+synced at intervals instead of averaged; the departures of `dqn` also apply.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mcaprl.offline.batches.buffer import Batch
 
 @dataclass(frozen=True)
 class BCQConfig(DQNConfig):
-    """Settings of discrete BCQ: those of DQN and of the behavior clone."""
+    """Settings of discrete BCQ: those of DQN, plus those of the behavior clone."""
 
     threshold: float = 0.3
     """minimum probability relative to the most likely action; 0 is Double DQN, 1 cloning"""
@@ -76,7 +76,7 @@ class BCQ(DQN):
 
     @torch.no_grad()
     def targets(self, batch: Batch, q_t: Tensor) -> Tensor:
-        """Return the targets; the learning network selects likely actions, `q_t` evaluates them."""
+        """Return the targets. The learning network selects likely actions; `q_t` evaluates them."""
         own_q_t = self.outputs("q", batch.next_observations)
         logits_t = self.outputs("logits", batch.next_observations)
         q_t_selector = allowed_only(own_q_t, likely_actions(logits_t, self.config.threshold))

@@ -1,4 +1,4 @@
-"""Settings of all offline algorithms, and those of algorithms that bootstrap."""
+"""Base classes of the settings of offline algorithms."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from mcaprl.offline.batches.buffer import Batch
 
 @dataclass(frozen=True)
 class CQLConfig(DoubleDQNConfig):
-    """Settings of CQL: those of Double DQN and alpha."""
+    """Settings of CQL: those of Double DQN, plus alpha."""
 
     alpha: float = 1.0
     """weight of the penalty on actions that are not in the data; 0 is Double DQN"""

@@ -4,11 +4,12 @@
     Double DQN  https://arxiv.org/abs/1509.06461      target r + gamma Q'(s', argmax_a Q(s', a))
     quantiles   https://arxiv.org/abs/1710.10044      Q is the mean of `n_quantiles` quantiles
 
-Q is the learning network, Q' the target network, synced every `target_interval` updates.
+Q is the learning network. Q' is the target network, which is synced every `target_interval`
+updates.
 
 Departures from the papers: the data are a fixed log, so there is no exploration; Adam replaces
 RMSProp; the learning rate decays to almost 0, because no new data arrive. Both algorithms
-overestimate actions that are not in the log; they are the baselines of CQL.
+overestimate actions that are not in the log, so they are baselines for CQL.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class DQNConfig(BootstrapConfig):
 
 @dataclass(frozen=True)
 class DoubleDQNConfig(DQNConfig):
-    """Settings of Double DQN: those of DQN."""
+    """Settings of Double DQN, the same as those of DQN."""
 
 
 class DQN(Learner):
@@ -70,7 +71,7 @@ class DQN(Learner):
     config: DQNConfig
 
     def __init__(self, config: DQNConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
-        """Initialize the network with random weights, and the target network with the same ones."""
+        """Initialize the network with random weights, and copy them to the target network."""
         super().__init__(config, buffer, seeds)
         self.target_network = self.add_target_network("q", config.target_interval)
 
@@ -89,8 +90,8 @@ class DQN(Learner):
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return the values of the logged actions, and their absolute errors.
 
-        The targets are those of the learning network, because the age of the target network differs
-        from one validation to the next.
+        The learning network also computes the targets, because the age of the target network
+        differs from one validation to the next.
         """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))
@@ -104,7 +105,7 @@ class DQN(Learner):
         Args:
             batch: Transitions.
             q_t: Values (R, A) or quantiles (R, A, N) of the next states, usually those of
-                `target_outputs`; here, they both select and evaluate actions.
+                `target_outputs`. DQN uses them both to select and to evaluate actions.
         """
         return q_learning_target(batch.rewards, batch.discounts, q_t)
 

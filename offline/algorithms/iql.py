@@ -63,7 +63,7 @@ class IQL(Learner):
     config: IQLConfig
 
     def __init__(self, config: IQLConfig, buffer: TransitionBuffer, seeds: Sequence[int]) -> None:
-        """Initialize the networks with random weights, and the target networks with the same."""
+        """Initialize the networks with random weights, and copy them to the target networks."""
         super().__init__(config, buffer, seeds)
         for name in _TWINS:
             self.add_target_network(name, config.target_interval, next_states=False)
@@ -74,7 +74,7 @@ class IQL(Learner):
         return {"logits": per_action, "q": per_action, "q_twin": per_action, "v": (1,)}
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses of V, of Q and of the policy; they share no weights."""
+        """Return the losses of V, Q and the policy, which share no weights."""
         q_a_tm1 = torch.minimum(
             *(chosen(self.target_networks[name].outputs(batch), batch.actions) for name in _TWINS)
         )

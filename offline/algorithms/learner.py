@@ -38,19 +38,19 @@ class NotFiniteError(ArithmeticError):
 
 
 class Learner(ABC):
-    """One algorithm on one dataset with K seeds; a subclass defines networks and losses.
+    """Training of K seeds on one dataset; a subclass defines the networks and losses.
 
-    All randomness comes from the seeds: the same seed, data and machine produce the same
-    weights, regardless of the seeds trained in parallel. Networks are on the device of the buffer.
+    All randomness comes from the seeds. The same seed, data and machine produce the same weights,
+    whichever other seeds are trained in parallel. Networks are on the device of the buffer.
 
     Attributes:
         name: Name of the algorithm in commands and in `mcaprl.train`.
-        config_type: Dataclass of its settings.
-        acts_by: Outputs by which the policy selects actions.
+        config_type: Dataclass of the algorithm's settings.
+        acts_by: Kind of outputs from which the policy selects actions.
         policy_models: Names of the models that the policy needs.
         seeds: K seeds.
-        models: K networks each, by name.
-        target_networks: Target networks of some models, by name.
+        models: Models by name; each contains K networks.
+        target_networks: Target networks by the name of the model that they copy.
         step: Number of finished updates.
     """
 
@@ -140,8 +140,8 @@ class Learner(ABC):
 
         Args:
             name: Name of the model.
-            interval: Number of updates; the same for all target networks.
-            next_states: Whether it evaluates the next states instead of the states.
+            interval: Number of updates between two syncs, the same for all target networks.
+            next_states: Whether the target network evaluates next states instead of states.
         """
         rows = self.config.batch_size * interval
         self._sync_interval = interval
@@ -158,7 +158,7 @@ class Learner(ABC):
         return [{name: means[name][k] for name in means} for k in range(len(self.seeds))]
 
     def outputs(self, name: str, observations: Observations) -> Tensor:
-        """Return a model's outputs, minus infinity for actions that are not allowed."""
+        """Return a model's outputs, with minus infinity for actions that are not allowed."""
         return allowed_only(self.models[name](observations), observations.mask)
 
     def all_models(self) -> dict[str, Model]:
@@ -183,7 +183,7 @@ class Learner(ABC):
 
     @torch.no_grad()
     def load_state(self, seed: int, tensors: Mapping[str, Tensor], step: int) -> None:
-        """Restore the tensors of `state` after `step` updates, the same for all seeds.
+        """Restore the tensors that `state` returned; `step` must be the same for all seeds.
 
         Raises:
             KeyError: A tensor is missing.

@@ -6,7 +6,8 @@ size, A the number of actions, N the number of quantiles.
     r_t             rewards (B,)
     discount_t      gamma (B,), to the power of n for n-step returns, or 0 after termination
     q_t             values (B, A) of the target network, or quantiles (B, A, N)
-    q_t_value       q_t where a second network, of output q_t_selector, selects the action
+    q_t_selector    values (B, A) or quantiles (B, A, N) of the network that selects the next action
+    q_t_value       values (B, A) or quantiles (B, A, N) of the network that evaluates it
     a_t             next actions (B,), int64
     pi_t            probabilities (B, A) of the evaluated policy in the next states
     q_tm1, z_tm1    values (B, A) or quantiles (B, A, N) of the learning network
@@ -15,9 +16,8 @@ size, A the number of actions, N the number of quantiles.
     v_tm1           values (B, 1) of states
     logits_tm1      unnormalized log probabilities (B, A)
 
-Quantile targets (B, N) are those of the action with the largest mean. Outputs of actions that are
-not allowed are minus infinity. A loss returns one value per transition; autograd computes its
-gradient.
+Actions are selected by their mean quantile. Outputs of actions that are not allowed are minus
+infinity. A loss returns one value per transition; autograd computes its gradient.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def expected_sarsa_target(r_t: Tensor, discount_t: Tensor, q_t: Tensor, pi_t: Te
 
 
 def square_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return half the squared error of Q(s, a) (B,), lowest where Q(s, a) is the mean target."""
+    """Return half the squared error (B,) of Q(s, a); the mean target minimizes it."""
     _check_actions(q_tm1, a_tm1)
     _check_shape("target_tm1", target_tm1, (len(q_tm1),))
     return 0.5 * (chosen(q_tm1, a_tm1) - target_tm1).square()
@@ -86,7 +86,7 @@ def temporal_difference_loss(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -
 
 
 def huber_regression(q_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Tensor:
-    """Return the Huber loss (B,) of Q(s, a) - target: squared / 2 up to 1, absolute - 1/2 beyond.
+    """Return the Huber loss (B,) of Q(s, a) - target: quadratic up to 1, linear beyond.
 
     This is the error clipping of the DQN paper: the gradient of a rare, large error (a crash, a new
     target network) is no larger than that of an error of 1.
@@ -118,8 +118,8 @@ def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Ten
 def cross_entropy(logits_tm1: Tensor, a_tm1: Tensor) -> Tensor:
     """Return -log pi(a_data | s) (B,) with pi = softmax(logits): the loss of behavior cloning.
 
-    For Q-values it is the CQL(H) penalty logsumexp_a Q(s, a) - Q(s, a_data), which is never
-    negative: minimizing it lowers all values and raises that of the logged action. See
+    With Q-values as logits, this is the CQL(H) penalty logsumexp_a Q(s, a) - Q(s, a_data), which
+    is never negative. Its gradient lowers all values and raises that of the logged action. See
     "Conservative Q-Learning for Offline Reinforcement Learning", equation 4,
     https://arxiv.org/abs/2006.04779.
     """
@@ -135,7 +135,8 @@ def square_penalty(logits_tm1: Tensor) -> Tensor:
 def expectile_regression(v_tm1: Tensor, target_tm1: Tensor, expectile: float) -> Tensor:
     """Return the asymmetric square loss |expectile - 1{u < 0}| u^2 (B,), u = target - V(s).
 
-    With 0.5 the best V(s) is the mean target; toward 1 it approaches the largest target.
+    At expectile 0.5, the mean target minimizes the loss; toward 1, the minimum approaches the
+    largest target.
     See "Offline Reinforcement Learning with Implicit Q-Learning", equation 5,
     https://arxiv.org/abs/2110.06169.
     """
@@ -157,8 +158,8 @@ def allowed_only(outputs: Tensor, mask: Tensor | None) -> Tensor:
 def likely_actions(logits: Tensor, threshold: float) -> Tensor:
     """Return whether pi(a|s) / max_a pi(a|s) >= threshold (B, A), with pi = softmax(logits).
 
-    This is the filter of discrete BCQ; a threshold of 0 admits all actions, 1 only the most likely
-    one. See "Benchmarking Batch Deep Reinforcement Learning Algorithms", algorithm 1,
+    This is the filter of discrete BCQ; a threshold of 0 admits all actions, and 1 admits only the
+    most likely one. See "Benchmarking Batch Deep Reinforcement Learning Algorithms", algorithm 1,
     https://arxiv.org/abs/1910.01708.
     """
     return (logits - logits.amax(1, keepdim=True)).exp() >= threshold
@@ -175,7 +176,7 @@ def best_actions(q: Tensor) -> Tensor:
 
 
 def chosen(values: Tensor, actions: Tensor) -> Tensor:
-    """Return values (B,) of one action each, or quantiles (B, N) from (B, A, N)."""
+    """Return the values (B,), or the quantiles (B, N), of the given actions."""
     if values.ndim == 2:
         return values.gather(1, actions.unsqueeze(1)).squeeze(1)
     return values[torch.arange(len(values), device=values.device), actions]

@@ -1,8 +1,8 @@
-"""K networks of one shape, one per seed, trained in parallel, and their target networks.
+"""Networks of the same shape, one for each of K seeds, trained in parallel; target networks.
 
-The weights are the rows of one matrix (K, P), a leaf of autograd: the optimizer, the target network
-and a checkpoint each handle one tensor. Batches contain the rows of all seeds, ordered by seed:
-R = K * B rows.
+The weights are the rows of one matrix (K, P), a leaf of autograd, so the optimizer, the target
+network and a checkpoint each handle one tensor. Batches contain the rows of all seeds, ordered by
+seed: R = K * B rows.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Model(ABC):
 
     Attributes:
         networks: K networks; their parameters share memory with `weights`.
-        weights: (K, P).
+        weights: (K, P), one row of weights per network.
         bulk_gain: Time per row in a small batch, relative to a batch of a thousand rows.
     """
 
@@ -71,7 +71,7 @@ class AnyModel(Model):
         return torch.cat([self._apply(network, row, part) for network, row, part in seeds])
 
     def _apply(self, network: Network, row: Tensor, observations: Observations) -> Tensor:
-        """Apply one network with the weights of a row, so that gradients reach the matrix."""
+        """Apply one network with the weights in `row`, so that gradients reach the matrix."""
         parts = zip(self._names, self._shapes, row.split_with_sizes(self._sizes), strict=False)
         weights = {name: part.view(shape) for name, shape, part in parts}
         return cast(Tensor, functional_call(network, weights, (observations,)))
@@ -120,8 +120,8 @@ def build_model(networks: Sequence[Network]) -> Model:
 class TargetNetwork:
     """Copy of a learning model, synced at intervals.
 
-    Outputs are constant between two syncs. If that is faster than a forward pass for each batch,
-    they are computed once for the whole dataset and then looked up.
+    Outputs are constant between two syncs. They are computed once for the whole dataset and then
+    looked up, if that is faster than a forward pass for each batch.
 
     Attributes:
         model: K target networks.
@@ -130,7 +130,7 @@ class TargetNetwork:
     def __init__(
         self, model: Model, buffer: TransitionBuffer, rows_per_sync: int, *, next_states: bool
     ) -> None:
-        """Copy `model`, to evaluate a buffer's states or next states.
+        """Copy `model`; the copy evaluates the states or next states of a buffer.
 
         `rows_per_sync` is the approximate number of rows per seed between two calls of `sync`.
         """

@@ -26,8 +26,8 @@ class Architecture:
         channels: Output channels of the three convolutions over each image.
         layer_norm: Whether the hidden layers are normalized before each ReLU
             (https://arxiv.org/abs/1607.06450).
-        dueling: Whether outputs are the sum of a value and advantages of mean 0, each with its own
-            last hidden layer (https://arxiv.org/abs/1511.06581).
+        dueling: Whether outputs are the sum of a value and of advantages with mean 0, computed by
+            separate last hidden layers (https://arxiv.org/abs/1511.06581).
     """
 
     hidden: tuple[int, ...]
@@ -94,11 +94,11 @@ class NatureConvolutions(nn.Module):
     scale: Tensor
 
     def __init__(self, image: ImageInput, channels: tuple[int, ...]) -> None:
-        """Build the convolutions for an image input, with these numbers of output channels."""
+        """Build the convolutions for an image input."""
         super().__init__()
         first, second, third = channels
         shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
-        # Constants, which are saved with the normalization of the other observations.
+        # Not persistent, because the normalization of all observations is saved separately.
         self.register_buffer("shift", torch.from_numpy(shift), persistent=False)
         self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
         self.layers = nn.Sequential(
@@ -120,7 +120,7 @@ class NatureConvolutions(nn.Module):
 
 
 class DuelingHead(nn.Module):
-    """Separate streams for the value of a state and the advantages: Q = V + A - mean(A)."""
+    """Head with separate streams for the state value and advantages: Q = V + A - mean(A)."""
 
     def __init__(
         self, n_inputs: int, hidden: tuple[int, ...], output_shape: tuple[int, ...], norm: bool

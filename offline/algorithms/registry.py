@@ -42,7 +42,7 @@ def choose_algorithm(algo: str | TrainingConfig) -> tuple[type[Learner], Trainin
 
     Raises:
         UnknownNameError: No algorithm has that name.
-        UsageError: No algorithm has such a config, or its entry point is broken.
+        UsageError: No algorithm has a config of this type, or an entry point is broken.
     """
     if isinstance(algo, str):
         if algo in ALGORITHMS:
@@ -59,7 +59,7 @@ def choose_algorithm(algo: str | TrainingConfig) -> tuple[type[Learner], Trainin
         if type(algo) is learner.config_type:
             return learner, algo
     known = ", ".join(learner.config_type.__name__ for learner in algorithms.values())
-    raise UsageError(f"no algorithm has a {type(algo).__name__}; known: {known}")
+    raise UsageError(f"no algorithm has a config of type {type(algo).__name__}; known: {known}")
 
 
 def _entry_points() -> dict[str, EntryPoint]:

@@ -1,7 +1,8 @@
 """Transitions as tensors, packed once and sampled at random.
 
 Each observation is stored once, as a frame; transitions refer to frames by index. The indexes and
-the n-step returns are computed when the data are packed, frame stacks when a batch is read.
+the n-step returns are computed when the data are packed. Frame stacks are built when a batch is
+read.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Packing:
             first observation also pads the stacks.
         normalize: Whether network inputs are normalized to mean 0 and standard deviation 1.
         gamma: Discount per step.
-        n_steps: Number of rewards in a return; fewer at the end of an episode.
+        n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
     """
 
     frame_stack: int = 1
@@ -77,11 +78,12 @@ class TransitionBuffer:
         packing: Settings with which the transitions were built.
         frames: All observations, each stored once.
         starts: (F,) int64, first frame of each frame's episode.
-        places: (2, N) int64, frames of each transition's observation and next observation.
+        places: (2, N) int64, frame indexes of each transition's observation and next observation.
         actions: (N,) int64 action indexes, starting at 0.
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
-        drawable: (M,) int64, rows whose weight is above 0; None if these are all rows.
-        cumulative: (M,) float64, cumulative weights of these rows; None if the weights are equal.
+        drawable: (M,) int64, rows with a weight above 0; None if all rows have one.
+        cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
+            equal.
     """
 
     encoder: ObservationEncoder
@@ -108,9 +110,9 @@ class TransitionBuffer:
 
         Args:
             dataset: Dataset with discrete actions.
-            packing: How transitions are built; default: single steps, single frames.
-            encoder: Encoder of other data, to reuse its normalization; default: a new one.
-            weights: (E,) relative sampling weights of each episode's transitions; default: all
+            packing: How transitions are built; default: from single steps and single frames.
+            encoder: Encoder of other data, whose normalization is reused; default: a new one.
+            weights: (E,) relative sampling weight per episode, for its transitions; default: all
                 equal.
 
         Raises:
@@ -135,7 +137,7 @@ class TransitionBuffer:
         if actions.min() < 0 or actions.max() >= action_space.n:
             raise SpaceError(
                 f"the dataset has actions from {dataset.actions.min()} to {dataset.actions.max()},"
-                f" its action space is {action_space}"
+                f" but its action space is {action_space}"
             )
         _check_finite("rewards", torch.from_numpy(returns[0]))
         _check_data(dataset, frames, actions)
@@ -257,7 +259,7 @@ def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
 
 
 def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Compute `places` and `returns` of `TransitionBuffer`, over n steps or to the episode's end.
+    """Compute `places` and `returns` of `TransitionBuffer`; a return stops at the episode's end.
 
     A return that ends with termination has no bootstrap value; one that ends with truncation
     bootstraps from the last next observation.

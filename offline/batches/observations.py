@@ -39,8 +39,8 @@ class Observations:
 
     Attributes:
         vector: (B, V) float32; V is 0 if there are only images.
-        images: (B, height, width, channels) uint8 each.
-        mask: (B, A) bool, allowed actions; None if all are always allowed.
+        images: Tensors (B, height, width, channels), uint8, one per camera.
+        mask: (B, A) bool, allowed actions; None if every action is always allowed.
     """
 
     vector: Tensor
@@ -57,7 +57,7 @@ class Observations:
         return [self.vector, *self.images, *mask]
 
     def like(self, parts: Sequence[Tensor]) -> Observations:
-        """Return observations with other tensors, in the order that `self.parts` returns."""
+        """Return observations made of other tensors, which are in the order of `self.parts`."""
         n_images = len(self.images)
         mask = None if self.mask is None else parts[-1]
         return Observations(parts[0], tuple(parts[1 : 1 + n_images]), mask)
@@ -69,12 +69,12 @@ class Observations:
         return self.like([part.index_select(0, index) for part in self.parts()])
 
     def split(self, rows: int) -> list[Observations]:
-        """Return views of `rows` observations each; the last may have fewer."""
+        """Split into views of `rows` observations each; the last view may have fewer."""
         columns = [torch.split(part, rows) for part in self.parts()]
         return [self.like(parts) for parts in zip(*columns, strict=True)]
 
     def stacked(self, count: int) -> Observations:
-        """Return stacks of `count` successive observations, each with its last mask."""
+        """Return stacks of `count` successive observations, each with the mask of the last one."""
         if count == 1:
             return self
         rows = self.vector.shape[0] // count
@@ -105,7 +105,7 @@ class ImageInput:
     scale: float = 255.0
 
     def stacked(self, count: int) -> ImageInput:
-        """Return the input for stacks of `count` images along the channel axis."""
+        """Return the input for `count` images that are stacked along the channel axis."""
         height, width, channels = self.shape
         shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
         return replace(self, shape=(height, width, channels * count), shift=shift)
@@ -154,7 +154,7 @@ class ObservationEncoder:
         self.mask = leaves.pop((MASK_KEY,), None)
         if self.mask is not None and self.mask.shape != (n_actions,):
             shape = self.mask.shape
-            raise SpaceError(f"{MASK_KEY} has shape {shape}, there are {n_actions} actions")
+            raise SpaceError(f"{MASK_KEY} has shape {shape}, but there are {n_actions} actions")
         kinds = [(leaf, leaf.of(space)) for leaf in leaves.values()]
         self.images = [leaf for leaf, part in kinds if _is_image(part)]
         self.numbers = [(leaf, part) for leaf, part in kinds if not _is_image(part)]

@@ -14,7 +14,7 @@ from mcaprl.recorder.dataset.open import find_logs, open_logs
 
 
 def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
-    """Read logs as one dataset, and return it with the weight of each of its episodes.
+    """Read logs as one dataset, and return it with one weight per episode.
 
     Args:
         data: Files, folders or globs, each with an optional suffix `:WEIGHT`. A transition of

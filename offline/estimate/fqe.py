@@ -2,12 +2,12 @@
 
     Le, Voloshin and Yue, "Batch policy learning under constraints", https://arxiv.org/abs/1903.08738
 
-Q learns the target r + gamma sum_a pi(a|s') Q'(s', a), where pi is the evaluated policy and Q' the
-target network, synced every `target_interval` updates. A truncated episode would have continued, so
-only `terminated` ends the return.
+Q learns the target r + gamma sum_a pi(a|s') Q'(s', a), where pi is the evaluated policy and Q' is
+the target network, which is synced every `target_interval` updates. A truncated episode would have
+continued, so only `terminated` ends the return.
 
-Departures from the paper: gradient steps on random batches between two syncs, not a fit to
-convergence; targets are clipped to the range of possible returns, because the network's values of
+Departures from the paper: gradient steps on random batches between two syncs replace a fit to
+convergence. Targets are clipped to the range of possible returns, because the network's values of
 actions that are not in the log are arbitrary.
 """
 
@@ -48,7 +48,7 @@ class FQEConfig(TrainingConfig):
 
     @property
     def packing(self) -> Packing:
-        """Settings for single steps; n-step rewards would be those of the behavior policy."""
+        """Settings for single steps; n-step returns would depend on the behavior policy."""
         return Packing(gamma=self.gamma)
 
     @property
@@ -73,7 +73,7 @@ class FQE(Learner):
     def __init__(
         self, config: FQEConfig, buffer: TransitionBuffer, seeds: Sequence[int], pi_t: Tensor
     ) -> None:
-        """Initialize the network with random weights, and the target network with the same.
+        """Initialize the network with random weights, and copy them to the target network.
 
         Args:
             config: Settings.
@@ -102,13 +102,13 @@ class FQE(Learner):
         return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 
     def values(self, *, next_states: bool) -> Tensor:
-        """Return the values (N, A) that the first seed's network predicts, clipped."""
+        """Return the values (N, A) of the first seed's network, clipped to the possible returns."""
         outputs = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
         return outputs[: len(self.buffer)].clamp(self.low, self.high)
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """Return the bounds of a discounted sum of one or more of these rewards."""
+    """Return the lowest and highest discounted sum of one or more of these rewards."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

@@ -1,17 +1,17 @@
 """Off-policy estimates of a policy's value by importance sampling: pure functions.
 
-Each maps a table of episodes to a `RatioEstimate`, which has a value and an interval:
+Each function maps a table of episodes to a `RatioEstimate`, which has a value and an interval:
 
     TIS     trajectory importance sampling         sum_t gamma^t r_t, times rho of the whole episode
     WIS     weighted                               TIS with rho divided by the sum of all rho
     PDIS    per-decision importance sampling       sum_t gamma^t rho_t r_t
-    WPDIS   weighted                               PDIS with rho_t divided by their sum at t
+    WPDIS   weighted                               PDIS with rho_t divided by the sum of all rho_t
     DR      doubly robust                          PDIS of the residuals of a model Q
     WDR     weighted doubly robust                 WPDIS of these residuals
 
-with rho_t the product of pi(a|s) / mu(a|s) up to step t, pi the evaluated policy and mu the
-behavior policy. TIS, PDIS and DR are unbiased with a large variance; the weighted (self-normalized)
-estimators have a small bias and a smaller variance.
+Here, rho_t is the product of pi(a|s) / mu(a|s) up to step t, pi is the evaluated policy, and mu is
+the behavior policy. TIS, PDIS and DR are unbiased with a large variance; the weighted
+(self-normalized) estimators have a small bias and a smaller variance.
 
     Precup, Sutton and Singh, "Eligibility traces for off-policy policy evaluation", ICML 2000
     Jiang and Li, "Doubly robust off-policy value evaluation", https://arxiv.org/abs/1511.03722
@@ -89,7 +89,7 @@ def per_decision(episodes: EpisodeTable) -> RatioEstimate:
 
 
 def weighted_per_decision(episodes: EpisodeTable) -> RatioEstimate:
-    """Return WPDIS: sum_t gamma^t times the mean reward at t, weighted by rho_t."""
+    """Return WPDIS: the sum over t of gamma^t times the mean reward at t, weighted by rho_t."""
     rho = episodes.rho
     return RatioEstimate(episodes.discounts, ((rho * episodes.rewards, rho),))
 
@@ -143,9 +143,9 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
     """Return the effective number of episodes of an estimate.
 
     For TIS and WIS, this is the size at the last step. For the others, it is the harmonic mean over
-    steps, weighted with the discounts, because the variances of the steps add up. For PDIS and DR,
-    it is at most the size of the episodes' discounted sums of weights, because these estimators do
-    not normalize: one huge weight, even in a late step, determines their value.
+    steps, weighted with the discounts, because the variances of the steps add up. PDIS and DR do
+    not normalize, so one huge weight, even in a late step, determines their value. For them, the
+    result is at most the effective sample size of the discounted sums of each episode's weights.
     """
     sizes = effective_sample_sizes(episodes)
     if estimator in WHOLE_EPISODE:
@@ -159,10 +159,10 @@ def effective_sample_size(estimator: str, episodes: EpisodeTable) -> float:
 
 
 def mean_weight(estimator: str, episodes: EpisodeTable) -> RatioEstimate | None:
-    """Return the mean importance weight of an unbiased estimator, whose expectation is 1.
+    """Return the mean importance weight of an unbiased estimator; its expectation is 1.
 
     A mean well below 1 shows that the log does not cover the policy's actions: rare episodes with
-    large weights are missing. None for the weighted estimators, which divide by this mean.
+    large weights are missing. Return None for the weighted estimators, which divide by this mean.
     """
     if estimator not in UNBIASED:
         return None

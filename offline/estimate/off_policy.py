@@ -59,8 +59,7 @@ class Estimate:
         policy: Name of the policy.
         estimator: `FQE` or one of `importance.ESTIMATORS`.
         value: Discounted return; None if it cannot be computed.
-        interval: 95 % bootstrap-t interval over episodes; None for FQE, and where there is no
-            value.
+        interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
         effective_sample_size: Number of the policy's own episodes that would be as informative.
         verdict: `ok`, or `refused: ` or `no interval: ` and the reason. FQE is never `ok`.
     """
@@ -155,7 +154,7 @@ class OffPolicyEvaluator:
             name: Name in tables.
             epsilon: Probability of a random action instead of the policy's; a larger epsilon
                 requires fewer episodes.
-            on_update: Callback for each update of the model, `updates_of_model` in total.
+            on_update: Callback for each update of the model; it is called `updates_of_model` times.
 
         Raises:
             PolicyError: The observations do not fit the policy.
@@ -188,7 +187,7 @@ class OffPolicyEvaluator:
     def _probabilities(
         self, policy: StochasticPolicy | None, observations: Any, epsilon: float
     ) -> Floats:
-        """Return the probabilities (N, A) of a policy with this epsilon."""
+        """Return the action probabilities (N, A) of a policy that explores with `epsilon`."""
         actions = int(self._buffer.action_space.n)
         uniform = np.full((len(self._buffer), actions), 1 / actions)
         if policy is None:
@@ -199,7 +198,7 @@ class OffPolicyEvaluator:
         ]
         own = np.concatenate(parts).astype(np.float64)
         if own.shape != uniform.shape:
-            raise SpaceError(f"the policy has {own.shape[1]} actions, the log {actions}")
+            raise SpaceError(f"the policy has {own.shape[1]} actions, but the log has {actions}")
         return (1 - epsilon) * own + epsilon * uniform
 
     def _model(
@@ -276,9 +275,9 @@ class OffPolicyEvaluator:
     def _fqe_estimate(self, name: str, v: Floats, weights: Floats) -> Estimate:
         """Return the model's mean value of the first states.
 
-        It has no interval, and so it is never trusted: its error is the model's bias, which a log
-        does not show. The variation of the first states is a small part of the error. The effective
-        sample size is that of single steps, on which the model is trained, converted to episodes.
+        The estimate has no interval and is never trusted, because most of its error is the model's
+        bias, which a log does not show. The model is trained on single steps, so the effective
+        sample size counts steps, divided by the mean length of an episode.
         """
         first = v[np.cumsum(self._lengths) - self._lengths]
         steps = weights.sum() ** 2 / max((weights**2).sum(), 1e-300)
@@ -305,8 +304,8 @@ def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
     """Rank policies by the first estimator of `PREFERENCE` that is trusted for all policies.
 
     Returns:
-        `estimator`; `policies`, best first; and `trusted`: false if no estimator is trusted for
-        all policies, so the ranking is that of FQE.
+        `estimator`; `policies`, best first; and `trusted`. If no estimator is trusted for all
+        policies, `trusted` is false and FQE ranks them.
     """
     by_estimator = {
         name: [estimate for estimate in estimates if estimate.estimator == name]
@@ -320,7 +319,7 @@ def ranking(estimates: Sequence[Estimate]) -> dict[str, Any]:
 
 
 def _unusable(behavior: Floats) -> str | None:
-    """Return a verdict if steps cannot be weighted with their logged probabilities."""
+    """Return a refusal if logged probabilities are missing or impossible, else None."""
     for wrong, what in (
         (is_impossible(behavior), "not in (0, 1]"),
         (np.isnan(behavior), "unknown"),
@@ -331,7 +330,7 @@ def _unusable(behavior: Floats) -> str | None:
 
 
 def _overflow(rho: Floats) -> str | None:
-    """Return a verdict if importance weights may overflow."""
+    """Return a refusal if importance weights may overflow, else None."""
     largest = float(np.nanmax(rho))
     if largest <= LARGEST_WEIGHT:
         return None

@@ -3,16 +3,16 @@
 Every off-policy estimate by importance sampling is sum_k w_k mean(a_k) / mean(b_k) over episodes:
 b is 1 for the unbiased estimators and the mean weight for the weighted (self-normalized) ones.
 
-Weights that are products over many steps are skewed: most logs lack the rare episodes with large
-weights, so their variance is too small and percentile bootstrap intervals are too narrow: at 95 %,
-they contain the true value in 85 to 93 of 100 logs of 50 episodes. The bootstrap-t instead
-resamples the error divided by the standard error of each resampling:
+Weights that are products over many steps are skewed. Most logs lack the rare episodes with large
+weights, so the variance of the weights is too small, and percentile bootstrap intervals are too
+narrow: with 50 episodes per log, 95 % intervals contain the true value in only 85 to 93 % of logs.
+The bootstrap-t instead divides the error of each resampling by its standard error:
 
     Efron and Tibshirani, "An introduction to the bootstrap", 1993, section 12.5
 
 That standard error is itself an estimate, with few degrees of freedom if a few episodes contribute
 most of it. The interval is therefore widened by the ratio of the quantiles of Student's t and the
-normal distribution; the degrees of freedom follow from how unequal the episodes' contributions are:
+normal distribution. The more unequal the episodes' contributions, the fewer degrees of freedom:
 
     Satterthwaite, "An approximate distribution of estimates of variance components", Biometrics
     Bulletin 2, 1946
@@ -38,8 +38,9 @@ class RatioEstimate:
     """Estimate sum_k w_k (mean a_k / mean b_k + ...) over E episodes.
 
     Attributes:
-        weights: w (K,).
-        pairs: Pairs of a (E, K) and b (E, K); a ratio whose b is 0 in all episodes counts as 0.
+        weights: Weights w (K,).
+        pairs: Arrays a (E, K) and b (E, K) of each ratio; if b is 0 in all episodes, so is the
+            ratio.
     """
 
     weights: Floats
@@ -47,7 +48,7 @@ class RatioEstimate:
 
     @classmethod
     def mean(cls, values: Floats) -> RatioEstimate:
-        """Return the estimate that is the mean of values (E,)."""
+        """Create an estimate of the mean of values (E,)."""
         column = values[:, None]
         return cls(np.ones(1), ((column, np.ones_like(column)),))
 
@@ -62,8 +63,8 @@ class RatioEstimate:
     def errors(self, counts: Floats) -> Floats:
         """Return the standard errors (B,) of `values(counts)`, by the delta method.
 
-        An episode changes the estimate by sum_k w_k (a_k - q_k b_k) / mean b_k, divided by the
-        number of episodes, where q_k is the ratio mean a_k / mean b_k.
+        One of E episodes changes the estimate by sum_k w_k (a_k - q_k b_k) / (E mean b_k), where
+        q_k is the ratio mean a_k / mean b_k.
         """
         parts = [
             self._errors(counts[start : start + _RESAMPLES_AT_ONCE])
@@ -95,9 +96,10 @@ class RatioEstimate:
         return float(low), float(high)
 
     def degrees_of_freedom(self) -> float:
-        """Return (sum_i m_i^2)^2 / sum_i m_i^4 - 1, at least 1, for the standard error.
+        """Return the degrees of freedom of the standard error, at least 1.
 
-        m_i is the change of the estimate due to episode i. Equal changes result in E - 1.
+        They are (sum_i m_i^2)^2 / sum_i m_i^4 - 1, where m_i is the change of the estimate due to
+        episode i. Equal changes result in E - 1.
         """
         once = np.ones((1, len(self.pairs[0][0])))
         shares = self._changes(once)[:, 0] ** 2

@@ -89,7 +89,7 @@ def td_errors(
     """Return the Q-learning errors (T,): r + gamma max_a Q(s', a) - Q(s, a_data).
 
     Args:
-        q: (T + 1, A) values at each observation, including the last next one.
+        q: (T + 1, A) values at each observation, including the last next observation.
         actions: (T,) actions taken, counted from 0.
         rewards: (T,) rewards.
         terminated: (T,) whether the episode terminated at each step.
@@ -105,13 +105,13 @@ def td_errors(
 
 
 def softmax(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the Boltzmann policy at temperature 1, row by row."""
+    """Return the softmax of each row, which is the Boltzmann policy at temperature 1."""
     odds = np.exp(values - values.max(1, keepdims=True))
     return cast(NDArray[np.float32], odds / odds.sum(1, keepdims=True))
 
 
 def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return -sum p log p / log A (T,) of rows (T, A): 0 is deterministic, 1 is uniform."""
+    """Return the entropy (T,) of rows (T, A), scaled from 0 (deterministic) to 1 (uniform)."""
     actions = probabilities.shape[1]
     if actions == 1:
         return np.zeros(len(probabilities), np.float32)
@@ -133,14 +133,14 @@ def gamma_of_run(path: Path) -> float:
 
 
 def _with_last(observations: Any, next_observations: Any) -> Any:
-    """Return the observations of all steps and the last next one, (T + 1, ...)."""
+    """Append the last next observation to the observations of all steps: (T + 1, ...)."""
     if isinstance(observations, dict):
         return {k: _with_last(observations[k], next_observations[k]) for k in observations}
     return np.concatenate([observations, next_observations[-1:]])
 
 
 def _stacked(observations: Any, count: int) -> Any:
-    """Return frame stacks (T + 1, count, ...), oldest first; for a count of 1, (T + 1, ...)."""
+    """Return frame stacks (T + 1, count, ...), oldest frame first; a count of 1 adds no axis."""
     if count == 1:
         return observations
     if isinstance(observations, dict):

@@ -1,4 +1,4 @@
-"""Checkpoints; a run resumed from one has the same result as an uninterrupted run.
+"""Checkpoints: a resumed run has the same result as an uninterrupted one.
 
 `checkpoint.safetensors` contains one seed's tensors (weights, target network, optimizer,
 generator) and, in its header, the number of updates and the run's identity. Both are in one file,
@@ -51,7 +51,7 @@ def save_checkpoint(folder: Path, learner: Learner, seed: int, identity: RunIden
 
 
 def read_checkpoint(folder: Path, identity: RunIdentity) -> Checkpoint | None:
-    """Read the checkpoint in a folder; None if there is none.
+    """Read the checkpoint in a folder; return None if there is none.
 
     Raises:
         TrainingError: The checkpoint is from another run, or broken.

@@ -86,7 +86,7 @@ def _state_of(path: Path) -> tuple[int, int, int]:
 def with_more_data(
     learner: Learner, dataset: Dataset, held_out_episodes: NDArray[np.int64]
 ) -> Learner:
-    """Return a learner with the same state on a dataset that has grown.
+    """Return a learner with the same state for the grown dataset.
 
     Args:
         learner: Learner to continue.
@@ -105,7 +105,7 @@ def with_more_data(
 
 
 def _read_from(path: Path, first: int) -> Dataset | None:
-    """Read the episodes of a log from number `first`; None if there are none."""
+    """Read the episodes of a log from number `first`; return None if there are none."""
     with warnings.catch_warnings():
         # The warning that a log is still being written is expected here.
         warnings.simplefilter("ignore", UserWarning)

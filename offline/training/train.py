@@ -70,7 +70,7 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of networks to train in parallel; they are independent of each other.
         seed: Seed of the first network; network k uses seed + k.
-        weights: (E,) relative sampling weights of each episode's transitions; default: all equal.
+        weights: (E,) relative sampling weight per episode, for its transitions; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without one start from
             update 0.
         other_data: Whether to accept checkpoints trained on other data when resuming.
@@ -88,7 +88,7 @@ def train(
         OutputExistsError: `out` exists and is not empty.
         SpaceError: The algorithm does not support these observations or actions.
         TrainingError: The loss is NaN or infinite; `out` cannot be written, is being written by
-            another training, or has a run with other data or settings; or there is no run to
+            another training, or contains a run with other data or settings; or there is no run to
             resume.
     """
     if seeds < 1 or seed < 0:
@@ -221,7 +221,7 @@ class _Run:
         return values
 
     def _with_new_episodes(self, learner: Learner) -> Learner:
-        """Return the learner, with new episodes added every `CHECK_INTERVAL` updates."""
+        """Add new episodes every `CHECK_INTERVAL` updates; return the learner to continue with."""
         if self.follow is None or learner.step % CHECK_INTERVAL or not self.follow.grow():
             return learner
         return with_more_data(learner, self.follow.dataset, self.held_out_episodes)
@@ -229,8 +229,8 @@ class _Run:
     def _save(self, learner: Learner) -> None:
         """Write each seed's policy and then its checkpoint.
 
-        The checkpoint is written last: a kill before that loses updates, but a finished run never
-        has an outdated policy.
+        The checkpoint is written last. If the process is killed before that, updates are lost, but
+        the policy of a finished run is never outdated.
         """
         for seed in learner.seeds:
             folder = seed_folder(self.folder, seed)
@@ -238,7 +238,7 @@ class _Run:
             save_checkpoint(folder, learner, seed, self.identity)
 
     def _update(self, learner: Learner) -> dict[str, Tensor]:
-        """Run one update; if the loss is not finite, raise an error with the last checkpoint."""
+        """Run one update; if the loss is not finite, raise an error that names the checkpoints."""
         try:
             return learner.update()
         except NotFiniteError as error:
@@ -261,13 +261,13 @@ class _Run:
 
 
 def _earlier_encoder(folder: Path) -> ObservationEncoder | None:
-    """Return the encoder, with its normalization, of the run in a folder; None if there is none."""
+    """Return the encoder of the run in a folder with its normalization, or None."""
     policies = policy_files(folder)
     return read_policy(policies[0].parent).encoder if policies else None
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Return a hash of the data, and of the weights unless all are equal."""
+    """Return a hash of the data; unequal weights are included in it."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()

@@ -55,7 +55,7 @@ class HeldOut:
         self.mean_return = float(returns[chosen].mean())
 
     def terms(self, learner: Learner) -> list[dict[str, float]]:
-        """Return the terms of each seed on these transitions, with the prefix `held_out_`."""
+        """Return each seed's validation metrics; their names have the prefix `held_out_`."""
         seeds = len(learner.seeds)
         with torch.no_grad():
             terms = learner.validate(self._buffer.batch(self._rows.repeat(seeds)))
@@ -66,7 +66,7 @@ class HeldOut:
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes: at least one if there are ten, never all.
+    """Choose about `fraction` of the episodes, never all; from ten on, choose at least one.
 
     The choice depends only on the number of episodes, so it is the same for all seeds.
     """
@@ -107,7 +107,7 @@ def monte_carlo_returns(
 
 
 def largest_return(dataset: Dataset, gamma: float) -> float:
-    """Return an upper bound on the absolute discounted return of these rewards."""
+    """Return an upper bound on the absolute discounted return of an episode."""
     longest = float(dataset.episode_lengths.max())
     steps = longest if gamma == 1 else 1 / (1 - gamma)
     return float(np.abs(dataset.rewards).max()) * steps

@@ -226,7 +226,7 @@ def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> Non
     train_offline(mcaprl.open(logs), config, tmp_path / "cql", progress=silent)
     with (
         closing(agent(tmp_path, hidden=(16, 8))) as begun,
-        pytest.raises(PolicyError, match="has layers 12-8-6, the agent has 12-16-8-6"),
+        pytest.raises(PolicyError, match="has layers 12-8-6, but the agent has 12-16-8-6"),
     ):
         begun.start_from(None, load_policy(tmp_path / "cql"))
 

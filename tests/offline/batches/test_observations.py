@@ -161,7 +161,7 @@ def test_a_mask_is_not_a_network_input() -> None:
 
 def test_a_mask_of_another_length_is_refused() -> None:
     space = spaces.Dict({"action_mask": spaces.MultiBinary(3), "x": spaces.Box(-1, 1, (2,))})
-    with pytest.raises(SpaceError, match=r"action_mask has shape \(3,\), there are 2 actions"):
+    with pytest.raises(SpaceError, match=r"action_mask has shape \(3,\), but there are 2 actions"):
         ObservationEncoder(space, 2)
 
 
