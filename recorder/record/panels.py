@@ -21,11 +21,11 @@ _LEGEND_PX, _LEGEND_WITH_VALUES_PX = 160, 220
 # Height in pixels of each row of state transitions, and of their title and time axis.
 _TRANSITIONS_ROW_PX, _TRANSITIONS_REST_PX = 64, 60
 # Height of a screen in the smallest window, 1280 x 720 pixels.
-_SCREEN_PX = 590
+_SCREEN_PX = 570
 
 
 def tabs(nodes: Mapping[str, Node]) -> Panel:
-    """Return a panel of tabs, each with a layout of its own."""
+    """Return a panel of tabs, each with a layout."""
     parts = [{"title": title, "layout": node} for title, node in nodes.items()]
     return {"activeTabIdx": 0, "tabs": parts}
 

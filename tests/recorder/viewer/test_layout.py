@@ -141,8 +141,8 @@ def test_sizes_are_shares_of_the_area() -> None:
     found = dict(sizes_of(tree, panels, (960, 600)))
     # A quarter of 600 px; the other tab has a row of tabs of 30 px.
     assert found == {"Plot!a": (960, 150), "Tab!x": (960, 450), "Plot!c": (960, 420)}
-    # One row of 64 px, and 60 px for the title and the axis, of 590 px.
-    assert share_of_transitions(1) == 124 / 590
+    # One row of 64 px, and 60 px for the title and the axis, of 570 px.
+    assert share_of_transitions(1) == 124 / 570
     assert share_of_transitions(9) == 0.45
 
 
@@ -257,7 +257,7 @@ def test_continuous_actions_are_plotted(tmp_path: Path) -> None:
 
 
 def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
-    class Pictures(gym.Env[Any, Any]):
+    class Images(gym.Env[Any, Any]):
         observation_space = spaces.Dict(
             {
                 "front": spaces.Box(0, 255, (8, 9, 3), np.uint8),
@@ -273,7 +273,7 @@ def test_images_of_any_environment_are_shown(tmp_path: Path) -> None:
             return self.observation_space.sample(), 1.0, False, False, {}
 
     path = tmp_path / "log.mcap"
-    with closing(mcaprl.RecordMcap(Pictures(), path)) as env:
+    with closing(mcaprl.RecordMcap(Images(), path)) as env:
         env.reset(seed=0)
         env.step(np.zeros(2, np.float32))
     layout = check_layout(path)
