@@ -196,8 +196,8 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Return the fields of a `LiveStep` that are known before the step."""
         model = self.model
         assert model is not None
-        is_picture = self._stream.look(self._source(self._last_action), self._return_so_far)
-        values = _values(model, actions[WATCHED : WATCHED + 1]) if is_picture else {}
+        is_shown = self._stream.look(self._source(self._last_action), self._return_so_far)
+        values = _values(model, actions[WATCHED : WATCHED + 1]) if is_shown else {}
         probability = behavior_probabilities(model, actions)[WATCHED]
         self.after_forward()
         self._stream.pause()

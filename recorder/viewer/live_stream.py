@@ -205,7 +205,7 @@ class LiveStream(ViewerServer):
         self._tracks = Tracks()
         # Frames at the latest step, which are sent with the motion after it.
         self._moment: Moment | None = None
-        self._start_ns = self._time_ns = self._next_ns = self._picture_ns = 0
+        self._start_ns = self._time_ns = self._next_ns = self._frame_ns = 0
         self._steps_shown = 0
         if isinstance(source, SceneSource):
             self._send_static(source, time.time_ns())
@@ -221,7 +221,7 @@ class LiveStream(ViewerServer):
         if now_ns < self._next_ns or not self._pace.due() or not self._sink.has_viewers():
             return False
         self._start_ns = self._next_ns = now_ns
-        self._steps_shown = self._picture_ns = 0
+        self._steps_shown = self._frame_ns = 0
         self._moment = None
         self._tracks.begin()
         self._sink.write_messages(self._log.begin_messages(episode, policy, now_ns))
@@ -236,17 +236,17 @@ class LiveStream(ViewerServer):
         self._pace.begin()
         self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
         self._next_ns = time_ns + self._step_ns
-        is_picture = time_ns - self._picture_ns >= self._pace.period_s * 1e9
-        if is_picture:
-            self._picture_ns = time_ns
+        is_shown = time_ns - self._frame_ns >= self._pace.period_s * 1e9
+        if is_shown:
+            self._frame_ns = time_ns
         if isinstance(source, SceneSource) and SCENE in self._topics:
-            self._send_scene(source, is_picture=is_picture)
+            self._send_scene(source, is_shown=is_shown)
         if isinstance(source, TelemetrySource) and TELEMETRY in self._topics:
             self._emit(TELEMETRY, time_ns, self._shown.telemetry(source, return_so_far))
-        if is_picture and isinstance(source, DepthSource) and self._depth is not None:
+        if is_shown and isinstance(source, DepthSource) and self._depth is not None:
             self._put_image(self._depth, depth_millimeters(source.depth_image_m()))
             self._depth.write(_ROW, time_ns)
-        return is_picture
+        return is_shown
 
     def pause(self) -> None:
         """Stop the timer of the stream while the environment is stepped."""
@@ -316,7 +316,7 @@ class LiveStream(ViewerServer):
         self._sink.close()
         super().close()
 
-    def _send_scene(self, source: SceneSource, *, is_picture: bool) -> None:
+    def _send_scene(self, source: SceneSource, *, is_shown: bool) -> None:
         """Send frames and, if they are due, shapes."""
         time_ns = self._time_ns
         if self._steps_shown == 0:
@@ -329,7 +329,7 @@ class LiveStream(ViewerServer):
         self._send_motion([*between, (time_ns, frames)])
         if frames:
             self._tracks.add(frames[0].position)
-        if is_picture:
+        if is_shown:
             self._emit(SCENE, time_ns, marker_array(source.scene()))
 
     def _send_motion(self, moments: Sequence[Moment]) -> None:

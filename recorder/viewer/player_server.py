@@ -21,8 +21,8 @@ from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 _PERIOD_S = 1 / 30
 # Range of speeds that a viewer may request; others are ignored.
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
-# Viewers drop all messages when the time goes back, so the time has to arrive before the picture.
-# The server has separate queues for times and messages, so the picture waits for these ticks.
+# Viewers drop all messages when the time goes back, so the time has to arrive before the messages.
+# The server has separate queues for times and messages, so the messages wait for this many ticks.
 _TICKS_AFTER_SEEK = 2
 # Topics whose messages are events; a viewer that receives one twice shows it twice.
 _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
@@ -64,13 +64,13 @@ class LiveServer(ViewerServer):
         self._starts_ns = tuple(episode_starts_ns)
         self._lock = threading.Lock()
         self._looked_at = self._seeked = False
-        self._ticks_to_picture = 0
+        self._ticks_to_latest = 0
         # Number of subscribers by channel, and the channels with a new one.
         self._subscribers: Counter[int] = Counter()
         self._joined: set[int] = set()
         # Viewers have all events up to this time.
         self._sent_ns = -1
-        # The first picture includes the messages at the start.
+        # The first response includes the messages at the start.
         player.seek(player.start_ns)
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)
@@ -90,7 +90,7 @@ class LiveServer(ViewerServer):
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the messages that are due; first send the current picture to viewers without it."""
+        """Send the messages that are due; first send the current ones to viewers without them."""
         # The lock is held until all messages are sent. Otherwise a message from before a seek could
         # arrive after the response to the seek.
         with self._lock:
@@ -98,14 +98,14 @@ class LiveServer(ViewerServer):
             if player.ended and player.loops and player.playing:
                 self._seek(player.start_ns)
                 self._server.broadcast_playback_state(self._state(did_seek=True))
-            if self._ticks_to_picture:
-                self._ticks_to_picture -= 1
+            if self._ticks_to_latest:
+                self._ticks_to_latest -= 1
                 self._server.broadcast_time(player.time_ns)
                 return
-            picture, was_playing = self._picture(), player.playing
+            latest, was_playing = self._latest(), player.playing
             due = player.advance(elapsed_s)
             self._server.broadcast_time(player.time_ns)
-            for message in picture + due:
+            for message in latest + due:
                 self._send(message)
             self._sent_ns = player.time_ns
             if was_playing and not player.playing:
@@ -162,7 +162,7 @@ class LiveServer(ViewerServer):
     def on_parameters_unsubscribe(self, names: list[str]) -> None:
         """Do nothing."""
 
-    def _picture(self) -> list[Played]:
+    def _latest(self) -> list[Played]:
         """Return the current messages that viewers lack after a seek or a new subscription."""
         seeked, joined = self._seeked, self._joined
         self._seeked, self._joined = False, set()
@@ -186,7 +186,7 @@ class LiveServer(ViewerServer):
 
     def _seek(self, time_ns: int) -> None:
         self._player.seek(time_ns)
-        self._seeked, self._ticks_to_picture = True, _TICKS_AFTER_SEEK
+        self._seeked, self._ticks_to_latest = True, _TICKS_AFTER_SEEK
 
     def _jump(self, episode: int) -> None:
         if 0 <= episode < len(self._starts_ns):

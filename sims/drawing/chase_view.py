@@ -247,8 +247,8 @@ def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]
     x_m, y_m, z_m = ((middles_m - eye.at_m) @ eye.axes).T
     seen: NDArray[np.bool_] = z_m + radii_m > _NEAR_M
     for aside_m, size_px in ((x_m, SIZE_PX[0]), (y_m, SIZE_PX[1])):
-        slope = size_px / 2 / _FOCAL_PX
-        seen &= np.abs(aside_m) - slope * z_m <= math.hypot(1.0, slope) * radii_m
+        gradient = size_px / 2 / _FOCAL_PX
+        seen &= np.abs(aside_m) - gradient * z_m <= math.hypot(1.0, gradient) * radii_m
     return seen
 
 

@@ -119,7 +119,7 @@ def test_a_decompression_bomb_is_refused() -> None:
     bomb = zstandard.compress(bytes(2**28))
     assert len(bomb) < 50_000
     chunk = _chunk(bomb, claimed=100)
-    with pytest.raises(CorruptLogError, match="its header declares 100$"):
+    with pytest.raises(CorruptLogError, match=r"its header declares 100$"):
         chunk_records(memoryview(chunk), 0)
     with pytest.raises(CorruptLogError, match="the limit is"):
         chunk_records(memoryview(_chunk(bomb, claimed=2**40)), 0)

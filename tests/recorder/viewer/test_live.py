@@ -284,13 +284,13 @@ def test_a_viewer_connects_seeks_and_receives_the_files_bytes(log: Path) -> None
     assert seen["parameters"][-1][0] == {"name": "episode", "value": 2}
 
 
-def test_time_comes_before_the_picture_after_a_restart_and_a_jump_back(log: Path) -> None:
+def test_time_comes_before_the_messages_after_a_restart_and_a_jump_back(log: Path) -> None:
     viewer_is_there()
     starts = [str(e.log_time_ns[0]) for e in mcaprl.open(log).episodes]
     seen, _ = look([str(log)], [["loop", 20.0, 2], ["episode", 1], ["episode", 0]])
     looped, _, jumped = (step["wire"] for step in seen["steps"])
     shown = ("/scene", "/scene/static", "/tf", "/tf_static", "/telemetry")
-    picture = {"/rl/step", "/rl/phase", "/rosout", *shown}
+    shown_topics = {"/rl/step", "/rl/phase", "/rosout", *shown}
     for wire, rounds in ((looped, 2), (jumped, 1)):
         assert not [kind for kind, _ in wire if kind == "session"]
         seeks = [i for i, (kind, _) in enumerate(wire) if kind == "seeked"]
@@ -298,9 +298,9 @@ def test_time_comes_before_the_picture_after_a_restart_and_a_jump_back(log: Path
         for i in seeks:
             after = [pair for pair in wire[i + 1 :] if pair[0] != "state"]
             assert after[0] == ["time", starts[0]]
-            # The next messages are the picture, one of each topic.
-            sent = dict([pair for pair in after if pair[0] != "time"][: len(picture)])
-            assert sent == dict.fromkeys(picture, starts[0])
+            # The next messages are the current ones, one of each topic.
+            sent = dict([pair for pair in after if pair[0] != "time"][: len(shown_topics)])
+            assert sent == dict.fromkeys(shown_topics, starts[0])
 
 
 def test_the_first_log_line_comes_once(log: Path) -> None:
@@ -314,7 +314,9 @@ def test_the_first_log_line_comes_once(log: Path) -> None:
     assert [int(time_ns) for kind, time_ns in wire if kind == "/rosout"] == expected
 
 
-def test_a_second_viewer_gets_the_picture_and_the_first_one_no_line_twice(log: Path) -> None:
+def test_a_second_viewer_gets_the_current_messages_and_the_first_one_no_line_twice(
+    log: Path,
+) -> None:
     viewer_is_there()
     from mcaprl.recorder.viewer.player_server import LiveServer
 

@@ -277,7 +277,7 @@ def test_each_sim_has_its_own_camera_and_ranges(tmp_path: Path) -> None:
         layouts[sim] = mcaprl.layout(path)
         without = tmp_path / f"{sim}-without.mcap"
         mcaprl.open(path).save(without)
-        # The numbers come from the log, also if the layout is made anew.
+        # The numbers come from the log, also if the layout is made again.
         assert LogMetadata.from_strings(McapReader(without).metadata["mcaprl.dataset"]).view
     cameras = {
         sim: layout["configById"]["3D!scene"]["cameraState"] for sim, layout in layouts.items()
