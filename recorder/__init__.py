@@ -15,6 +15,7 @@
 from mcaprl.lazy import lazy_attributes
 
 __all__ = [
+    "MAPPING_SECTIONS",
     "STEP_TOPIC",
     "ChunkHeader",
     "McapReader",
@@ -37,6 +38,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.recorder.columns.records": ("map_file",),
         "mcaprl.recorder.format.schema": ("message_dtype", "step_schema"),
         "mcaprl.recorder.format.topics": ("STEP_TOPIC",),
+        "mcaprl.recorder.mapping.config": ("MAPPING_SECTIONS",),
         "mcaprl.recorder.viewer.playback": ("Player", "Track"),
     },
 )

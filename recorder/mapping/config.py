@@ -233,6 +233,18 @@ class Mapping(_Part):
         return {**self.observation, **self.fields}
 
 
+MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
+    "The file": Mapping,
+    "clock": Clock,
+    "An entry of observation or fields, and behavior_prob": Quantity,
+    "action": Action,
+    "action.box": Limits,
+    "episodes": Episodes,
+    "meta": Meta,
+}
+"""Models of the parts of a mapping, by the titles of the reference."""
+
+
 class Place:
     """Position of each key of a mapping file, for errors."""
 
