@@ -23,7 +23,7 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 _STOPS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# Shells make background processes ignore SIGINT. On Windows, a process cannot handle SIGTERM.
+# Signal that ends a worker: background processes ignore SIGINT, and Windows cannot handle SIGTERM.
 _END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 

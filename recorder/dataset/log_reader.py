@@ -221,7 +221,7 @@ def described(reader: McapReader) -> LogMetadata | None:
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The summary section also contains this metadata, and it has a CRC.
+        # The summary section has a copy of this metadata, which a CRC protects.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata

@@ -54,7 +54,7 @@ def attached_layout(reader: McapReader) -> dict[str, Any]:
 
 
 def _first_frame(reader: McapReader) -> str:
-    """Return the first moving frame; empty if there is none."""
+    """Return the name of the first moving coordinate frame; empty if there is none."""
     channel = reader.channel_of(TF)
     first = next(reader.messages(channel), None) if channel is not None else None
     if first is None:

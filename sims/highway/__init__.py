@@ -1,4 +1,4 @@
-"""Lane keeping and racetracks of highway-env, `mcaprl/HighwayLane-v0`."""
+"""The sim `mcaprl/HighwayLane-v0`: lane keeping and racetracks of highway-env."""
 
 from mcaprl.sims.spec import SimSpec
 
