@@ -7,10 +7,10 @@ import re
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcaprl.recorder.bags.bag import Bag
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.bag import Bag
 
 _SUFFIX = re.compile(r"(.*?)\[(-?\d*)(?:(:)(-?\d*)(?::(-?\d*))?)?\]")
 

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcaprl.recorder.bags.bag import Bag
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import time_order
 from mcaprl.recorder.mapping.config import TimeSource
 

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcaprl.recorder.bags.bag import Bag
 from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
+from mcaprl.recorder.bags.bag import Bag
 from mcaprl.recorder.mapping.align import NONE, last, nearest
 
 Floats = NDArray[np.float64]
