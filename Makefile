@@ -78,7 +78,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,fast]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,fast]' --group dev
 	@touch $@
 
 # The libraries that the benchmarks compare with.
