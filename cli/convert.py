@@ -1,4 +1,4 @@
-"""`mcaprl convert`: other robots' bags as logs."""
+"""`mcaprl convert`: logs from and to other robots' bags and other tools' datasets."""
 
 from __future__ import annotations
 
@@ -14,43 +14,62 @@ from mcaprl.texts import counted
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="BAG... [OUT]")
+@click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]")
 @mapping_options
-@click.option("--suggest", is_flag=True, help="Print a mapping to begin with; there is no OUT.")
-@click.option("--dry-run", is_flag=True, help="Write nothing; there is no OUT.")
+@click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not clear.")
+@click.option("--to", metavar="FORMAT", help="Format of DST if its name does not say it.")
+@click.option("--lossy", is_flag=True, help="Convert or leave out what the format cannot hold.")
+@click.option("--suggest", is_flag=True, help="Print a mapping to begin with; there is no DST.")
+@click.option("--dry-run", is_flag=True, help="Write nothing; there is no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @json_option
 def convert(
     paths: tuple[str, ...],
     mapping: Path | None,
     trust_code: bool,
+    source_format: str | None,
+    to: str | None,
+    lossy: bool,
     suggest: bool,
     dry_run: bool,
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Read BAG by a mapping, and write its transitions to the log OUT.
+    """Read SRC, and write its transitions to DST.
 
-    BAG is an MCAP file of any writer, a rosbag2 folder or database, or a ROS 1 bag. Begin with
-    `mcaprl convert --suggest BAG > robot.yaml`.
+    SRC is a log, a dataset of another tool, or, with --mapping, the bag of another robot: an MCAP
+    file of any writer, a rosbag2 folder or database, or a ROS 1 bag. For a bag, begin with
+    `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap, otherwise a
+    dataset of the format --to: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
     if suggest:
         click.echo(mcaprl.suggest_mapping(paths), nl=False)
         return
-    if mapping is None:
-        raise UsageError("convert needs --mapping FILE, or --suggest for a mapping to begin with")
     if not dry_run and len(paths) < 2:
-        raise UsageError("convert needs BAG and OUT, or --dry-run to write nothing")
-    bags, out = (paths, None) if dry_run else (paths[:-1], paths[-1])
-    found = mcaprl.convert(bags, out, mapping=mapping, trust_code=trust_code, overwrite=overwrite)
+        raise UsageError("convert needs SRC and DST, or --dry-run to write nothing")
+    sources, out = (paths, None) if dry_run else (paths[:-1], paths[-1])
+    found = mcaprl.convert(
+        sources,
+        out,
+        mapping=mapping,
+        source_format=source_format,
+        to=to,
+        lossy=lossy,
+        trust_code=trust_code,
+        overwrite=overwrite,
+    )
     if as_json:
         print_json(found.to_json())
         return
-    print_facts(", ".join(bags), found.report.rows())
+    if found.report is not None:
+        print_facts(", ".join(sources), found.report.rows())
     if dry_run:
         for number, step in enumerate(found.first()):
             echo(f"{number}: {step}")
-    print_problems(found.report.problems())
+    if found.report is not None:
+        print_problems(found.report.problems())
+    for sentence in found.lost:
+        echo(f"lost: {sentence}")
     if found.out is not None:
         data = found.dataset
         steps = counted(len(data), "step")

@@ -254,6 +254,51 @@ def replacing(
         raise
 
 
+@contextmanager
+def replacing_folder(
+    path: Path, error_type: type[McaprlError] = LogError, *, overwrite: bool = False
+) -> Iterator[Path]:
+    """Yield an empty folder in a work folder; move it to `path` at the end.
+
+    The files are synced to disk before the move. If the body raises, `path` is left as it was.
+
+    Args:
+        path: Folder to create or replace.
+        error_type: Type raised in place of an OSError.
+        overwrite: Whether an existing folder is replaced.
+
+    Raises:
+        OutputExistsError: The folder exists and is not to be replaced, or is not a folder.
+        LogError: Another process is writing the folder.
+        McaprlError: A file cannot be written.
+    """
+    _check_folder(path, overwrite=overwrite)
+    try:
+        with work_folder(path) as work:
+            unfinished = work / path.name
+            unfinished.mkdir()
+            yield unfinished
+            for file in (entry for entry in unfinished.rglob("*") if entry.is_file()):
+                with file.open("rb+") as opened:
+                    os.fsync(opened.fileno())
+            _check_folder(path, overwrite=overwrite)
+            if path.exists():
+                # Two moves, between which neither folder is at `path`: both are complete.
+                os.rename(path, work / f"{path.name}.old")
+            os.rename(unfinished, path)
+    except OSError as error:
+        raise error_type(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _check_folder(path: Path, *, overwrite: bool) -> None:
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        raise OutputExistsError(f"{path} is not a folder: choose another path")
+    if path.exists() and not overwrite:
+        raise OutputExistsError(
+            f"{path} exists: choose another path, or pass --overwrite (overwrite=True in Python)"
+        )
+
+
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:
     """Move a complete file to its target atomically, unless another writer has locked it."""
     if not overwrite:

@@ -1,17 +1,17 @@
-"""Conversion of another robot's bag into a log, and a mapping to begin with."""
+"""Conversion between logs, other robots' bags and other tools' datasets."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mcaprl.api.data import MappingFile, Paths, mapped
-from mcaprl.errors import UsageError
+from mcaprl.api.data import MappingFile, Paths, mapped, open_data
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.registry import target_format, write_format
 
 if TYPE_CHECKING:
     from mcaprl.recorder.mapping.summary import MappingReport
@@ -25,14 +25,16 @@ class Conversion:
     """Result of `convert`.
 
     Attributes:
-        dataset: Transitions of the bag.
-        report: What the mapping found and left out.
-        out: Path of the log; None if none was written.
+        dataset: Transitions that were read.
+        report: What the mapping found and left out; None without a mapping.
+        out: Path of what was written; None if nothing was.
+        lost: One sentence for each thing that the target's format cannot hold.
     """
 
     dataset: Dataset
-    report: MappingReport
+    report: MappingReport | None
     out: Path | None
+    lost: list[str] = field(default_factory=list)
 
     def first(self) -> list[dict[str, Any]]:
         """Return the first five transitions, as JSON types."""
@@ -52,41 +54,63 @@ class Conversion:
     def to_json(self) -> dict[str, Any]:
         """Return what `convert --json` prints."""
         out = None if self.out is None else str(self.out)
-        return {**self.report.to_json(), "first": self.first(), "out": out}
+        report = {} if self.report is None else self.report.to_json()
+        return {**report, "first": self.first(), "out": out, "lost": self.lost}
 
 
 def convert(
-    bag: Paths,
+    source: Paths,
     out: str | Path | None,
     *,
-    mapping: MappingFile,
+    mapping: MappingFile | None = None,
+    source_format: str | None = None,
+    to: str | None = None,
+    lossy: bool = False,
     trust_code: bool = False,
     overwrite: bool = False,
 ) -> Conversion:
-    """Read another robot's bag by a mapping, and write its transitions as a log.
+    """Read logs, another tool's dataset or another robot's bag, and write a log or a dataset.
 
     Args:
-        bag: MCAP files, rosbag2 folders and databases, or ROS 1 bags.
-        out: Path of the log; None to write none.
+        source: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and
+            databases, or ROS 1 bags.
+        out: Path of the log or dataset; None to write none.
         mapping: Mapping file, or its keys and values; see docs/bags.md.
+        source_format: Name of the format of `source`; default: what it looks like.
+        to: Name of the format to write; default: a log if `out` ends with .mcap, otherwise the
+            format with the suffix of `out`.
+        lossy: Whether what the format cannot hold is left out or converted.
         trust_code: Whether the mapping may name a Python function, which is imported.
-        overwrite: Whether an existing file is replaced.
+        overwrite: Whether an existing file or folder is replaced.
 
     Raises:
-        UsageError: The mapping does not fit the bag; the message names file, line and key.
-        LogError: The bag cannot be read, or has no episode; or `out` cannot be written.
+        UsageError: The format to write is not clear; or the mapping does not fit the bag, and the
+            message names file, line and key.
+        LogError: The source cannot be read, or has no episode; or `out` cannot be written.
+        SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
         OutputExistsError: `out` exists.
-        MissingExtraError: The packages of the `bags` extra are not installed.
+        MissingExtraError: The packages of an extra are not installed.
     """
-    path = None if out is None else Path(out)
-    if path is not None:
-        if path.suffix != ".mcap":
-            raise UsageError(f"{path}: the name of a log ends with .mcap")
-        check_target(path, overwrite=overwrite)
-    dataset, report = mapped(bag, mapping, trust_code=trust_code)
-    if path is not None:
-        dataset.save(path, overwrite=overwrite)
-    return Conversion(dataset, report, path)
+    is_log = out is not None and to is None and Path(out).suffix == ".mcap"
+    form = None if out is None or is_log else target_format(out, to)
+    if out is not None and is_log:
+        check_target(Path(out), overwrite=overwrite)
+    dataset, report = _read(source, mapping, source_format, trust_code)
+    lost: list[str] = []
+    if out is not None and form is not None:
+        lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
+    elif out is not None:
+        dataset.save(out, overwrite=overwrite)
+    return Conversion(dataset, report, None if out is None else Path(out), lost)
+
+
+def _read(
+    source: Paths, mapping: MappingFile | None, source_format: str | None, trust_code: bool
+) -> tuple[Dataset, MappingReport | None]:
+    if mapping is None:
+        return open_data(source, format=source_format), None
+    found = mapped(source, mapping, trust_code=trust_code)
+    return found.dataset, found.report
 
 
 def suggest_mapping(bag: Paths) -> str:

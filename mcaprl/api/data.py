@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -12,6 +12,7 @@ from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.open import Episodes, open_logs
 
 if TYPE_CHECKING:
+    from mcaprl.recorder.dataset.formats.registry import Format
     from mcaprl.recorder.mapping.read import MappedBag
 
 Paths = str | Path | Sequence[str | Path]
@@ -29,12 +30,13 @@ def open_data(
     *,
     mapping: MappingFile | None = None,
     trust_code: bool = False,
+    format: str | None = None,
     columns: Sequence[str] | None = None,
     episodes: Episodes | None = None,
     images: Storage = "auto",
     threads: int = 1,
 ) -> Dataset:
-    """Read logs, or another robot's bag by a mapping.
+    """Read logs, another tool's dataset, or another robot's bag by a mapping.
 
     The CRCs of all chunks that are read are checked. If a log was cut off or is still being
     written, its finished episodes are read, with a warning. If there are several logs, those
@@ -42,11 +44,13 @@ def open_data(
 
     Args:
         data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
-            the same spaces; their episodes are concatenated in the order of the files. With a
-            mapping: MCAP files of any writer, rosbag2 folders and databases, or ROS 1 bags.
+            the same spaces; their episodes are concatenated in the order of the files. Or one
+            dataset of another tool; see docs/formats.md. With a mapping: MCAP files of any writer,
+            rosbag2 folders and databases, or ROS 1 bags.
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
+        format: Name of the other tool's format; default: what the path looks like.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these. An empty sequence reads no
             observations. Actions, rewards and end flags are always read. Default: all keys.
@@ -64,11 +68,33 @@ def open_data(
         UsageError: A column or an episode does not exist, or the mapping does not fit the bag.
         MissingExtraError: A mapping needs the packages of the `bags` extra.
     """
-    if mapping is None:
+    other = None if mapping is not None else _other_format(data, format)
+    if mapping is None and other is None:
         return open_logs(data, columns=columns, episodes=episodes, images=images, threads=threads)
     if columns is not None or episodes is not None or images == "mapped":
-        raise UsageError("columns, episodes and mapped images are for logs, not for a mapping")
+        what = f"the format {other.name}" if other is not None else "a mapping"
+        raise UsageError(f"columns, episodes and mapped images are for logs, not for {what}")
+    if other is not None:
+        from mcaprl.recorder.dataset.formats.registry import read_format
+
+        return read_format(cast("str | Path", data), other)
+    assert mapping is not None
     return mapped(data, mapping, trust_code=trust_code).dataset
+
+
+def _other_format(data: Paths, name: str | None) -> Format | None:
+    """Return the format of another tool's dataset; None for logs."""
+    one = data if isinstance(data, str | Path) else data[0] if len(data) == 1 else None
+    path = None if one is None else Path(one)
+    is_log = path is None or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap")))
+    if name is None and is_log:
+        return None
+    from mcaprl.recorder.dataset.formats.registry import format_named, recognized
+
+    if name is not None:
+        return format_named(name)
+    assert one is not None
+    return recognized(one)
 
 
 def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:

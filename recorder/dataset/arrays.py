@@ -157,7 +157,7 @@ def _leaf_array(role: str, values: Any, leaf: Leaf, steps: int) -> NDArray[Any]:
         raise SpaceError(f"{where} is missing") from error
     if array.shape != (steps, *leaf.shape):
         raise SpaceError(f"{where} has shape {array.shape}, expected {(steps, *leaf.shape)}")
-    return _exactly(where, array, leaf.dtype)
+    return exactly(where, array, leaf.dtype)
 
 
 def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
@@ -169,8 +169,17 @@ def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
     return array.astype(dtype)
 
 
-def _exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Cast an array exactly, or raise an error."""
+def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Copy an array in a dtype that holds each of its values exactly.
+
+    Args:
+        where: Name of the array for the error.
+        array: Any numeric array.
+        dtype: Data type of the result.
+
+    Raises:
+        SpaceError: A value changes.
+    """
     if array.dtype == dtype:
         return array.copy()
     with np.errstate(all="ignore"):

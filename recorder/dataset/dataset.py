@@ -13,6 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, SpaceError, UnknownNameError
+from mcaprl.recorder.dataset.conversions import Conversions
 from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 _BLOCK_ROWS = 1024
 
 
-class Dataset:
+class Dataset(Conversions):
     """Transitions of whole episodes, from logs or from arrays.
 
     Attributes:

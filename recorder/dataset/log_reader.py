@@ -244,7 +244,8 @@ def _steps_of(reader: McapReader) -> Topic:
     if not channels:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
-            f"{reader.path} has no topic {STEP_TOPIC}, hence no transitions (topics: {topics})"
+            f"{reader.path} has no topic {STEP_TOPIC}, hence no transitions (topics: {topics});"
+            " another robot's bag is read by a mapping: --mapping (mapping= in Python)"
         )
     for schema in map(reader.schema_of, channels):
         if not is_intact(schema.name, schema.data):

@@ -1,0 +1,235 @@
+"""Conversions of a dataset to and from other tools' data, as methods of `Dataset`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.dataset.dataset import Dataset
+
+
+class Conversions:
+    """Methods of `Dataset` that convert to and from other tools' data."""
+
+    def to_lerobot(
+        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+    ) -> list[str]:
+        """Write a LeRobot dataset v3.
+
+        Args:
+            path: Path of the folder.
+            lossy: Whether what the format cannot hold is left out or converted.
+            overwrite: Whether what exists at the path is replaced.
+
+        Returns:
+            One sentence for each thing that was left out or changed.
+
+        Raises:
+            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+            OutputExistsError: Something exists at the path, and `overwrite` is not set.
+            LogError: The files cannot be written, or the dataset has no episodes.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return self._written("lerobot", path, lossy=lossy, overwrite=overwrite)
+
+    @staticmethod
+    def from_lerobot(path: str | Path) -> Dataset:
+        """Read a LeRobot dataset v3.
+
+        Raises:
+            LogError: The files are missing, damaged or of another format.
+            SpaceError: A log cannot hold a space or dtype of the data.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return _read("lerobot", path)
+
+    def to_minari(
+        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+    ) -> list[str]:
+        """Write a Minari dataset.
+
+        Args:
+            path: Path of the folder, whose name is the dataset's and ends with its version, such as
+                `drive-v0`; or `minari:ID` for Minari's folder of local datasets.
+            lossy: Whether what the format cannot hold is left out or converted.
+            overwrite: Whether what exists at the path is replaced.
+
+        Returns:
+            One sentence for each thing that was left out or changed.
+
+        Raises:
+            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+            OutputExistsError: Something exists at the path, and `overwrite` is not set.
+            LogError: The files cannot be written, or the dataset has no episodes.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return self._written("minari", path, lossy=lossy, overwrite=overwrite)
+
+    @staticmethod
+    def from_minari(path: str | Path) -> Dataset:
+        """Read a Minari dataset.
+
+        Raises:
+            LogError: The files are missing, damaged or of another format.
+            SpaceError: A log cannot hold a space or dtype of the data.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return _read("minari", path)
+
+    def to_parquet(
+        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+    ) -> list[str]:
+        """Write Parquet files, one of transitions and one of episodes.
+
+        Args:
+            path: Path of the folder.
+            lossy: Whether what the format cannot hold is left out or converted.
+            overwrite: Whether what exists at the path is replaced.
+
+        Returns:
+            One sentence for each thing that was left out or changed.
+
+        Raises:
+            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+            OutputExistsError: Something exists at the path, and `overwrite` is not set.
+            LogError: The files cannot be written, or the dataset has no episodes.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return self._written("parquet", path, lossy=lossy, overwrite=overwrite)
+
+    @staticmethod
+    def from_parquet(path: str | Path) -> Dataset:
+        """Read Parquet files, one of transitions and one of episodes.
+
+        Raises:
+            LogError: The files are missing, damaged or of another format.
+            SpaceError: A log cannot hold a space or dtype of the data.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return _read("parquet", path)
+
+    def to_hdf5(
+        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+    ) -> list[str]:
+        """Write an HDF5 file in D4RL's form.
+
+        Args:
+            path: Path of the file.
+            lossy: Whether what the format cannot hold is left out or converted.
+            overwrite: Whether what exists at the path is replaced.
+
+        Returns:
+            One sentence for each thing that was left out or changed.
+
+        Raises:
+            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+            OutputExistsError: Something exists at the path, and `overwrite` is not set.
+            LogError: The files cannot be written, or the dataset has no episodes.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return self._written("hdf5", path, lossy=lossy, overwrite=overwrite)
+
+    @staticmethod
+    def from_hdf5(path: str | Path) -> Dataset:
+        """Read an HDF5 file in D4RL's form.
+
+        Raises:
+            LogError: The files are missing, damaged or of another format.
+            SpaceError: A log cannot hold a space or dtype of the data.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return _read("hdf5", path)
+
+    def to_npz(
+        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+    ) -> list[str]:
+        """Write NumPy arrays in one .npz file.
+
+        Args:
+            path: Path of the file.
+            lossy: Whether what the format cannot hold is left out or converted.
+            overwrite: Whether what exists at the path is replaced.
+
+        Returns:
+            One sentence for each thing that was left out or changed.
+
+        Raises:
+            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+            OutputExistsError: Something exists at the path, and `overwrite` is not set.
+            LogError: The files cannot be written, or the dataset has no episodes.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return self._written("npz", path, lossy=lossy, overwrite=overwrite)
+
+    @staticmethod
+    def from_npz(path: str | Path) -> Dataset:
+        """Read NumPy arrays in one .npz file.
+
+        Raises:
+            LogError: The files are missing, damaged or of another format.
+            SpaceError: A log cannot hold a space or dtype of the data.
+            MissingExtraError: A package of the format is not installed.
+        """
+        return _read("npz", path)
+
+    def to_d3rlpy(self) -> Any:
+        """Return a `d3rlpy.dataset.MDPDataset` with all transitions, those before a truncation too.
+
+        Raises:
+            SpaceError: d3rlpy cannot hold a space.
+            MissingExtraError: d3rlpy is not installed.
+        """
+        from mcaprl.recorder.dataset.formats.d3rlpy import to_mdp_dataset
+
+        return to_mdp_dataset(cast("Dataset", self))
+
+    @staticmethod
+    def from_d3rlpy(buffer: Any) -> Dataset:
+        """Copy the episodes of a d3rlpy replay buffer, `MDPDataset` included.
+
+        Raises:
+            SpaceError: A log cannot hold a space or dtype of the data.
+        """
+        from mcaprl.recorder.dataset.formats.d3rlpy import from_buffer
+
+        return from_buffer(buffer)
+
+    def to_sb3(self, *, device: str = "cpu", **options: Any) -> Any:
+        """Return a Stable-Baselines3 `ReplayBuffer` or `DictReplayBuffer` with all transitions.
+
+        Args:
+            device: Torch device of the samples.
+            options: Further arguments of the buffer.
+
+        Raises:
+            SpaceError: The buffer cannot hold a space.
+            MissingExtraError: Stable-Baselines3 is not installed.
+        """
+        from mcaprl.recorder.dataset.formats.sb3 import to_buffer
+
+        return to_buffer(cast("Dataset", self), device=device, **options)
+
+    @staticmethod
+    def from_sb3(buffer: Any) -> Dataset:
+        """Copy the transitions of a Stable-Baselines3 replay buffer, column by column in order.
+
+        Raises:
+            SpaceError: A log cannot hold a space or dtype of the data.
+            LogError: The buffer is empty.
+        """
+        from mcaprl.recorder.dataset.formats.sb3 import from_buffer
+
+        return from_buffer(buffer)
+
+    def _written(self, name: str, path: str | Path, *, lossy: bool, overwrite: bool) -> list[str]:
+        from mcaprl.recorder.dataset.formats.registry import format_named, write_format
+
+        dataset, form = cast("Dataset", self), format_named(name)
+        return write_format(dataset, path, form, lossy=lossy, overwrite=overwrite)
+
+
+def _read(name: str, path: str | Path) -> Dataset:
+    from mcaprl.recorder.dataset.formats.registry import format_named, read_format
+
+    return read_format(path, format_named(name))

@@ -1,0 +1,1 @@
+"""Other tools' data formats, one module each."""

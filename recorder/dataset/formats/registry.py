@@ -1,0 +1,162 @@
+"""The formats that are read and written, found by name or by what a path looks like.
+
+The module of a format has these functions; one that only writes has no `matches` and `read`:
+
+    matches(path: Path) -> bool                 whether a file or folder is of the format
+    read(path: Path) -> Dataset                 all episodes
+    write(dataset: Dataset, path: Path, *, lossy: bool) -> list[str]
+                                                writes the new file or the empty folder `path`;
+                                                returns one sentence for each thing lost
+    local_path(name: str) -> Path               optional: the folder that `FORMAT:NAME` stands for
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcaprl.errors import LogError, UnknownNameError, UsageError
+from mcaprl.files import replacing, replacing_folder
+from mcaprl.recorder.dataset.dataset import Dataset
+
+
+class Format(NamedTuple):
+    """A data format.
+
+    Attributes:
+        name: Name in `--to` and `--from`.
+        about: What it is, for lists of formats.
+        suffix: Suffix of its files' names; empty if it is a folder.
+        reads: Whether it is read.
+    """
+
+    name: str
+    about: str
+    suffix: str = ""
+    reads: bool = True
+
+    @property
+    def module(self) -> Any:
+        """Module that reads and writes the format."""
+        return import_module(f"mcaprl.recorder.dataset.formats.{self.name}")
+
+
+# Where several formats match a path, the first one reads it.
+FORMATS = {
+    form.name: form
+    for form in (
+        Format("lerobot", "LeRobot dataset v3 (folder)"),
+        Format("minari", "Minari dataset (folder, or minari:ID of a local dataset)"),
+        Format("parquet", "Parquet files of transitions and episodes (folder)"),
+        Format("npz", "NumPy arrays by name", ".npz"),
+        Format("d3rlpy", "d3rlpy's ReplayBuffer file", ".h5"),
+        Format("hdf5", "D4RL's or robomimic's HDF5 file", ".hdf5"),
+    )
+}
+"""All formats, by name."""
+
+
+def format_named(name: str) -> Format:
+    """Return a format by its name.
+
+    Raises:
+        UnknownNameError: There is no such format; the message lists those that there are.
+    """
+    if name not in FORMATS:
+        raise UnknownNameError("format", name, list(FORMATS))
+    return FORMATS[name]
+
+
+def recognized(path: str | Path) -> Format | None:
+    """Return the format that a file, a folder or `FORMAT:NAME` is of; None if none matches."""
+    name, colon, _ = str(path).partition(":")
+    if colon and name in FORMATS:
+        return FORMATS[name]
+    if not Path(path).exists():
+        return None
+    readable = (form for form in FORMATS.values() if form.reads)
+    return next((form for form in readable if form.module.matches(Path(path))), None)
+
+
+def target_format(path: str | Path, name: str | None) -> Format:
+    """Return the format to write: by its name, or else by the suffix of the path.
+
+    Raises:
+        UnknownNameError: There is no format with this name.
+        UsageError: The name is not given, and no format or more than one has this suffix.
+    """
+    if name is not None:
+        return format_named(name)
+    start, colon, _ = str(path).partition(":")
+    if colon and start in FORMATS:
+        return FORMATS[start]
+    suffix = Path(path).suffix
+    found = [form for form in FORMATS.values() if form.suffix and form.suffix == suffix]
+    if len(found) != 1:
+        raise UsageError(
+            f"{path}: the format is not clear from the name; pass --to with one of"
+            f" {', '.join(FORMATS)}, or a name that ends with .mcap"
+        )
+    return found[0]
+
+
+def target_path(path: str | Path, form: Format) -> Path:
+    """Return the file or folder that a name stands for, such as `minari:drive/lane-v0`."""
+    prefix = f"{form.name}:"
+    if str(path).startswith(prefix) and hasattr(form.module, "local_path"):
+        local: Path = form.module.local_path(str(path).removeprefix(prefix))
+        return local
+    return Path(path)
+
+
+def read_format(path: str | Path, form: Format) -> Dataset:
+    """Read a file or folder of another format.
+
+    Raises:
+        LogError: The file is missing or damaged.
+        SpaceError: The data has a space that a log cannot hold.
+        MissingExtraError: The format needs a package that is not installed.
+    """
+    if not form.reads:
+        raise UsageError(f"{form.name} is written only")
+    source = target_path(path, form)
+    if not source.exists():
+        raise LogError(f"{path}: no such file or folder")
+    dataset: Dataset = form.module.read(source)
+    dataset.sources = dataset.sources or (source,)
+    return dataset
+
+
+def write_format(
+    dataset: Dataset,
+    path: str | Path,
+    form: Format,
+    *,
+    lossy: bool = False,
+    overwrite: bool = False,
+) -> list[str]:
+    """Write a dataset in another format; nothing is at `path` until it is complete.
+
+    Args:
+        dataset: Episodes to write.
+        path: File or folder to create.
+        form: Format to write.
+        lossy: Whether what the format cannot hold is left out or converted.
+        overwrite: Whether an existing file or folder is replaced.
+
+    Returns:
+        One sentence for each thing that was left out or changed.
+
+    Raises:
+        SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
+        OutputExistsError: `path` exists, and `overwrite` is not set.
+        LogError: The file cannot be written, or the dataset has no episodes.
+        MissingExtraError: The format needs a package that is not installed.
+    """
+    if not len(dataset.episode_lengths):
+        raise LogError(f"nothing to write to {path}: the dataset has no episodes")
+    target = replacing if form.suffix else replacing_folder
+    with target(target_path(path, form), LogError, overwrite=overwrite) as unfinished:
+        lost: list[str] = form.module.write(dataset, unfinished, lossy=lossy)
+    return lost
