@@ -1,0 +1,75 @@
+"""Make a robot's bag of the drives in a log of the lane sim.
+
+    mcaprl record lane --policy pilot --epsilon 0.1 --episodes 40 --out native.mcap
+    python examples/robot_bag/make_bag.py native.mcap bag                     # ROS 2, by rosbags
+    python examples/robot_bag/make_bag.py native.mcap drive.mcap --format protobuf   # foxglove-sdk
+    python examples/robot_bag/make_bag.py native.mcap drive.mcap --format json
+
+The log gives the starts and the actions alone; `robot.py` lists what the robot publishes.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+from robot import PAUSE_S, Drive, Message
+from writers import WRITERS
+
+import mcaprl
+from mcaprl.sims.lane.camera import CarCamera
+from mcaprl.sims.lane.env import LaneKeepingEnv
+
+START_NS = 1_700_000_000 * 10**9
+
+
+def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
+    """Write the drives of a log as a bag; return the number of messages.
+
+    Args:
+        log: Log of the lane sim with its default rules.
+        out: Folder of a ROS 2 bag, or MCAP file.
+        form: `ros2`, `protobuf` or `json`.
+    """
+    with WRITERS[form](Path(out)) as write:
+        count = 0
+        for time_ns, message in _recorded(log):
+            write(message.topic, time_ns, message.content)
+            count += 1
+    return count
+
+
+def _recorded(log: str | Path) -> Iterator[tuple[int, Message]]:
+    camera, start_ns = CarCamera(), START_NS
+    for drive in drives(log):
+        for message in drive.messages(camera, start_ns):
+            yield start_ns + round(message.time_s * 1e9), message
+        start_ns += round((drive.duration_s + PAUSE_S) * 1e9)
+
+
+def drives(log: str | Path) -> Iterator[Drive]:
+    """Yield the drives of a log, from their seeds and actions."""
+    env = mcaprl.make_sim("lane")
+    sim = cast(LaneKeepingEnv, env.unwrapped)
+    for episode in mcaprl.open(log).episodes:
+        env.reset(seed=episode.seed)
+        actions: list[Any] = episode.actions.tolist()
+        failed = bool(episode.terminated[-1])
+        yield Drive(sim.car, actions, is_failure=failed, seed=episode.index)
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("log", type=Path, help="log of the lane sim")
+    parser.add_argument("out", type=Path, help="folder of a ROS 2 bag, or MCAP file")
+    parser.add_argument("--format", choices=list(WRITERS), default="ros2")
+    arguments = parser.parse_args()
+    count = make_bag(arguments.log, arguments.out, arguments.format)
+    print(f"{arguments.out}: {count} messages")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""What a car with a lane detector publishes while it drives; it knows nothing of mcaprl's topics.
+
+/odom           nav_msgs/Odometry at 50 Hz: pose and speed
+/joint_states   sensor_msgs/JointState at 20 Hz: commanded position of the steering joint
+/lane           std_msgs/Float32MultiArray at 4 Hz, a lane detector: offset and heading error from
+                the middle of the lane, distance along the route, and four points of the lane ahead
+/cmd_vel        geometry_msgs/Twist at 20 Hz: speed and steering that the controller wants, chosen
+                after each message of the lane detector
+/e_stop         std_msgs/Bool: true when a safety monitor stops the car
+/camera/depth   sensor_msgs/Image at 10 Hz: depth in millimeters
+/diagnostics    diagnostic_msgs/DiagnosticArray at 1 Hz
+
+A message is a dict with the fields of its type; fields that are left out are zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mcaprl.sims.lane.camera import CarCamera
+from mcaprl.sims.lane.rules import (
+    BRAKE,
+    DECISION_S,
+    LOOKAHEADS_M,
+    MAX_SPEED_M_S,
+    MAX_STEERING_RAD,
+    STEERING,
+    SUBSTEP_S,
+    Car,
+    drive,
+    observe,
+)
+
+TYPES = {
+    "/odom": "nav_msgs/msg/Odometry",
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/lane": "std_msgs/msg/Float32MultiArray",
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+    "/e_stop": "std_msgs/msg/Bool",
+    "/camera/depth": "sensor_msgs/msg/Image",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+}
+PAUSE_S = 5.0
+"""Time between two drives."""
+_ODOMETRY_S, _COMMAND_S, _IMAGE_S, _DIAGNOSTICS_S = 0.02, 0.05, 0.1, 1.0
+_JITTER_S = 0.004
+"""Largest delay of a measurement until it is recorded."""
+_LANE_DELAY_S = 0.010
+_COMMAND_DELAY_S = 0.012
+_FAR_MM = 65_535
+
+
+class Message(NamedTuple):
+    """A recorded message.
+
+    Attributes:
+        time_s: Time of recording since the start of the drive, seconds.
+        topic: Name of a topic in `TYPES`.
+        content: Fields of the message.
+    """
+
+    time_s: float
+    topic: str
+    content: dict[str, Any]
+
+
+class Drive:
+    """One drive of the car: its start and the actions of the controller."""
+
+    def __init__(self, start: Car, actions: list[int], *, is_failure: bool, seed: int) -> None:
+        """Compute the motion; each action lasts 0.25 s.
+
+        Args:
+            start: State of the car at the start.
+            actions: Actions of the lane sim.
+            is_failure: Whether the safety monitor stops the car at the end.
+            seed: Seed of the delays.
+        """
+        self.actions = actions
+        self._is_failure = is_failure
+        self._random = np.random.default_rng(seed)
+        self._cars = [start]
+        for action in actions:
+            self._cars.append(drive(self._cars[-1], action))
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the drive, seconds."""
+        return len(self.actions) * DECISION_S
+
+    def messages(self, camera: CarCamera, start_ns: int) -> list[Message]:
+        """Return all messages in the order of recording; header stamps count from `start_ns`."""
+        parts = (
+            self._odometry(start_ns),
+            self._joints(start_ns),
+            self._lane(),
+            self._commands(),
+            self._stops(),
+            self._images(camera, start_ns),
+            self._diagnostics(start_ns),
+        )
+        return sorted(message for part in parts for message in part)
+
+    def _odometry(self, start_ns: int) -> Iterator[Message]:
+        for time_s in self._times(_ODOMETRY_S):
+            car = self._car(time_s)
+            pose = {
+                "position": {"x": car.x_m, "y": car.y_m},
+                "orientation": {"z": math.sin(car.yaw_rad / 2), "w": math.cos(car.yaw_rad / 2)},
+            }
+            yield self._measured(
+                time_s,
+                "/odom",
+                {
+                    "header": _header(start_ns, time_s, "odom"),
+                    "child_frame_id": "base_link",
+                    "pose": {"pose": pose},
+                    "twist": {"twist": {"linear": {"x": car.speed_m_s}}},
+                },
+            )
+
+    def _joints(self, start_ns: int) -> Iterator[Message]:
+        for time_s in self._times(_COMMAND_S):
+            content = {
+                "header": _header(start_ns, time_s, ""),
+                "name": ["steering"],
+                "position": [self._car(time_s).steering * MAX_STEERING_RAD],
+            }
+            yield self._measured(time_s, "/joint_states", content)
+
+    def _lane(self) -> Iterator[Message]:
+        seen = np.empty(12, np.float32)
+        for step, car in enumerate(self._cars):
+            observe(car, seen)
+            ahead_m = seen[4:] * np.repeat(LOOKAHEADS_M, 2)
+            data = [car.offset_m, car.heading_error_rad, car.along_m, *ahead_m.tolist()]
+            yield Message(step * DECISION_S + _LANE_DELAY_S, "/lane", {"data": data})
+
+    def _commands(self) -> Iterator[Message]:
+        for step, action in enumerate(self.actions):
+            speed = 0.0 if action == BRAKE else MAX_SPEED_M_S
+            content = {"linear": {"x": speed}, "angular": {"z": STEERING[action]}}
+            for repeat in range(round(DECISION_S / _COMMAND_S)):
+                time_s = step * DECISION_S + repeat * _COMMAND_S + _COMMAND_DELAY_S
+                yield Message(time_s, "/cmd_vel", content)
+
+    def _stops(self) -> Iterator[Message]:
+        yield Message(0.0, "/e_stop", {"data": False})
+        if self._is_failure:
+            yield Message(self.duration_s, "/e_stop", {"data": True})
+
+    def _images(self, camera: CarCamera, start_ns: int) -> Iterator[Message]:
+        for time_s in self._times(_IMAGE_S):
+            depth_mm = np.minimum(camera.image_m(self._car(time_s)) * 1000, _FAR_MM)
+            pixels = depth_mm.round().astype("<u2")
+            content = {
+                "header": _header(start_ns, time_s, "camera"),
+                "height": pixels.shape[0],
+                "width": pixels.shape[1],
+                "encoding": "16UC1",
+                "step": 2 * pixels.shape[1],
+                "data": pixels.tobytes(),
+            }
+            yield self._measured(time_s, "/camera/depth", content)
+
+    def _diagnostics(self, start_ns: int) -> Iterator[Message]:
+        for time_s in self._times(_DIAGNOSTICS_S):
+            status = {"name": "drive", "message": "OK", "hardware_id": "car"}
+            content = {"header": _header(start_ns, time_s, ""), "status": [status]}
+            yield self._measured(time_s, "/diagnostics", content)
+
+    def _times(self, period_s: float) -> Iterator[float]:
+        count = round(self.duration_s / period_s)
+        return (
+            number * period_s for number in range(count + 1) if number * period_s <= self.duration_s
+        )
+
+    def _measured(self, time_s: float, topic: str, content: dict[str, Any]) -> Message:
+        delay_s = float(self._random.uniform(0.0, _JITTER_S))
+        return Message(time_s + delay_s, topic, content)
+
+    def _car(self, time_s: float) -> Car:
+        """Return the car at a time, interpolated between two substeps of the sim."""
+        step = min(int(time_s / DECISION_S + 1e-9), len(self.actions))
+        rest = (time_s - step * DECISION_S) / SUBSTEP_S
+        before = self._cars[step]
+        if step == len(self.actions) or rest < 1e-6:
+            return before
+        count = int(rest + 1e-9)
+        low = drive(before, self.actions[step], count) if count else before
+        high = drive(before, self.actions[step], count + 1)
+        return _between(low, high, rest - count)
+
+
+def _between(low: Car, high: Car, share: float) -> Car:
+    turn = math.remainder(high.yaw_rad - low.yaw_rad, 2 * math.pi)
+    return high._replace(
+        x_m=low.x_m + share * (high.x_m - low.x_m),
+        y_m=low.y_m + share * (high.y_m - low.y_m),
+        yaw_rad=low.yaw_rad + share * turn,
+        speed_m_s=low.speed_m_s + share * (high.speed_m_s - low.speed_m_s),
+    )
+
+
+def _header(start_ns: int, time_s: float, frame: str) -> dict[str, Any]:
+    stamp_ns = start_ns + round(time_s * 1e9)
+    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
