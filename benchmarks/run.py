@@ -9,14 +9,14 @@ import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from benchmarks import growth, logs, sims
+from benchmarks import bags, growth, logs, sims
 from benchmarks.measure import Table
 from benchmarks.workloads import IMAGE_STEPS
 from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
-PARTS = ["logs", "growth", "sims"]
+PARTS = ["logs", "bags", "growth", "sims"]
 LIBRARIES = (
     "numpy",
     "zstandard",
@@ -24,6 +24,8 @@ LIBRARIES = (
     "mcap-ros2-support",
     "foxglove-sdk",
     "rosbags",
+    "rerun-sdk",
+    "pillow",
     "minari",
     "h5py",
     "pyarrow",
@@ -67,6 +69,8 @@ def main() -> None:
         folder, found = Path(name), []
         if "logs" in arguments.only:
             found += logs.tables(folder, arguments.transitions)
+        if "bags" in arguments.only:
+            found += bags.tables(folder)
         if "growth" in arguments.only:
             found += growth.tables(folder, sizes)
         if "sims" in arguments.only:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -68,11 +68,13 @@ class Bag(Protocol):
 
     Attributes:
         paths: Files of the bag.
-        topics: Facts of each topic by name.
     """
 
     paths: tuple[Path, ...]
-    topics: dict[str, TopicInfo]
+
+    @property
+    def topics(self) -> Mapping[str, TopicInfo]:
+        """Facts of each topic by name."""
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the (N,) log_times of a topic, in file order."""
@@ -102,19 +104,24 @@ class _Topic:
 
     def __init__(self, name: str, sources: Sequence[TopicSource]) -> None:
         self.name = name
-        used = [each for each in sources if len(each.times_ns)] or list(sources[:1])
-        # Files of a split bag follow each other in time.
-        self._sources = sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
-        self._definition = self._sources[0].definition
+        self._given = sources
         self._decoder: MessageDecoder | None = None
-        self.info = self._info()
+
+    @cached_property
+    def _sources(self) -> list[TopicSource]:
+        if len(self._given) == 1:
+            return list(self._given)
+        used = [each for each in self._given if len(each.times_ns)] or list(self._given[:1])
+        # Files of a split bag follow each other in time.
+        return sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
 
     @cached_property
     def times_ns(self) -> NDArray[np.int64]:
         return np.concatenate([each.times_ns for each in self._sources])
 
-    def _info(self) -> TopicInfo:
-        found, problem = self._definition, ""
+    @cached_property
+    def info(self) -> TopicInfo:
+        found, problem = self._sources[0].definition, ""
         kinds = {each.definition.type_name for each in self._sources}
         try:
             if len(kinds) > 1:
@@ -183,6 +190,22 @@ class _Topic:
             first = stop
 
 
+class _Infos(Mapping[str, TopicInfo]):
+    """Facts of each topic by name; a topic's definition is parsed when it is asked for."""
+
+    def __init__(self, topics: Mapping[str, _Topic]) -> None:
+        self._topics = topics
+
+    def __getitem__(self, name: str) -> TopicInfo:
+        return self._topics[name].info
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._topics)
+
+    def __len__(self) -> int:
+        return len(self._topics)
+
+
 class _FileBag:
     """A bag of files."""
 
@@ -194,7 +217,7 @@ class _FileBag:
             name: _Topic(name, [each for file in files for each in file.topics.get(name, [])])
             for name in sorted(names)
         }
-        self.topics = {name: topic.info for name, topic in self._topics.items()}
+        self.topics: Mapping[str, TopicInfo] = _Infos(self._topics)
 
     def times(self, topic: str) -> NDArray[np.int64]:
         return self._topic(topic).times_ns

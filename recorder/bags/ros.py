@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mcaprl.errors import LogError
-from mcaprl.recorder.format.reading import ROS1, full_name, leaf_kinds, store_of
+from mcaprl.recorder.format.reading import ROS1, definitions_of, full_name, leaf_kinds
 
 
 class RosDecoder:
@@ -32,10 +31,9 @@ class RosDecoder:
         """
         self._is_ros1 = encoding == ROS1
         self._name = full_name(type_name)
-        self._store = store_of(self._name, text, encoding, distribution)
-        constants, _ = self._store.fielddefs[self._name]
-        self.constants = {name: value for name, _, value in constants if isinstance(value, int)}
-        self.fields = leaf_kinds(self._store, self._name)
+        self._definitions = definitions_of(self._name, text, encoding, distribution)
+        self.constants = self._definitions.constants
+        self.fields = leaf_kinds(self._definitions.types, self._name)
 
     def decode(self, data: bytes) -> Any:
         """Decode a message to an object with an attribute for each field.
@@ -43,10 +41,4 @@ class RosDecoder:
         Raises:
             LogError: The bytes do not fit the type.
         """
-        try:
-            if self._is_ros1:
-                return self._store.deserialize_ros1(data, self._name)
-            return self._store.deserialize_cdr(data, self._name)
-        # The library raises errors of many types; each means that the bytes do not fit.
-        except Exception as error:
-            raise LogError(f"{len(data)} bytes are not a {self._name}: {error}") from error
+        return self._definitions.decode(data, is_ros1=self._is_ros1)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
 from mcaprl.errors import CorruptLogError, LogError
-from mcaprl.recorder.columns.definitions import TIME_TYPES, full_name, leaf_kinds, store_of
+from mcaprl.recorder.columns.definitions import TIME_TYPES, definitions_of, full_name, leaf_kinds
 
 # The encapsulation header of little-endian plain CDR, bytes 00 01 00 00, as a uint32.
 ENCAPSULATION = 0x0100
@@ -84,15 +84,15 @@ class MessageType:
     """Message type parsed from a schema."""
 
     def __init__(self, name: str, text: str, encoding: str = "ros2msg") -> None:
-        """Parse a ROS 2 definition; see `definitions.store_of`.
+        """Parse a ROS 2 definition; see `definitions_of`.
 
         Raises:
             LogError: The definition does not parse, or a type is not defined.
         """
         self.name = name = full_name(name)
         self._layouts: dict[tuple[object, ...], Layout | None] = {}
-        self._store = store_of(name, text, encoding)
-        self._fields = dict(self._store.fielddefs[name][1])
+        self._definitions = definitions_of(name, text, encoding)
+        self._fields = self._definitions.fields
 
     @cached_property
     def dtypes(self) -> dict[str, np.dtype[Any]]:
@@ -102,7 +102,7 @@ class MessageType:
     @cached_property
     def kinds(self) -> dict[str, str]:
         """Kind of each leaf field by its dotted path; see `definitions.leaf_kinds`."""
-        return leaf_kinds(self._store, self.name)
+        return leaf_kinds(self._definitions.types, self.name)
 
     def leaf_dtype(self, path: str) -> np.dtype[Any]:
         """Return the dtype of a leaf field; int64 for times, `object` for strings and lists."""
@@ -116,10 +116,9 @@ class MessageType:
             CorruptLogError: The bytes do not fit the type.
         """
         try:
-            return self._store.deserialize_cdr(data, self.name)
-        # The library raises errors of many types when a message does not fit its type.
-        except Exception as error:
-            raise CorruptLogError(f"{len(data)} bytes are not a {self.name}: {error}") from error
+            return self._definitions.decode(data)
+        except LogError as error:
+            raise CorruptLogError(str(error)) from error
 
     def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
         """Return the layout that was found last for this message length; None if there is none."""
@@ -164,7 +163,7 @@ class MessageType:
             case Nodetype.NAME:
                 # Names are composed only where a wanted path may be.
                 within = wanted if any(each.startswith(f"{path}.") for each in wanted) else ()
-                for inner, found in self._store.fielddefs[what][1]:
+                for inner, found in self._definitions.types[what][1]:
                     self._pass(walk, found, f"{path}.{inner}" if within else path, within)
             case Nodetype.ARRAY | Nodetype.SEQUENCE:
                 element, count = what

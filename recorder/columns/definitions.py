@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -30,8 +31,56 @@ def full_name(name: str) -> str:
     return name if not slash or folder.endswith("/msg") else f"{folder}/msg/{last}"
 
 
-def store_of(name: str, text: str, encoding: str = "ros2msg", distribution: str = "") -> Typestore:
-    """Return a store with a type and all types that are nested in it.
+class Definitions:
+    """A type and all types that are nested in it.
+
+    Attributes:
+        name: Full name of the type.
+        types: Constants and fields of each type by its full name, as rosbags describes them.
+    """
+
+    def __init__(self, name: str, types: dict[str, Any]) -> None:
+        """Store the parsed definitions; see `definitions_of`."""
+        self.name = name
+        self.types = types
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Description of each field of the type by its name."""
+        return dict(self.types[self.name][1])
+
+    @property
+    def constants(self) -> dict[str, int]:
+        """Integer constants of the type by name."""
+        return {name: value for name, _, value in self.types[self.name][0] if type(value) is int}
+
+    @cached_property
+    def _store(self) -> Typestore:
+        """Store whose generated code decodes messages; generating takes milliseconds."""
+        store = get_typestore(Stores.EMPTY)
+        new = {key: found for key, found in self.types.items() if key not in store.fielddefs}
+        store.register(new)
+        return store
+
+    def decode(self, data: bytes, *, is_ros1: bool = False) -> Any:
+        """Decode a message to an object with an attribute for each field.
+
+        Raises:
+            LogError: The bytes do not fit the type, or no code can be generated for it.
+        """
+        try:
+            decoded = self._store.deserialize_ros1 if is_ros1 else self._store.deserialize_cdr
+            return decoded(data, self.name)
+        # The library raises errors of many types; each means that the bytes do not fit.
+        except Exception as error:
+            raise LogError(f"{len(data)} bytes are not a {self.name}: {error}") from error
+
+
+@lru_cache(maxsize=256)
+def definitions_of(
+    name: str, text: str, encoding: str = "ros2msg", distribution: str = ""
+) -> Definitions:
+    """Return a type and all types that are nested in it.
 
     Definitions of the file have precedence over those of the distribution.
 
@@ -59,25 +108,22 @@ def store_of(name: str, text: str, encoding: str = "ros2msg", distribution: str 
             for field, description in found[1]:
                 _refuse_wide(name, field, description)
                 needed += _nested(description)
-    store = get_typestore(Stores.EMPTY)
-    try:
-        store.register({key: found for key, found in types.items() if key not in store.fielddefs})
-        # Generates code, which finds errors that parsing does not.
-        store.get_msgdef(name)
-    # The library raises errors of many types.
-    except Exception as error:
-        raise LogError(f"the definition of {name} cannot be used: {error}") from error
-    return store
+    return Definitions(name, types)
 
 
-def leaf_kinds(store: Typestore, name: str, prefix: str = "") -> dict[str, str]:
+def leaf_kinds(types: Mapping[str, Any], name: str, prefix: str = "") -> dict[str, str]:
     """Return the kind of each leaf field of a type by its dotted path.
 
     Kinds are `float64`, `string`, `float32[36]`, `uint8[]` and so on; `time` for times and
     durations, whose two parts are leaves as well; and the type's name for arrays of messages.
+
+    Args:
+        types: Definitions of the type and all nested ones; see `Definitions.types`.
+        name: Full name of the type.
+        prefix: Path of the type's value with a final dot.
     """
     found = {}
-    for field, description in store.fielddefs[name][1]:
+    for field, description in types[name][1]:
         kind, what = description
         path = f"{prefix}{field}"
         if kind != Nodetype.NAME:
@@ -85,7 +131,7 @@ def leaf_kinds(store: Typestore, name: str, prefix: str = "") -> dict[str, str]:
         elif what in TIME_TYPES:
             found |= {path: "time", f"{path}.sec": "int32", f"{path}.nanosec": "uint32"}
         else:
-            found |= leaf_kinds(store, str(what), f"{path}.")
+            found |= leaf_kinds(types, str(what), f"{path}.")
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mcaprl.recorder.columns.cdr import ROS_TO_NUMPY
 from mcaprl.recorder.columns.chunks import Scratch, chunk_header
 from mcaprl.recorder.columns.decoder import Columns, Decoder
-from mcaprl.recorder.columns.definitions import ROS1, full_name, leaf_kinds, store_of
+from mcaprl.recorder.columns.definitions import ROS1, definitions_of, full_name, leaf_kinds
 from mcaprl.recorder.columns.file_check import check_chunk, check_file, check_statistics, place
 from mcaprl.recorder.columns.message_rows import MESSAGE_HEADER, MessageRange
 from mcaprl.recorder.columns.reader import McapReader
@@ -28,8 +28,8 @@ __all__ = [
     "check_file",
     "check_statistics",
     "chunk_header",
+    "definitions_of",
     "full_name",
     "leaf_kinds",
     "place",
-    "store_of",
 ]

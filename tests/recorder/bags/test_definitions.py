@@ -7,7 +7,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from mcap.writer import Writer
 
@@ -46,8 +45,7 @@ def vector(store: Any, kind: str = "geometry_msgs/msg/Vector3") -> Any:
 def test_idl_definitions(tmp_path: Path) -> None:
     decoder = RosDecoder("demo_msgs/msg/Level", IDL, encoding="ros2idl")
     assert decoder.fields == {"level": "uint8", "ratio": "float64", "parts": "float32[]"}
-    message = decoder._store.types["demo_msgs/msg/Level"](2, 0.5, np.array([1, 2], np.float32))
-    data = bytes(decoder._store.serialize_cdr(message, "demo_msgs/msg/Level"))
+    data = bytes([0, 1, 0, 0]) + struct.pack("<B7xdI2f", 2, 0.5, 2, 1.0, 2.0)
     path = write_mcap(
         tmp_path / "idl.mcap", [("/level", "demo_msgs/msg/Level", "ros2idl", IDL, "cdr", data)]
     )
