@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import multiprocessing
-import resource
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from operator import attrgetter
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from benchmarks.measure import OURS, Side, Table, compare
 
-MESSAGES = 20_000
-SLOW_SHARE = 0.05
+MESSAGES = 100_000
+SLOW_SHARE = 0.02
 IMAGES, IMAGE_SIZE = 600, (640, 480)
 STEP_NS = 10_000_000
 FIELDS = {
@@ -61,7 +61,10 @@ def _fields(path: Path, kind: str) -> Table:
 
 def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
     from mcaprl.recorder.bags.bag import open_bag
+    from mcaprl.recorder.columns.cdr import forget_types
 
+    # Each turn is a first opening, which parses the definitions.
+    forget_types()
     with closing(open_bag(path)) as bag:
         return bag.read(topic, fields).columns
 
@@ -111,12 +114,12 @@ def _decoded(path: Path, encoded: list[bytes]) -> Table:
         from PIL import Image
 
         for image in encoded:
-            np.asarray(Image.open(io.BytesIO(image)))
+            np.asarray(Image.open(io.BytesIO(image)).resize((84, 84), Image.Resampling.BOX))
 
     return compare(
         f"Compressed images of a bag: {IMAGE_SIZE[0]}x{IMAGE_SIZE[1]} JPEG to 84x84",
-        [Side(OURS, lambda: _open(path)), Side("Pillow's decoder alone", decode)],
-        goal="bound by the decoder",
+        [Side(OURS, lambda: _open(path)), Side("Pillow's decoding and averaging alone", decode)],
+        goal="bound by Pillow",
         rounds=3,
     )
 
@@ -138,27 +141,47 @@ def _gigabyte(path: Path) -> Table:
     """Read images in a process of its own, whose peak memory is that of the reading."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         seconds, memory = pool.submit(_cost, path).result()
-    table = Table("A bag of compressed images through a mapping", goal="less than 1", unit="ratio")
+    table = Table(
+        "A bag of compressed images through a mapping",
+        goal="time less than 1; memory bounded by the result",
+        unit="ratio",
+    )
     table.ratios = {
         "time for a gigabyte, five minutes = 1": seconds * 1e9 / path.stat().st_size / LIMIT_S,
-        "peak memory beyond the imports, size of the bag = 1": memory / path.stat().st_size,
+        "peak memory, result = 1": memory,
     }
     print(table.to_markdown(), flush=True)
     return table
 
 
-def _cost(path: Path) -> tuple[float, int]:
-    """Return the seconds and the bytes of memory that reading a bag takes."""
+def _cost(path: Path) -> tuple[float, float]:
+    """Return the seconds that reading a bag takes, and the memory relative to the result.
+
+    Pages of the mapped file do not count: the system takes them back when it needs memory.
+    """
     few = path.with_name("few.mcap")
-    _write_images(few, 2)
+    _write_images(few, 5)
     _open(few)
-    before, start = _peak(), time.perf_counter()
-    _open(path)
-    return time.perf_counter() - start, _peak() - before
+    before, start, samples, done = _private_bytes(), time.perf_counter(), [0], Event()
+
+    def sample() -> None:
+        while not done.wait(0.005):
+            samples.append(_private_bytes())
+
+    thread = Thread(target=sample)
+    thread.start()
+    data = _open(path)
+    seconds = time.perf_counter() - start
+    done.set()
+    thread.join()
+    result = data.frames.nbytes
+    return seconds, (max(samples) - before) / result
 
 
-def _peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+def _private_bytes() -> int:
+    """Return the memory of this process without mapped files, bytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
 
 
 def _topic(kind: str) -> str:

@@ -280,6 +280,12 @@ def message_type(schema: Schema) -> MessageType:
 _parsed = lru_cache(maxsize=64)(MessageType)
 
 
+def forget_types() -> None:
+    """Forget all parsed types, so that a benchmark measures a first opening."""
+    _parsed.cache_clear()
+    definitions_of.cache_clear()
+
+
 def _dtype_of(description: Any) -> np.dtype[Any]:
     kind, what = description
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):

@@ -7,7 +7,6 @@ float32 meters (H, W, 1), 0 where there is no surface; with `range_m`, it become
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from io import BytesIO
 from typing import Any
 
@@ -89,33 +88,38 @@ class ImageReader:
             return spaces.Box(0, 255, images.shape[1:], np.uint8)
         return spaces.Box(0.0, np.inf, images.shape[1:], np.float32)
 
-    def _decoded(self, message: dict[str, Any]) -> Image:
-        """Return an image as (H, W, 3) uint8 colors, (H, W) uint8 gray, or float32 meters."""
+    def _decoded(self, message: dict[str, Any]) -> Any:
+        """Return an image as uint8 colors or gray, of Pillow or NumPy, or as float32 meters."""
         if "encoding" in message:
             return _raw_image(self.topic, message)
         return _compressed_image(self.topic, str(message["format"]), bytes(message["data"]))
 
-    def _prepared(self, image: Image) -> Image:
+    def _prepared(self, image: Any) -> Image:
         quantity = self._quantity
         if quantity.crop is not None:
-            left, top, width, height = quantity.crop
-            cropped = image[top : top + height, left : left + width]
-            if left < 0 or top < 0 or cropped.shape[:2] != (height, width):
-                raise UsageError(
-                    f"{self.topic}: crop {list(quantity.crop)} is outside of the image of"
-                    f" {image.shape[1]} x {image.shape[0]} pixels"
-                )
-            image = cropped
-        if quantity.gray and image.ndim == 3:
-            image = np.rint(image @ _GRAY_WEIGHTS).astype(np.uint8)
+            image = self._cropped(image, *quantity.crop)
         if quantity.resize is not None:
             image = _resized(image, *quantity.resize)
-        if quantity.range_m is not None and image.dtype == np.float32:
+        pixels: Image = np.asarray(image)
+        if quantity.gray and pixels.ndim == 3:
+            pixels = np.rint(pixels @ _GRAY_WEIGHTS).astype(np.uint8)
+        if quantity.range_m is not None and pixels.dtype == np.float32:
             low, high = quantity.range_m
-            share = np.clip((image - low) / (high - low), 0.0, 1.0)
+            share = np.clip((pixels - low) / (high - low), 0.0, 1.0)
             # As in the sims, nothing is the farthest value.
-            image = np.where(image > 0, np.rint(255 * share), 255).astype(np.uint8)
-        return image if image.ndim == 3 else image[..., np.newaxis]
+            pixels = np.where(pixels > 0, np.rint(255 * share), 255).astype(np.uint8)
+        return pixels if pixels.ndim == 3 else pixels[..., np.newaxis]
+
+    def _cropped(self, image: Any, left: int, top: int, width: int, height: int) -> Any:
+        full_width, full_height = _size(image)
+        if min(left, top) < 0 or left + width > full_width or top + height > full_height:
+            raise UsageError(
+                f"{self.topic}: crop {[left, top, width, height]} is outside of the image of"
+                f" {full_width} x {full_height} pixels"
+            )
+        if isinstance(image, np.ndarray):
+            return image[top : top + height, left : left + width]
+        return image.crop((left, top, left + width, top + height))
 
 
 def _image_fields(topic: TopicInfo) -> tuple[str, ...]:
@@ -150,16 +154,19 @@ def _raw_image(topic: str, message: dict[str, Any]) -> Image:
     return pixels if channels > 1 else pixels[..., 0]
 
 
-def _compressed_image(topic: str, kind: str, data: bytes) -> Image:
+def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
+    """Return colors or gray as an image of Pillow, or depth as float32 meters."""
     pillow = import_extra("PIL.Image", "bags")
     # compressed_depth_image_transport puts 12 bytes of parameters before the PNG.
     is_depth = "compressedDepth" in kind
     try:
-        with pillow.open(BytesIO(data[12:] if is_depth else data)) as image:
-            if image.mode in ("I;16", "I", "F"):
-                unit = 1.0 if image.mode == "F" else 1e-3
-                return _meters(np.asarray(image), unit)
-            return np.asarray(image.convert("L" if image.mode in ("L", "1") else "RGB"))
+        image = pillow.open(BytesIO(data[12:] if is_depth else data))
+        image.load()
+        if image.mode in ("I;16", "I", "F"):
+            return _meters(np.asarray(image), 1.0 if image.mode == "F" else 1e-3)
+        wanted = "L" if image.mode in ("L", "1") else "RGB"
+        # Converting to the same mode would copy the image.
+        return image if image.mode == wanted else image.convert(wanted)
     # Pillow raises errors of many types for damaged images.
     except Exception as error:
         raise LogError(f"{topic}: a compressed image ({kind}) cannot be read: {error}") from error
@@ -170,11 +177,20 @@ def _meters(depth: Image, unit_m: float) -> Image:
     return np.where(np.isfinite(meters) & (meters > 0), meters, np.float32(0))
 
 
-def _resized(image: Image, width: int, height: int) -> Image:
+def _size(image: Any) -> tuple[int, int]:
+    """Return width and height of an image of Pillow or NumPy."""
+    if isinstance(image, np.ndarray):
+        return image.shape[1], image.shape[0]
+    width, height = image.size
+    return width, height
+
+
+def _resized(image: Any, width: int, height: int) -> Any:
     """Resize by averaging; depth takes the nearest pixel, since a mean of distances is no place."""
-    pillow = import_extra("PIL.Image", "bags")
-    if image.shape[:2] == (height, width):
+    if _size(image) == (width, height):
         return image
-    is_depth = image.dtype == np.float32
-    method: Callable[..., Any] = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
-    return np.asarray(pillow.fromarray(image).resize((width, height), method))
+    pillow = import_extra("PIL.Image", "bags")
+    is_array = isinstance(image, np.ndarray)
+    is_depth = is_array and image.dtype == np.float32
+    method = pillow.Resampling.NEAREST if is_depth else pillow.Resampling.BOX
+    return (pillow.fromarray(image) if is_array else image).resize((width, height), method)
