@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
+import numpy as np
+
 from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 
@@ -27,6 +29,8 @@ _LIKELY = {
     "sensor_msgs/msg/Imu": ("angular_velocity.z", "linear_acceleration.x"),
     "sensor_msgs/msg/LaserScan": ("ranges[::10]",),
     "sensor_msgs/msg/JointState": ("position", "velocity"),
+    "std_msgs/msg/Float32MultiArray": ("data",),
+    "std_msgs/msg/Float64MultiArray": ("data",),
 }
 """Fields of common types that a policy is likely to observe."""
 
@@ -49,7 +53,9 @@ def suggested(bag: Bag) -> str:
     """
     usable = [info for info in bag.topics.values() if info.count and not info.problem]
     command = _command(usable)
-    observed = list(_observations(usable, command))
+    rate_hz = _rate(usable)
+    frequent = [info for info in usable if info is not command and 2 * _rate_of(info) >= rate_hz]
+    observed = list(_observations(bag, frequent))
     if not observed and command is None:
         raise LogError(
             f"{', '.join(map(str, bag.paths))}: no topic has numbers; topics:"
@@ -59,7 +65,7 @@ def suggested(bag: Bag) -> str:
         "# Mapping of a bag to observations, actions and rewards. Edit it, and look at the result:",
         "#   mcaprl convert BAG --mapping THIS_FILE --dry-run",
         "time: log_time  # or publish_time, or header",
-        f"clock: {{rate_hz: {_rate(usable):g}}}",
+        f"clock: {{rate_hz: {rate_hz:g}}}",
         "observation:",
         *(f"  {name}: {{field: {path}}}  # {remark}" for name, path, remark in observed),
     ]
@@ -83,21 +89,28 @@ def suggested(bag: Bag) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _observations(topics: Iterable[TopicInfo], command: TopicInfo | None) -> Iterator[_Entry]:
+def _observations(bag: Bag, topics: Iterable[TopicInfo]) -> Iterator[_Entry]:
     """Yield the likely observations, each with a unique name."""
     names: set[str] = set()
     for info in topics:
-        if info is command or info.name in _SKIPPED or info.type_name in _IMAGES:
+        if info.name in _SKIPPED or info.type_name in _IMAGES:
             continue
         fields = _LIKELY.get(info.type_name) or _numbers(info)[:3]
         for field in fields:
             plain = field.split("[")[0]
             if plain not in info.fields or len(names) == _MAX_OBSERVED:
                 continue
+            if info.fields[plain].endswith("[]") and not _first_length(bag, info, plain):
+                continue
             name = _name(info.name, plain, names)
             names.add(name)
             # Missing ranges of a scan are beyond its reach.
             yield _Entry(name, _quoted(f"{info.name}.{field}"), _remark(info))
+
+
+def _first_length(bag: Bag, info: TopicInfo, field: str) -> int:
+    """Return the number of elements of an array in the first message."""
+    return len(bag.read(info.name, [field], np.array([0])).columns[field][0])
 
 
 def _others(topics: Iterable[TopicInfo], observed: list[_Entry]) -> Iterator[tuple[str, str]]:

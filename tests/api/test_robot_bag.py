@@ -61,3 +61,18 @@ def test_a_policy_that_learned_from_the_bag_drives_in_the_sim(
     assert run([*train, "--out", str(runs)]) == 0
     assert run(["evaluate", str(runs), "--sim", "lane", "--episodes", "2"]) == 0
     assert "runs" in capsys.readouterr().out
+
+
+def test_the_suggested_mapping_uses_frequent_topics(native: Path, tmp_path: Path) -> None:
+    bag = native.with_name("ros2")
+    bag = bag if bag.exists() else make(native, "ros2")
+    (tmp_path / "suggested.yaml").write_text(mcaprl.suggest_mapping(bag))
+    found = mcaprl.convert(bag, None, mapping=tmp_path / "suggested.yaml")
+    assert found.report is not None
+    observed = found.dataset.observation_names
+    # Two joints' arrays: positions are in the messages, velocities are empty.
+    assert "joint_states_position" in observed
+    assert "lane_data_10" in observed
+    assert not any(name.startswith(("e_stop", "joint_states_velocity")) for name in observed)
+    # The clock does not follow the lane detector exactly, so some steps fall into the pauses.
+    assert len(found.dataset) > 0.9 * len(mcaprl.open(native))
