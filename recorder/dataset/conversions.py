@@ -13,12 +13,19 @@ class Conversions:
     """Methods of `Dataset` that convert to and from other tools' data."""
 
     def to_lerobot(
-        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+        self,
+        path: str | Path,
+        *,
+        video: bool = False,
+        lossy: bool = False,
+        overwrite: bool = False,
     ) -> list[str]:
         """Write a LeRobot dataset v3.
 
         Args:
             path: Path of the folder.
+            video: Whether images become H.264 video, which changes their pixels and so needs
+                `lossy`; default: PNG.
             lossy: Whether what the format cannot hold is left out or converted.
             overwrite: Whether what exists at the path is replaced.
 
@@ -31,7 +38,7 @@ class Conversions:
             LogError: The files cannot be written, or the dataset has no episodes.
             MissingExtraError: A package of the format is not installed.
         """
-        return self._written("lerobot", path, lossy=lossy, overwrite=overwrite)
+        return self._written("lerobot", path, lossy=lossy, overwrite=overwrite, video=video)
 
     @staticmethod
     def from_lerobot(path: str | Path) -> Dataset:
@@ -222,11 +229,13 @@ class Conversions:
 
         return from_buffer(buffer)
 
-    def _written(self, name: str, path: str | Path, *, lossy: bool, overwrite: bool) -> list[str]:
+    def _written(
+        self, name: str, path: str | Path, *, lossy: bool, overwrite: bool, **options: Any
+    ) -> list[str]:
         from mcaprl.recorder.dataset.formats.registry import format_named, write_format
 
         dataset, form = cast("Dataset", self), format_named(name)
-        return write_format(dataset, path, form, lossy=lossy, overwrite=overwrite)
+        return write_format(dataset, path, form, lossy=lossy, overwrite=overwrite, **options)
 
 
 def _read(name: str, path: str | Path) -> Dataset:

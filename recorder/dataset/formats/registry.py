@@ -7,7 +7,7 @@ The module of a format has these functions; one that only writes has no `matches
     write(dataset: Dataset, path: Path, *, lossy: bool) -> list[str]
                                                 writes the new file or the empty folder `path`;
                                                 returns one sentence for each thing lost
-    local_path(name: str) -> Path               optional: the folder that `FORMAT:NAME` stands for
+    local_path(name: str) -> Path               optional: the folder that `FORMAT:NAME` means
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def target_format(path: str | Path, name: str | None) -> Format:
 
 
 def target_path(path: str | Path, form: Format) -> Path:
-    """Return the file or folder that a name stands for, such as `minari:drive/lane-v0`."""
+    """Return the file or folder that a name means, such as `minari:drive/lane-v0`."""
     prefix = f"{form.name}:"
     if str(path).startswith(prefix) and hasattr(form.module, "local_path"):
         local: Path = form.module.local_path(str(path).removeprefix(prefix))
@@ -135,6 +135,7 @@ def write_format(
     *,
     lossy: bool = False,
     overwrite: bool = False,
+    **options: Any,
 ) -> list[str]:
     """Write a dataset in another format; nothing is at `path` until it is complete.
 
@@ -144,6 +145,7 @@ def write_format(
         form: Format to write.
         lossy: Whether what the format cannot hold is left out or converted.
         overwrite: Whether an existing file or folder is replaced.
+        options: Further arguments of the format's `write`.
 
     Returns:
         One sentence for each thing that was left out or changed.
@@ -158,5 +160,5 @@ def write_format(
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
     target = replacing if form.suffix else replacing_folder
     with target(target_path(path, form), LogError, overwrite=overwrite) as unfinished:
-        lost: list[str] = form.module.write(dataset, unfinished, lossy=lossy)
+        lost: list[str] = form.module.write(dataset, unfinished, lossy=lossy, **options)
     return lost

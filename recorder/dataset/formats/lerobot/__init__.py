@@ -1,0 +1,20 @@
+"""LeRobot datasets, version 3.0: folders of Parquet files, images and videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.formats.lerobot.reader import read
+from mcaprl.recorder.dataset.formats.lerobot.writer import write
+
+__all__ = ["matches", "read", "write"]
+
+
+def matches(path: Path) -> bool:
+    """Return whether a folder is a LeRobot dataset of any version."""
+    try:
+        info = parse_json((path / "meta/info.json").read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(info, dict) and "codebase_version" in info

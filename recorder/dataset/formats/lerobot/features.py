@@ -1,0 +1,221 @@
+"""Features of a LeRobot dataset: their names, and their values as Arrow columns.
+
+A number is a plain column, a vector a fixed-size list, and an array of two to five dimensions a
+nested list. An image is a struct of the bytes of its file and a name: PNG without loss, or TIFF of
+32-bit floats for depth in meters.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
+from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf
+
+STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.images."
+ACTION, REWARD, DONE, TRUNCATED = "action", "next.reward", "next.done", "next.truncated"
+INFO = "complementary_info."
+PROBABILITY = f"{INFO}behavior_prob"
+INDEXES = ("frame_index", "episode_index", "index", "task_index")
+DEFAULTS = ("timestamp", *INDEXES)
+"""Features of every dataset."""
+MAX_DIMENSIONS = 5
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA_PATH = f"data/{FILE}.parquet"
+VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
+EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
+OWN = "meta/mcaprl"
+"""Folder of what LeRobot has no place for."""
+_HEIGHT_WIDTH_CHANNELS = ("height", "width", "channels")
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature of the data.
+
+    Attributes:
+        name: Name of the column.
+        dtype: Data type: a NumPy name, `image` or `video`.
+        shape: Shape of one value, at least (1,); (height, width, channels) for images.
+        names: Names of the elements or dimensions; None if unknown.
+        is_depth: Whether an image contains depth.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: Any = None
+    is_depth: bool = False
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the values are images, in the data files or as video."""
+        return self.dtype in ("image", "video")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of `meta/info.json`."""
+        entry = {"dtype": self.dtype, "shape": list(self.shape), "names": self.names}
+        depth = {"info": {"is_depth_map": True, "depth_unit": "m"}}
+        return entry | depth if self.is_depth else entry
+
+    @classmethod
+    def from_json(cls, name: str, entry: dict[str, Any]) -> Feature:
+        """Read an entry of `meta/info.json`.
+
+        Raises:
+            KeyError: A field is missing.
+            TypeError: A field has another type.
+            ValueError: A dimension is not a number.
+        """
+        info = entry.get("info") or entry.get("video_info") or {}
+        shape = tuple(int(size) for size in entry["shape"])
+        is_depth = bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+        return cls(name, str(entry["dtype"]), shape, entry.get("names"), is_depth)
+
+    def encode(self, values: NDArray[Any]) -> Any:
+        """Return the values (T, *shape) as an Arrow array."""
+        arrow = import_extra("pyarrow", "tables")
+        if self.dtype == "image":
+            files = [image_file(value) for value in values]
+            suffix = "tiff" if self.is_depth else "png"
+            names = [f"frame-{row:06d}.{suffix}" for row in range(len(files))]
+            columns = [arrow.array(files, arrow.binary()), arrow.array(names, arrow.string())]
+            return arrow.StructArray.from_arrays(columns, ["bytes", "path"])
+        column = arrow.array(np.ascontiguousarray(values).reshape(-1))
+        if self.shape == (1,):
+            return column
+        if len(self.shape) == 1:
+            return arrow.FixedSizeListArray.from_arrays(column, self.shape[0])
+        for size in reversed(self.shape):
+            offsets = np.arange(0, len(column) + 1, size, dtype=np.int32)
+            column = arrow.ListArray.from_arrays(arrow.array(offsets), column)
+        return column
+
+    def decode(self, column: Any) -> NDArray[Any]:
+        """Return the values (T, *shape) of an Arrow column.
+
+        Raises:
+            LogError: A value is missing, has another shape, or is a damaged image.
+        """
+        if self.dtype == "image":
+            files = [file for chunk in column.chunks for file in chunk.field("bytes").to_pylist()]
+            return _stack(self.name, [image_of(self.name, file) for file in files])
+        parts = [_numbers(self.name, chunk) for chunk in column.chunks if len(chunk)]
+        flat = np.concatenate(parts) if parts else np.zeros(0, self.dtype)
+        if flat.size != len(column) * math.prod(self.shape):
+            raise LogError(f"the values of {self.name} do not have the shape {self.shape}")
+        return flat.astype(self.dtype, copy=False).reshape(len(column), *self.shape)
+
+
+def default_features() -> list[Feature]:
+    """Return the features of every dataset."""
+    return [Feature("timestamp", "float32", (1,)), *(Feature(n, "int64", (1,)) for n in INDEXES)]
+
+
+def feature_of(name: str, leaf: Leaf, names: Sequence[str] = (), *, video: bool = False) -> Feature:
+    """Return the feature of a leaf of a space.
+
+    Args:
+        name: Name of the feature.
+        leaf: Leaf of the observation or action space.
+        names: Names of the elements; empty if unknown.
+        video: Whether images become video.
+    """
+    if leaf.encoding or _is_depth(leaf):
+        shape = leaf.shape if len(leaf.shape) == 3 else (*leaf.shape, 1)
+        if video and leaf.encoding in ("rgb8", "mono8"):
+            return Feature(name, "video", (*shape[:2], 3), list(_HEIGHT_WIDTH_CHANNELS))
+        is_depth = leaf.encoding is None
+        return Feature(name, "image", shape, list(_HEIGHT_WIDTH_CHANNELS), is_depth=is_depth)
+    # More dimensions than LeRobot has are flattened; the writer refuses them unless it may.
+    shape = leaf.shape if 0 < len(leaf.shape) <= MAX_DIMENSIONS else (leaf.size,)
+    labels = list(names) if len(names) == math.prod(shape) and len(shape) == 1 else None
+    return Feature(name, str(leaf.dtype), shape, labels)
+
+
+def observation_names(leaves: Sequence[Leaf]) -> list[str]:
+    """Return a unique name of a feature for each leaf of an observation space."""
+    found: list[str] = []
+    for leaf in leaves:
+        words = [re.sub(r"[^A-Za-z0-9_.-]+", "_", word) or "_" for word in leaf.path]
+        if leaf.encoding or _is_depth(leaf):
+            name = IMAGES + ".".join(words) if words else IMAGE
+        else:
+            name = ".".join(("observation", *words)) if words else STATE
+            # LeRobot takes the statistics of every name that contains "image" for those of images.
+            name = re.sub("image", "img", name, flags=re.IGNORECASE)
+        candidate, number = name, 2
+        while candidate in found:
+            candidate, number = f"{name}_{number}", number + 1
+        found.append(candidate)
+    return found
+
+
+def image_file(values: NDArray[Any]) -> bytes:
+    """Return an image (height, width[, channels]) as PNG, or as TIFF if it has floats."""
+    images = import_extra("PIL.Image", "video")
+    flat = values[:, :, 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    file = BytesIO()
+    is_tiff = flat.dtype.kind == "f"
+    image = images.fromarray(np.ascontiguousarray(flat))
+    image.save(file, "TIFF") if is_tiff else image.save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def image_of(name: str, file: bytes | None) -> NDArray[Any]:
+    """Decode an image file to (height, width, channels): uint8, or uint16 or float32 for depth.
+
+    Raises:
+        LogError: The file is missing or damaged.
+    """
+    images = import_extra("PIL.Image", "video")
+    if file is None:
+        raise LogError(f"an image of {name} is not in the data files: only its path is stored")
+    try:
+        with images.open(BytesIO(file)) as image:
+            kept = image.mode in ("L", "RGB", "RGBA", "F") or image.mode.startswith("I;16")
+            pixels = np.asarray(image if kept else image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise LogError(f"an image of {name} is damaged: {error}") from error
+    return pixels if pixels.ndim == 3 else pixels[:, :, None]
+
+
+def _is_depth(leaf: Leaf) -> bool:
+    """Return whether a leaf is an image of depths: 32-bit floats (height, width[, 1])."""
+    is_flat = len(leaf.shape) == 2 or (len(leaf.shape) == 3 and leaf.shape[2] == 1)
+    is_named = any("depth" in word.lower() for word in leaf.path[-1:])
+    return (
+        is_named and is_flat and leaf.dtype == np.float32 and min(leaf.shape[:2]) >= MIN_IMAGE_EDGE
+    )
+
+
+def _stack(name: str, images: list[NDArray[Any]]) -> NDArray[Any]:
+    shapes = {image.shape for image in images}
+    if len(shapes) > 1:
+        raise LogError(f"the images of {name} differ in size: {sorted(shapes)}")
+    return np.stack(images)
+
+
+def _numbers(name: str, column: Any) -> NDArray[Any]:
+    """Return the numbers of a column of nested lists, flattened."""
+    types = import_extra("pyarrow", "tables").types
+    while True:
+        if column.null_count:
+            raise LogError(f"{name} has missing values")
+        if not (types.is_list(column.type) or types.is_fixed_size_list(column.type)):
+            break
+        column = column.flatten()
+    if not (types.is_integer(column.type) or types.is_floating(column.type)) and (
+        not types.is_boolean(column.type)
+    ):
+        raise LogError(f"{name} has values of type {column.type}, expected numbers")
+    array: NDArray[Any] = column.to_numpy(zero_copy_only=False)
+    return array

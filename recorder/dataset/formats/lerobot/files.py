@@ -1,0 +1,128 @@
+"""The files of a LeRobot dataset, version 3.0: tables, Parquet columns and videos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.formats.lerobot.features import VIDEO_PATH, Feature
+from mcaprl.recorder.dataset.formats.lerobot.video import read_frames
+
+_VERSIONS = "v3."
+
+
+class Files:
+    """The files of one dataset of N frames.
+
+    Attributes:
+        features: Features by name.
+        fps: Frames per second.
+        episodes: Rows of the table of episodes, without statistics.
+        lengths: Number of frames of each episode.
+        stops: (E,) index of the frame after each episode.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the description and the table of episodes.
+
+        Raises:
+            LogError: A file is missing, of another version, or does not fit the others.
+        """
+        self._path = path
+        info = parse_json((path / "meta/info.json").read_bytes())
+        version = str(info["codebase_version"])
+        if not version.startswith(_VERSIONS):
+            raise LogError(
+                f"{path} is a LeRobot dataset of version {version}; convert it to v3.0 with LeRobot"
+            )
+        self.fps = float(info["fps"])
+        if not 0 < self.fps < math.inf:
+            raise LogError(f"{path}: fps is {self.fps}, expected a positive number")
+        self.features = {
+            name: Feature.from_json(name, entry) for name, entry in info["features"].items()
+        }
+        for name in self.features:
+            # The name becomes part of the paths of videos.
+            if "/" in name or "\\" in name:
+                raise LogError(f"{path}: the feature '{name}' has a slash in its name")
+        self.episodes = self._episode_rows()
+        self._files = sorted((path / "data").glob("*/*.parquet"))
+        self.lengths = [int(row["length"]) for row in self.episodes]
+        self.stops = np.cumsum(self.lengths, dtype=np.int64)
+        found = self._column(Feature("episode_index", "int64", (1,)))[:, 0]
+        same = sum(self.lengths) == len(found)
+        if not same or not np.array_equal(
+            found, np.repeat(np.arange(len(self.lengths)), self.lengths)
+        ):
+            raise LogError(f"{path}: the data files and the table of episodes do not agree")
+
+    def ranges(self) -> Iterator[tuple[int, int]]:
+        """Yield the first and the last row + 1 of each of LeRobot's episodes."""
+        return zip([0, *self.stops[:-1].tolist()], self.stops.tolist(), strict=True)
+
+    def values(self, feature: Feature) -> NDArray[Any]:
+        """Return the values (N, *shape) of a feature, or the images of a camera.
+
+        Raises:
+            LogError: A file is missing or damaged, or the feature does not have this shape.
+        """
+        return self._video(feature) if feature.dtype == "video" else self._column(feature)
+
+    def times_s(self) -> NDArray[np.float64]:
+        """Return the time (N,) of each frame since the start of its episode, seconds."""
+        return self._column(Feature("timestamp", "float32", (1,)))[:, 0].astype(np.float64)
+
+    def _column(self, feature: Feature) -> NDArray[Any]:
+        arrow = import_extra("pyarrow", "tables")
+        parquet = import_extra("pyarrow.parquet", "tables")
+        known = [feature.name in parquet.read_schema(file).names for file in self._files]
+        if not known or not all(known):
+            raise LogError(f"{self._path}: the data files have no column '{feature.name}'")
+        tables = [parquet.read_table(file, columns=[feature.name]) for file in self._files]
+        column: Any = arrow.concat_tables(tables)[feature.name]
+        try:
+            return feature.decode(column)
+        except LogError as error:
+            raise LogError(f"{self._path}: {error}") from error
+
+    def _video(self, feature: Feature) -> NDArray[np.uint8]:
+        """Decode the images of a camera from the videos, in the order of the rows."""
+        times = self.times_s()
+        name = f"videos/{feature.name}"
+        by_file: dict[tuple[int, int], list[NDArray[np.float64]]] = {}
+        for row, (start, stop) in zip(self.episodes, self.ranges(), strict=True):
+            place = int(row[f"{name}/chunk_index"]), int(row[f"{name}/file_index"])
+            first = float(row[f"{name}/from_timestamp"])
+            by_file.setdefault(place, []).append(first + times[start:stop])
+        parts = []
+        for (chunk, number), found in by_file.items():
+            relative = VIDEO_PATH.format(
+                video_key=feature.name, chunk_index=chunk, file_index=number
+            )
+            file = self._path / relative
+            parts.append(read_frames(file, np.concatenate(found), 0.5 / self.fps))
+        return np.concatenate(parts)
+
+    def _episode_rows(self) -> list[dict[str, Any]]:
+        arrow = import_extra("pyarrow", "tables")
+        parquet = import_extra("pyarrow.parquet", "tables")
+        files = sorted((self._path / "meta/episodes").glob("*/*.parquet"))
+        if not files:
+            raise LogError(f"{self._path} has no table of episodes in meta/episodes")
+        tables = []
+        for file in files:
+            names = parquet.read_schema(file).names
+            needed = [name for name in names if not name.startswith("stats/")]
+            tables.append(parquet.read_table(file, columns=needed))
+        rows = arrow.concat_tables(tables, promote_options="default").to_pylist()
+        found = sorted(rows, key=lambda row: int(row["episode_index"]))
+        if [row["episode_index"] for row in found] != list(range(len(found))):
+            raise LogError(f"{self._path}: the table of episodes has gaps")
+        return found

@@ -1,0 +1,301 @@
+"""Writing of LeRobot datasets, version 3.0.
+
+Each transition is a row. LeRobot has no place for the final observation of an episode, for real
+times and for the fields of an episode's summary: they are in the folder `meta/mcaprl`, which
+LeRobot does not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import SpaceError, import_extra
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.columns import episode_slices
+from mcaprl.recorder.dataset.formats.lerobot import features
+from mcaprl.recorder.dataset.formats.lerobot.features import (
+    DATA_PATH,
+    EPISODES_PATH,
+    OWN,
+    VIDEO_PATH,
+    Feature,
+)
+from mcaprl.recorder.dataset.formats.lerobot.statistics import Stats, describe, pooled, sampled
+from mcaprl.recorder.dataset.formats.lerobot.tables import (
+    CHUNK_FILES,
+    MAX_FILE_BYTES,
+    ParquetFiles,
+    write_json,
+    write_table,
+    write_tasks,
+)
+from mcaprl.recorder.dataset.formats.lerobot.video import VideoWriter
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
+
+VERSION = "v3.0"
+MAX_VIDEO_BYTES = 200 << 20
+_DEFAULT_TASK = "act"
+
+
+def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = False) -> list[str]:
+    """Write a dataset to an empty folder.
+
+    Args:
+        dataset: Episodes to write.
+        path: Empty folder.
+        lossy: Whether what LeRobot cannot hold is left out or converted.
+        video: Whether images are compressed as H.264 video, which changes their pixels.
+
+    Returns:
+        One sentence for each thing that was left out or changed.
+
+    Raises:
+        SpaceError: LeRobot cannot hold a space or dtype, or images would become video, and `lossy`
+            is not set.
+        MissingExtraError: PyArrow, Pillow or PyAV is not installed.
+    """
+    lost = _losses(dataset, lossy=lossy, video=video)
+    writer = _Writer(dataset, path, video=video)
+    for index in range(len(dataset.episode_lengths)):
+        writer.add_episode(index)
+    writer.finish()
+    return lost
+
+
+def frames_per_second(step_duration_ns: int) -> int | float:
+    """Return the rate of a step duration: a whole number where it gives the same duration."""
+    rate = 1e9 / step_duration_ns
+    whole = round(rate)
+    return whole if whole and round(1e9 / whole) == step_duration_ns else rate
+
+
+def task_of(options: str, metadata: LogMetadata) -> str:
+    """Return the text of an episode's task: the option `task` of its reset, or the environment."""
+    try:
+        task = parse_json(options or "{}").get("task")
+    except (ValueError, AttributeError):
+        task = None
+    return task if isinstance(task, str) and task else metadata.env_id or _DEFAULT_TASK
+
+
+def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
+    """Return what will be lost.
+
+    Raises:
+        SpaceError: Something will be lost, and `lossy` is not set.
+    """
+    leaves = leaves_of(dataset.observation_space)
+    named = zip(features.observation_names(leaves), leaves, strict=True)
+    every = [*named, (features.ACTION, action_leaf(dataset.action_space))]
+    for name, leaf in every:
+        if leaf.dtype == np.uint64 and _is_large(dataset, leaf):
+            raise SpaceError(
+                f"{name} has values of 2^63 or more, which LeRobot cannot read: use another dtype"
+            )
+    found = [
+        f"{name} of shape {leaf.shape} is flattened, because LeRobot has at most"
+        f" {features.MAX_DIMENSIONS} dimensions"
+        for name, leaf in every
+        if len(leaf.shape) > features.MAX_DIMENSIONS
+    ]
+    if video:
+        found += [
+            f"{name} is compressed as video, which changes its pixels"
+            for name, leaf in every
+            if features.feature_of(name, leaf, video=True).dtype == "video"
+        ]
+    if found and not lossy:
+        raise SpaceError(f"{found[0]}; pass --lossy (lossy=True in Python) to write it")
+    return found
+
+
+def _is_large(dataset: Dataset, leaf: Leaf) -> bool:
+    """Return whether an unsigned leaf has a value that a signed integer does not have."""
+    values = dataset.actions if leaf.name == "action" else leaf.of(dataset.frames)
+    return bool((values >= 2**63).any())
+
+
+class _Writer:
+    """Writer of the data files, videos and tables of episodes."""
+
+    def __init__(self, dataset: Dataset, path: Path, *, video: bool) -> None:
+        self._dataset, self._path = dataset, path
+        self._metadata = LogMetadata.from_strings(dataset.metadata)
+        self._leaves = leaves_of(dataset.observation_space)
+        self._fps = frames_per_second(self._metadata.step_duration_ns)
+        labels = self._metadata.observation_names
+        named = zip(features.observation_names(self._leaves), self._leaves, strict=True)
+        self._observations = [
+            features.feature_of(name, leaf, () if leaf.path else labels, video=video)
+            for name, leaf in named
+        ]
+        self._features = [*self._observations, *_step_features(dataset)]
+        self._slices = episode_slices(dataset)
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []
+        self._stats: list[dict[str, Stats]] = []
+        self._files = ParquetFiles(path, self._features)
+        rate = Fraction(self._fps).limit_denominator(1001)
+        self._videos = {
+            feature.name: VideoWriter(path, feature, rate, VIDEO_PATH, MAX_VIDEO_BYTES, CHUNK_FILES)
+            for feature in self._observations
+            if feature.dtype == "video"
+        }
+
+    def add_episode(self, index: int) -> None:
+        """Write the rows and videos of an episode."""
+        steps, frames = self._slices[index]
+        count = steps.stop - steps.start
+        task = task_of(self._dataset.episodes[index].summary.options, self._metadata)
+        task_index = self._tasks.setdefault(task, len(self._tasks))
+        row: dict[str, Any] = {"episode_index": index, "tasks": [task], "length": count}
+        columns: dict[str, Any] = {}
+        stats: dict[str, Stats] = {}
+        values = self._values(index, steps, frames, task_index)
+        for feature, array in values:
+            if feature.is_image:
+                stats[feature.name] = describe(feature, array[sampled(count)])
+            else:
+                stats[feature.name] = describe(feature, array)
+            if feature.dtype == "video":
+                row |= self._videos[feature.name].add_episode(array)
+            else:
+                columns[feature.name] = feature.encode(array)
+        row |= self._files.add_episode(columns)
+        row |= {"dataset_from_index": steps.start, "dataset_to_index": steps.stop}
+        self._rows.append(row)
+        self._stats.append(stats)
+
+    def finish(self) -> None:
+        """Close the files, and write the tables and descriptions."""
+        self._files.close()
+        for video in self._videos.values():
+            video.close()
+        self._write_info()
+        self._write_episodes()
+        write_tasks(self._path / "meta/tasks.parquet", self._tasks)
+        stats = {
+            feature.name: pooled([episode[feature.name] for episode in self._stats])
+            for feature in self._features
+        }
+        plain = {name: _plain(found) for name, found in stats.items()}
+        write_json(self._path / "meta/stats.json", plain)
+        self._write_own()
+
+    def _values(
+        self, index: int, steps: slice, frames: slice, task_index: int
+    ) -> Iterator[tuple[Feature, NDArray[Any]]]:
+        """Yield each feature of an episode of T transitions with its values (T, *shape)."""
+        count = steps.stop - steps.start
+        times = (np.arange(count) / float(self._fps)).astype(np.float32)
+        given: dict[str, Any] = {
+            features.ACTION: self._dataset.actions[steps],
+            features.REWARD: self._dataset.rewards[steps],
+            features.DONE: self._dataset.terminated[steps],
+            features.TRUNCATED: self._dataset.truncated[steps],
+            features.PROBABILITY: self._dataset.behavior_probs[steps],
+            "timestamp": times,
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, index),
+            "index": np.arange(steps.start, steps.stop),
+            "task_index": np.full(count, task_index),
+        }
+        rows = slice(frames.start, frames.stop - 1)
+        for leaf, feature in zip(self._leaves, self._observations, strict=True):
+            given[feature.name] = np.asarray(leaf.of(self._dataset.frames)[rows])
+        for feature in self._features:
+            values = given[feature.name]
+            if feature.dtype == "video":
+                yield feature, values
+            else:
+                kind = values.dtype if feature.dtype == "image" else feature.dtype
+                yield feature, values.astype(kind, copy=False).reshape(count, *feature.shape)
+
+    def _write_info(self) -> None:
+        count = len(self._rows)
+        entries = {feature.name: feature.to_json() for feature in self._features}
+        for name, video in self._videos.items():
+            entries[name]["info"] = video.info
+        info = {
+            "codebase_version": VERSION,
+            "robot_type": None,
+            "total_episodes": count,
+            "total_frames": len(self._dataset),
+            "total_tasks": len(self._tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": MAX_FILE_BYTES >> 20,
+            "video_files_size_in_mb": MAX_VIDEO_BYTES >> 20,
+            "fps": self._fps,
+            "splits": {"train": f"0:{count}"},
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH if self._videos else None,
+            "features": entries,
+        }
+        write_json(self._path / "meta/info.json", info)
+
+    def _write_episodes(self) -> None:
+        arrow = import_extra("pyarrow", "tables")
+        columns: dict[str, Any] = {
+            name: arrow.array([row[name] for row in self._rows]) for name in self._rows[0]
+        }
+        for feature in self._features:
+            found = [episode[feature.name] for episode in self._stats]
+            for name in found[0]:
+                lists = [episode[name].tolist() for episode in found]
+                columns[f"stats/{feature.name}/{name}"] = arrow.array(lists)
+        for name in ("chunk_index", "file_index"):
+            columns[f"meta/episodes/{name}"] = arrow.array([0] * len(self._rows))
+        write_table(columns, self._path / EPISODES_PATH.format(chunk_index=0, file_index=0))
+
+    def _write_own(self) -> None:
+        """Write the final observations, times and summaries."""
+        arrow = import_extra("pyarrow", "tables")
+        folder = self._path / OWN
+        folder.mkdir()
+        names = [feature.name for feature in self._observations]
+        write_json(
+            folder / "description.json", {"metadata": self._dataset.metadata, "features": names}
+        )
+        episodes = self._dataset.episodes
+        rows = [episode.summary._asdict() for episode in episodes]
+        columns = {name: arrow.array([row[name] for row in rows]) for name in rows[0]}
+        times = [episode.log_time_ns.tolist() for episode in episodes]
+        columns["log_time_ns"] = arrow.array(times, arrow.list_(arrow.int64()))
+        write_table(columns, folder / "episodes.parquet")
+        lasts = np.array([frames.stop - 1 for _, frames in self._slices])
+        finals = {}
+        for leaf, feature in zip(self._leaves, self._observations, strict=True):
+            # The final observations of videos are stored without loss.
+            kept = features.feature_of(feature.name, leaf)
+            values = np.asarray(leaf.of(self._dataset.frames)[lasts])
+            finals[kept.name] = kept.encode(values.reshape(len(lasts), *kept.shape))
+        write_table(finals, folder / "final_observations.parquet")
+
+
+def _step_features(dataset: Dataset) -> list[Feature]:
+    """Return the features besides the observations."""
+    leaf = action_leaf(dataset.action_space)
+    rewards = dataset.rewards
+    with np.errstate(over="ignore"):
+        fits = np.array_equal(rewards.astype(np.float32), rewards, equal_nan=True)
+    found = [
+        features.feature_of(features.ACTION, leaf),
+        Feature(features.REWARD, "float32" if fits else "float64", (1,)),
+        Feature(features.DONE, "bool", (1,)),
+        Feature(features.TRUNCATED, "bool", (1,)),
+    ]
+    if not np.isnan(dataset.behavior_probs).all():
+        found.append(Feature(features.PROBABILITY, "float32", (1,)))
+    return [*found, *features.default_features()]
+
+
+def _plain(stats: Stats) -> dict[str, Any]:
+    return {name: array.tolist() for name, array in stats.items()}

@@ -1,0 +1,127 @@
+"""LeRobot's own reader and writer, run by the tests in an environment that has LeRobot.
+
+    python run_lerobot.py read FOLDER OUT.npz    all items of a dataset, by key
+    python run_lerobot.py merge FOLDER TARGET    a dataset with the episodes of FOLDER twice
+    python run_lerobot.py make FOLDER KIND       the golden dataset of KIND `image` or `video`
+
+Only NumPy, PyAV, torch and LeRobot are imported. The writer of LeRobot 0.4 needs NumPy < 2.4.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def main(command: str, folder: str, target: str) -> None:
+    """Run a command."""
+    {"read": read, "merge": merge, "make": make}[command](Path(folder), target)
+
+
+def read(folder: Path, target: str) -> None:
+    """Write the items, statistics and facts that LeRobot reads."""
+    dataset = _lerobot().LeRobotDataset("any/name", root=folder)
+    items = [dataset[row] for row in range(len(dataset))]
+    found: dict[str, Any] = {
+        key: np.stack([np.asarray(item[key]) for item in items]) for key in items[0]
+    }
+    found |= {
+        f"stats/{key}/{name}": np.asarray(array)
+        for key, stats in dataset.meta.stats.items()
+        for name, array in stats.items()
+    }
+    found["fps"] = np.asarray(dataset.fps)
+    found["lengths"] = np.asarray(dataset.meta.episodes["length"])
+    np.savez(target, allow_pickle=False, **found)
+
+
+def merge(folder: Path, target: str) -> None:
+    """Merge a dataset with itself."""
+    _lerobot()
+    aggregate = import_module("lerobot.datasets.aggregate").aggregate_datasets
+    aggregate(["any/a", "any/b"], "any/merged", roots=[folder, folder], aggr_root=Path(target))
+
+
+def make(folder: Path, kind: str) -> None:
+    """Write two episodes of four and three frames with two cameras."""
+    features = {
+        "observation.state": _feature("float32", 2, names={"motors": ["shoulder", "elbow"]}),
+        "observation.images.front": _feature(kind, 32, 48, 3, names=_EDGES),
+        "observation.images.wrist": _feature(kind, 32, 32, 3, names=_EDGES),
+        "action": _feature("float32", 2, 3),
+    }
+    if kind == "image":
+        features |= {
+            "next.reward": _feature("float32", 1),
+            "next.done": _feature("bool", 1),
+            "complementary_info.discrete_penalty": _feature("float32", 1),
+        }
+    dataset = _lerobot().LeRobotDataset.create(
+        "any/name", 10, features, root=folder, robot_type="arm", use_videos=kind == "video"
+    )
+    for episode, (length, task) in enumerate([(4, "lift the cube"), (3, "drop the cube")]):
+        for step in range(length):
+            chunk = np.arange(6).reshape(2, 3) + step + 10 * episode
+            frame = {
+                "observation.state": np.array([episode, step / 4], np.float32),
+                "observation.images.front": np.full((32, 48, 3), 40 * step + episode, np.uint8),
+                "observation.images.wrist": np.full(
+                    (32, 32, 3), 30 * step + 100 * episode, np.uint8
+                ),
+                "action": chunk.astype(np.float32),
+                "next.reward": np.array([step + episode / 2], np.float32),
+                "next.done": np.array([step == length - 1 and episode == 0]),
+                "complementary_info.discrete_penalty": np.array([-0.5 * step], np.float32),
+            }
+            known = {name: value for name, value in frame.items() if name in features}
+            dataset.add_frame({**known, "task": task})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def _feature(dtype: str, *shape: int, names: Any = None) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": shape, "names": names}
+
+
+_EDGES = ["height", "width", "channels"]
+
+
+def _lerobot() -> Any:
+    """Import LeRobot's module of datasets.
+
+    torchvision's wheel is built for CUDA. Beside torch for the CPU, its compiled operators are
+    missing, so they are declared; LeRobot calls none of them. This torchvision decodes no video
+    either, so that PyAV does it here.
+    """
+    library: Any = import_module("torch.library").Library("torchvision", "DEF")
+    for name in ("nms", "qnms"):
+        library.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    _LIBRARIES.append(library)
+    module = import_module("lerobot.datasets.lerobot_dataset")
+    vars(module)["decode_video_frames"] = _decode
+    return module
+
+
+# A library that is garbage-collected takes its operators with it.
+_LIBRARIES: list[Any] = []
+
+
+def _decode(path: Path, times_s: list[float], tolerance_s: float, _backend: str) -> torch.Tensor:
+    """Return the images (K, 3, height, width) in [0, 1] that a video has at these times."""
+    with import_module("av").open(str(path)) as container:
+        frames = list(container.decode(video=0))
+    found = []
+    for time_s in times_s:
+        nearest = min(frames, key=lambda frame: abs(frame.time - time_s))
+        assert abs(nearest.time - time_s) < tolerance_s, f"no image at {time_s} s"
+        found.append(nearest.to_ndarray(format="rgb24").transpose(2, 0, 1) / 255)
+    return torch.from_numpy(np.stack(found))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
