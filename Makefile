@@ -25,7 +25,7 @@ help:
 demo: $(VENV)/.demo
 	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
 
-test: $(VENV)/.dev tests/node/node_modules
+test: $(VENV)/.dev $(VENV)/.lerobot tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 faults: $(VENV)/.dev
@@ -98,6 +98,15 @@ $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -e '.[offline,online]'
 	$(VENV)/rivals/bin/python -m pip install -qq -c constraints.txt -r benchmarks/rivals.txt
 	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1 scope-rl==0.2.1
+	@touch $@
+
+# LeRobot, which the tests run in an environment of its own: it requires older versions of PyTorch,
+# NumPy and pandas than constraints.txt has. It runs with these; pip does not resolve it.
+$(VENV)/.lerobot: tests/lerobot.txt | $(VENV)/bin/python
+	@echo "installing into $(VENV)/lerobot"
+	$(BIN)/python -m venv $(VENV)/lerobot
+	$(VENV)/lerobot/bin/python -m pip install -qq -r tests/lerobot.txt
+	$(VENV)/lerobot/bin/python -m pip install -qq --no-deps lerobot==0.4.4 torchvision==0.28.0
 	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev
