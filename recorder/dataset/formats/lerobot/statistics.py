@@ -1,12 +1,13 @@
 """Statistics of the features of a LeRobot dataset: for each episode, and for all data.
 
 Arrays have one number for each element of the last dimension. Images have one for each channel, of
-shape (channels, 1, 1), and those of color images are in [0, 1]. They are taken from at most
-`_MAX_IMAGES` images of an episode, spread evenly.
+shape (channels, 1, 1), and those of color images are in [0, 1]. They are those of at
+most `_MAX_IMAGES` images of an episode, spread evenly.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,9 +26,15 @@ Stats = dict[str, NDArray[Any]]
 """Arrays by the names of `NAMES`."""
 
 
-def sampled(count: int, limit: int = _MAX_IMAGES) -> NDArray[np.int64]:
-    """Return at most `limit` of `count` rows, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+def sampled(feature: Feature, count: int) -> NDArray[np.int64]:
+    """Return the images of an episode that are looked at, spread evenly.
+
+    Args:
+        feature: Feature of the images.
+        count: Number of images of the episode.
+    """
+    limit = _MAX_ELEMENTS // math.prod(feature.shape) if feature.is_depth else _MAX_IMAGES
+    return _spread(count, min(max(limit, 1), _MAX_IMAGES))
 
 
 def describe(feature: Feature, values: NDArray[Any]) -> Stats:
@@ -37,21 +44,15 @@ def describe(feature: Feature, values: NDArray[Any]) -> Stats:
         feature: Feature of the values.
         values: Values; of images, those that `sampled` selects.
     """
-    if feature.is_image:
-        rows = values.reshape(-1, 1 if values.ndim == 3 else values.shape[-1])
-        scale = 255.0 if values.dtype == np.uint8 else 1.0
-        if feature.dtype == "video":
-            rows = np.broadcast_to(rows, (len(rows), feature.shape[-1]))
+    channels = values.shape[3] if values.ndim == 4 else 1
+    rows = values.reshape(-1, channels if feature.is_image else feature.shape[-1])
+    if feature.is_image and values.dtype == np.uint8:
+        found = _of_levels(_histogram(values.reshape(len(values), -1, channels)))
     else:
-        rows, scale = values.reshape(-1, feature.shape[-1]), 1.0
-    # Unknown and infinite values have no mean; NumPy warns about them.
-    with np.errstate(all="ignore"):
-        numbers = rows.astype(np.float64) / scale
-        found = dict(zip(QUANTILES, _quantiles(numbers), strict=True))
-        found |= {"mean": numbers.mean(0), "std": numbers.std(0)}
-        found |= {"min": numbers.min(0), "max": numbers.max(0)}
+        found = _of_numbers(rows.astype(np.float64))
     if feature.is_image:
-        found = {name: array.reshape(-1, 1, 1) for name, array in found.items()}
+        shape = (feature.shape[-1], 1, 1)
+        found = {n: np.broadcast_to(a.reshape(-1, 1, 1), shape) for n, a in found.items()}
     elif rows.dtype.kind in "biu":
         found |= {"min": rows.min(0), "max": rows.max(0)}
     return found | {"count": np.array([len(values)], np.int64)}
@@ -74,8 +75,50 @@ def pooled(episodes: Sequence[Stats]) -> Stats:
     return found | {"count": column["count"].sum(0)}
 
 
-def _quantiles(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    limit = max(_MAX_ELEMENTS // rows.shape[1], 1)
-    few = rows if len(rows) <= limit else rows[sampled(len(rows), limit)]
-    found: NDArray[np.float64] = np.quantile(few, list(QUANTILES.values()), axis=0)
-    return found
+def _spread(count: int, limit: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+
+
+def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
+    """Return the statistics (D,) of rows (N, D)."""
+    limit = max(_MAX_ELEMENTS // numbers.shape[1], 1)
+    few = numbers if len(numbers) <= limit else numbers[_spread(len(numbers), limit)]
+    # Unknown and infinite values have no mean; NumPy warns about them.
+    with np.errstate(all="ignore"):
+        quantiles = np.quantile(few, list(QUANTILES.values()), axis=0)
+        return {
+            "min": numbers.min(0),
+            "max": numbers.max(0),
+            "mean": numbers.mean(0),
+            "std": numbers.std(0),
+            **dict(zip(QUANTILES, quantiles, strict=True)),
+        }
+
+
+def _histogram(images: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return how often each channel of images (T, pixels, C) has each level: (C, 256)."""
+    counts = np.zeros((images.shape[2], 256), np.int64)
+    for image in images:
+        for channel, row in enumerate(counts):
+            row += np.bincount(image[:, channel], minlength=256)
+    return counts
+
+
+def _of_levels(counts: NDArray[np.int64]) -> Stats:
+    """Return the statistics (C,) of levels in [0, 1] that occur `counts` (C, 256) times."""
+    levels = np.arange(256) / 255
+    total = int(counts[0].sum())
+    mean = counts @ levels / total
+    variance = (counts * (levels - mean[:, None]) ** 2).sum(1) / total
+    found = {"mean": mean, "std": np.sqrt(variance)}
+    ends = np.cumsum(counts, axis=1)
+
+    def at(rank: int) -> NDArray[np.float64]:
+        return levels[[int(np.searchsorted(row, rank, side="right")) for row in ends]]
+
+    for name, share in QUANTILES.items():
+        # As NumPy does, interpolate between the two values beside the place.
+        place = share * (total - 1)
+        low, high = at(math.floor(place)), at(math.ceil(place))
+        found[name] = low + (place - math.floor(place)) * (high - low)
+    return found | {"min": at(0), "max": at(total - 1)}

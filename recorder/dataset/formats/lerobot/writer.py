@@ -162,7 +162,7 @@ class _Writer:
         values = self._values(index, steps, frames, task_index)
         for feature, array in values:
             if feature.is_image:
-                stats[feature.name] = describe(feature, array[sampled(count)])
+                stats[feature.name] = describe(feature, array[sampled(feature, count)])
             else:
                 stats[feature.name] = describe(feature, array)
             if feature.dtype == "video":

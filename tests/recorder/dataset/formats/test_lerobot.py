@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from hypothesis import assume, given, settings
+from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 import mcaprl
@@ -24,7 +25,7 @@ from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.lerobot import tables, writer
 from mcaprl.recorder.dataset.formats.lerobot.features import Feature
-from mcaprl.recorder.dataset.formats.lerobot.statistics import describe, pooled, sampled
+from mcaprl.recorder.dataset.formats.lerobot.statistics import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.support.strategies import transitions
@@ -218,9 +219,21 @@ def test_statistics_of_vectors_images_and_all_episodes() -> None:
     assert found["mean"].shape == (3, 1, 1)
     np.testing.assert_allclose(found["mean"].ravel(), [0.5, 0.2, 1])
     assert found["max"].ravel().tolist() == [1, 0.2, 1]
-    assert sampled(3).tolist() == [0, 1, 2]
-    assert len(sampled(5000)) == 100
-    assert sampled(5000)[[0, -1]].tolist() == [0, 4999]
+    assert sampled(image, 3).tolist() == [0, 1, 2]
+    assert len(sampled(image, 5000)) == 100
+    assert sampled(image, 5000)[[0, -1]].tolist() == [0, 4999]
+    assert len(sampled(Feature("depth", "image", (480, 640, 1), is_depth=True), 5000)) == 13
+
+
+@given(arrays(np.uint8, (3, 4, 5, 2)))
+def test_statistics_of_images_are_those_of_their_pixels(pixels: NDArray[np.uint8]) -> None:
+    found = describe(Feature("observation.image", "image", (4, 5, 2)), pixels)
+    rows = pixels.reshape(-1, 2) / 255
+    assert found["count"].tolist() == [3]
+    expected = {"mean": rows.mean(0), "std": rows.std(0), "min": rows.min(0), "max": rows.max(0)}
+    expected |= {name: np.quantile(rows, share, axis=0) for name, share in QUANTILES.items()}
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name].ravel(), values, atol=1e-12)
 
 
 def test_a_file_ends_at_its_size_and_a_folder_at_its_number(
