@@ -24,6 +24,8 @@ STATE, IMAGE, IMAGES = "observation.state", "observation.image", "observation.im
 ACTION, REWARD, DONE, TRUNCATED = "action", "next.reward", "next.done", "next.truncated"
 INFO = "complementary_info."
 PROBABILITY = f"{INFO}behavior_prob"
+STEPS = (ACTION, REWARD, DONE, TRUNCATED, PROBABILITY)
+"""Features that have the values of a step, besides infos."""
 INDEXES = ("frame_index", "episode_index", "index", "task_index")
 DEFAULTS = ("timestamp", *INDEXES)
 """Features of every dataset."""
@@ -59,6 +61,14 @@ class Feature:
     def is_image(self) -> bool:
         """Whether the values are images, in the data files or as video."""
         return self.dtype in ("image", "video")
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether the values are numbers or flags."""
+        try:
+            return np.dtype(self.dtype).kind in "biuf"
+        except TypeError:
+            return False
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry of `meta/info.json`."""

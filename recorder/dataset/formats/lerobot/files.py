@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import LogError, import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.formats.lerobot.features import VIDEO_PATH, Feature
+from mcaprl.recorder.dataset.formats.lerobot.features import STEPS, VIDEO_PATH, Feature
 from mcaprl.recorder.dataset.formats.lerobot.video import read_frames
 
 _VERSIONS = "v3."
@@ -22,6 +22,7 @@ class Files:
     """The files of one dataset of N frames.
 
     Attributes:
+        path: Folder of the dataset.
         features: Features by name.
         fps: Frames per second.
         episodes: Rows of the table of episodes, without statistics.
@@ -35,7 +36,7 @@ class Files:
         Raises:
             LogError: A file is missing, of another version, or does not fit the others.
         """
-        self._path = path
+        self.path = path
         info = parse_json((path / "meta/info.json").read_bytes())
         version = str(info["codebase_version"])
         if not version.startswith(_VERSIONS):
@@ -75,6 +76,11 @@ class Files:
         """
         return self._video(feature) if feature.dtype == "video" else self._column(feature)
 
+    def steps(self) -> dict[str, NDArray[Any]]:
+        """Return the values (N, *shape) of those of `STEPS` that the dataset has."""
+        known = [self.features[name] for name in STEPS if name in self.features]
+        return {feature.name: self.values(feature) for feature in known}
+
     def times_s(self) -> NDArray[np.float64]:
         """Return the time (N,) of each frame since the start of its episode, seconds."""
         return self._column(Feature("timestamp", "float32", (1,)))[:, 0].astype(np.float64)
@@ -84,45 +90,61 @@ class Files:
         parquet = import_extra("pyarrow.parquet", "tables")
         known = [feature.name in parquet.read_schema(file).names for file in self._files]
         if not known or not all(known):
-            raise LogError(f"{self._path}: the data files have no column '{feature.name}'")
-        tables = [parquet.read_table(file, columns=[feature.name]) for file in self._files]
+            raise LogError(f"{self.path}: the data files have no column '{feature.name}'")
+        tables = [read_table(file, [feature.name]) for file in self._files]
         column: Any = arrow.concat_tables(tables)[feature.name]
         try:
             return feature.decode(column)
         except LogError as error:
-            raise LogError(f"{self._path}: {error}") from error
+            raise LogError(f"{self.path}: {error}") from error
 
     def _video(self, feature: Feature) -> NDArray[np.uint8]:
         """Decode the images of a camera from the videos, in the order of the rows."""
-        times = self.times_s()
         name = f"videos/{feature.name}"
-        by_file: dict[tuple[int, int], list[NDArray[np.float64]]] = {}
-        for row, (start, stop) in zip(self.episodes, self.ranges(), strict=True):
-            place = int(row[f"{name}/chunk_index"]), int(row[f"{name}/file_index"])
-            first = float(row[f"{name}/from_timestamp"])
-            by_file.setdefault(place, []).append(first + times[start:stop])
-        parts = []
-        for (chunk, number), found in by_file.items():
-            relative = VIDEO_PATH.format(
-                video_key=feature.name, chunk_index=chunk, file_index=number
+        files = [(row[f"{name}/chunk_index"], row[f"{name}/file_index"]) for row in self.episodes]
+        firsts = [float(row[f"{name}/from_timestamp"]) for row in self.episodes]
+        times = self.times_s() + np.repeat(firsts, self.lengths)
+        images: NDArray[np.uint8] | None = None
+        for chunk, number in sorted(set(files)):
+            mine = np.repeat([place == (chunk, number) for place in files], self.lengths)
+            rows = np.flatnonzero(mine)
+            rows = rows[np.argsort(times[rows], kind="stable")]
+            path = VIDEO_PATH.format(
+                video_key=feature.name, chunk_index=int(chunk), file_index=int(number)
             )
-            file = self._path / relative
-            parts.append(read_frames(file, np.concatenate(found), 0.5 / self.fps))
-        return np.concatenate(parts)
+            found = read_frames(self.path / path, times[rows], 0.5 / self.fps)
+            if images is None:
+                images = np.empty((len(times), *found.shape[1:]), np.uint8)
+            images[rows] = found
+        if images is None:
+            raise LogError(f"{self.path} has no episodes")
+        return images
 
     def _episode_rows(self) -> list[dict[str, Any]]:
         arrow = import_extra("pyarrow", "tables")
         parquet = import_extra("pyarrow.parquet", "tables")
-        files = sorted((self._path / "meta/episodes").glob("*/*.parquet"))
+        files = sorted((self.path / "meta/episodes").glob("*/*.parquet"))
         if not files:
-            raise LogError(f"{self._path} has no table of episodes in meta/episodes")
+            raise LogError(f"{self.path} has no table of episodes in meta/episodes")
         tables = []
         for file in files:
             names = parquet.read_schema(file).names
             needed = [name for name in names if not name.startswith("stats/")]
-            tables.append(parquet.read_table(file, columns=needed))
+            tables.append(read_table(file, needed))
         rows = arrow.concat_tables(tables, promote_options="default").to_pylist()
         found = sorted(rows, key=lambda row: int(row["episode_index"]))
         if [row["episode_index"] for row in found] != list(range(len(found))):
-            raise LogError(f"{self._path}: the table of episodes has gaps")
+            raise LogError(f"{self.path}: the table of episodes has gaps")
         return found
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
+    """Read a Parquet file, and compare the CRCs that it has.
+
+    Args:
+        path: File.
+        columns: Columns to read; default: all.
+    """
+    parquet = import_extra("pyarrow.parquet", "tables")
+    names = None if columns is None else list(columns)
+    return parquet.ParquetFile(path, page_checksum_verification=True).read(names)

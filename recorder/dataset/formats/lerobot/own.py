@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.formats.lerobot.features import OWN, feature_of
+from mcaprl.recorder.dataset.formats.lerobot.files import read_table
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 
@@ -49,8 +49,7 @@ def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
     folder = path / OWN
     if not (folder / "description.json").exists():
         return None
-    parquet = import_extra("pyarrow.parquet", "tables")
-    episodes = parquet.read_table(folder / "episodes.parquet")
+    episodes = read_table(folder / "episodes.parquet")
     if episodes["length"].to_pylist() != list(lengths):
         warnings.warn(
             f"{path}: {OWN} is ignored, because the episodes were changed after it was written",
@@ -59,7 +58,7 @@ def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
         return None
     description = parse_json((folder / "description.json").read_bytes())
     metadata = LogMetadata.from_strings(description["metadata"])
-    table = parquet.read_table(folder / "final_observations.parquet")
+    table = read_table(folder / "final_observations.parquet")
     names, finals = tuple(description["features"]), {}
     for leaf, name in zip(leaves_of(metadata.observation_space), names, strict=True):
         values = feature_of(name, leaf).decode(table[name])

@@ -60,6 +60,7 @@ class ParquetFiles:
             self._file,
             schema.with_metadata({b"huggingface": text.encode()}),
             compression="snappy",
+            write_page_checksum=True,
             use_dictionary=[f.name for f in self._stored if not f.is_image],
         )
 
@@ -89,9 +90,9 @@ def _hugging_face(feature: Feature) -> dict[str, Any]:
 
 def write_table(columns: dict[str, Any], path: Path) -> None:
     """Write Arrow arrays by name as a Parquet file."""
-    arrow = import_extra("pyarrow", "tables")
+    arrow, parquet = import_extra("pyarrow", "tables"), import_extra("pyarrow.parquet", "tables")
     path.parent.mkdir(parents=True, exist_ok=True)
-    import_extra("pyarrow.parquet", "tables").write_table(arrow.table(columns), path)
+    parquet.write_table(arrow.table(columns), path, write_page_checksum=True)
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -335,10 +335,11 @@ def _opened(path: Path) -> tuple[Dataset, list[str]]:
 
 def test_a_dataset_of_lerobots_writer_with_rewards_and_images() -> None:
     dataset, said = _golden("image")
-    assert [text.partition(",")[0].partition(" in a")[0] for text in said] == [
-        "'next.done' may also mean truncation",
-        "1 of 2 episodes end",
-        "1 of 2 episodes have no observation after their last action: that action is left out",
+    assert [text.partition(" episodes")[0] for text in said] == [
+        "'next.done' may also mean truncation, because there is no feature 'next.truncated'; it is"
+        " read as termination",
+        "the observation after the end is not stored of 1",
+        "the observation after the last action is not stored of 1 other",
     ]
     space = dataset.observation_space
     assert isinstance(space, spaces.Dict)
@@ -415,7 +416,7 @@ def written(tmp_path: Path) -> Path:
 def test_a_done_frame_in_the_middle_ends_an_episode(written: Path) -> None:
     shutil.rmtree(written / "meta/mcaprl")
     _edited(written, lambda t: _with(t, "next.done", pa.array([True, False, False, False, False])))
-    with pytest.warns(UserWarning, match="2 of 3 episodes have no observation after"):
+    with pytest.warns(UserWarning, match="is not stored of 2 other episodes"):
         dataset = Dataset.from_lerobot(written)
     # The frame after the done frame is its next observation, as it was recorded.
     assert dataset.episode_lengths.tolist() == [1, 1, 1]
@@ -491,6 +492,28 @@ def test_damage_is_named(written: Path, damage: Any, message: str) -> None:
     damage(written)
     with pytest.raises(LogError, match=message):
         Dataset.from_lerobot(written)
+
+
+def test_a_changed_byte_of_the_data_is_found(written: Path) -> None:
+    file = written / "data/chunk-000/file-000.parquet"
+    content = bytearray(file.read_bytes())
+    # The first page has the states of the first episode.
+    content[content.index(np.float32(-0.25).tobytes())] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(LogError, match="CRC"):
+        Dataset.from_lerobot(written)
+
+
+def test_videos_in_several_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("av", reason="needs the extra video")
+    monkeypatch.setattr(writer, "MAX_VIDEO_BYTES", 1)
+    dataset = Dataset.concatenate([_cameras(), _cameras()])
+    dataset.to_lerobot(tmp_path / "out", video=True, lossy=True)
+    # The encoder holds some images back, so that a file has more than one episode.
+    assert len(list((tmp_path / "out/videos/observation.images.front/chunk-000").iterdir())) > 1
+    found = Dataset.from_lerobot(tmp_path / "out")
+    difference = np.abs(found.frames["gray"].astype(int) - dataset.frames["gray"])
+    assert difference.max() <= 8
 
 
 def _set_info(path: Path, **changes: Any) -> None:
@@ -576,7 +599,7 @@ def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
     metadata = LogMetadata(space, spaces.Box(-np.inf, np.inf, (2,), np.float32))
     dataset_of([episode], metadata, "test").to_lerobot(tmp_path / "out")
     _run_lerobot("merge", tmp_path / "out", tmp_path / "merged", home=tmp_path / "home")
-    with pytest.warns(UserWarning, match="2 of 2 episodes end in a terminal state"):
+    with pytest.warns(UserWarning, match="is not stored of 2 episodes that end in a"):
         merged = Dataset.from_lerobot(tmp_path / "merged")
     assert merged.rewards.tolist() == [1, 2, 4, 1, 2, 4]
     np.testing.assert_array_equal(merged.observations["front"][3:], values["front"][:3])

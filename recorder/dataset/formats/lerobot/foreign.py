@@ -1,0 +1,264 @@
+"""Episodes from a dataset that LeRobot recorded: its frames, and what it does not say."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, SpaceError
+from mcaprl.recorder.dataset.arrays import action_space_of, box_of
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.lerobot import features
+from mcaprl.recorder.dataset.formats.lerobot.features import Feature
+from mcaprl.recorder.dataset.formats.lerobot.files import Files
+from mcaprl.recorder.format.metadata import LogMetadata
+
+# LeRobot's own tolerance; 32-bit floats are less precise after half an hour.
+_TIME_TOLERANCE_S = 1e-4
+_OBSERVATION = "observation"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Rows of a dataset that become an episode of T transitions.
+
+    Attributes:
+        frames: Indexes (T + 1,) of the rows with its observations.
+        steps: Rows of its transitions.
+        terminated: Whether the last transition led to a terminal state.
+        truncated: Whether the episode was truncated.
+        source: Index of LeRobot's episode.
+    """
+
+    frames: NDArray[np.int64]
+    steps: slice
+    terminated: bool
+    truncated: bool
+    source: int
+
+
+def foreign_dataset(files: Files) -> Dataset:
+    """Return all episodes of a dataset without final observations; warn of what is missing.
+
+    Raises:
+        LogError: There is no observation or no action.
+        SpaceError: A log cannot hold a feature.
+    """
+    values, parts, labels = _observations(files)
+    steps = files.steps()
+    if features.ACTION not in steps:
+        raise LogError(f"{files.path} has no feature '{features.ACTION}'")
+    _warn_of_steps(files, steps)
+    actions, action_space = _values_and_space(steps[features.ACTION], is_action=True)
+    is_single = len(parts) == 1
+    metadata = LogMetadata(
+        next(iter(parts.values())) if is_single else spaces.Dict(list(parts.items())),
+        action_space,
+        observation_names=labels if is_single else (),
+        step_duration_ns=_step_ns(files),
+    )
+    rewards = steps.get(features.REWARD, np.full((len(actions), 1), np.nan))
+    probabilities = steps.get(features.PROBABILITY)
+    times, infos = _times_ns(files), _infos(files)
+    episodes = []
+    for part in _parts(files, steps):
+        observations = {key: array[part.frames] for key, array in values.items()}
+        episode = EpisodeArrays(
+            observations=next(iter(observations.values())) if is_single else observations,
+            actions=actions[part.steps],
+            rewards=rewards[part.steps, 0],
+            terminated=part.terminated,
+            truncated=part.truncated,
+            behavior_probs=None if probabilities is None else probabilities[part.steps, 0],
+            times_ns=_frame_times(times, part, metadata.step_duration_ns),
+            infos={name: _info_rows(array[part.steps]) for name, array in infos.items()},
+            summary={"options": _options(files, part.source)},
+        )
+        episodes.append(episode)
+    return dataset_of(episodes, metadata, files.path)
+
+
+def _observations(
+    files: Files,
+) -> tuple[dict[str, NDArray[Any]], dict[str, spaces.Space[Any]], tuple[str, ...]]:
+    """Return the values and spaces of the observations by key, and the names of the first one."""
+    values, parts, labels = {}, {}, []
+    for key, feature in _observed(files).items():
+        values[key], parts[key] = _values_and_space(files.values(feature))
+        labels.append(_labels(feature))
+    return values, parts, labels[0]
+
+
+def _observed(files: Files) -> dict[str, Feature]:
+    """Return the features of the observation by key."""
+    found: dict[str, Feature] = {}
+    for name, feature in files.features.items():
+        if not name.startswith(_OBSERVATION) or not _is_kept(files, feature):
+            continue
+        full = name.removeprefix(_OBSERVATION).strip(".") or "state"
+        short = name.removeprefix(features.IMAGES)
+        key = short if short != name and short not in found else full
+        if key in found:
+            raise SpaceError(f"{files.path}: two observations have the name '{key}'")
+        found[key] = feature
+    if not found:
+        raise LogError(f"{files.path} has no feature '{_OBSERVATION}...' that can be read")
+    return found
+
+
+def _infos(files: Files) -> dict[str, NDArray[Any]]:
+    """Return the values (N, *shape) of the features that become infos, by the infos' names."""
+    taken = {*features.STEPS, *features.DEFAULTS}
+    found = {}
+    for name, feature in files.features.items():
+        is_other = name not in taken and not name.startswith(_OBSERVATION)
+        if is_other and _is_kept(files, feature, images=False):
+            found[name.removeprefix(features.INFO)] = files.values(feature)
+    return found
+
+
+def _is_kept(files: Files, feature: Feature, *, images: bool = True) -> bool:
+    """Return whether a feature has numbers or images; warn if not.
+
+    Depth in a video is compressed in a way of LeRobot's own.
+    """
+    is_video_of_depth = feature.is_depth and feature.dtype == "video"
+    if images and feature.is_image and not is_video_of_depth:
+        return True
+    if not feature.is_image and feature.is_numeric:
+        return True
+    kind = f"depth {feature.dtype}" if feature.is_depth else feature.dtype
+    _warn(files, f"the feature '{feature.name}' of type {kind} is left out")
+    return False
+
+
+def _warn_of_steps(files: Files, steps: Mapping[str, Any]) -> None:
+    if features.REWARD not in steps:
+        _warn(files, f"there is no feature '{features.REWARD}': all rewards are NaN")
+    if features.DONE in steps and features.TRUNCATED not in steps:
+        _warn(
+            files,
+            f"'{features.DONE}' may also mean truncation, because there is no feature"
+            f" '{features.TRUNCATED}'; it is read as termination",
+        )
+
+
+def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
+    """Divide the rows into episodes; `next.done` and `next.truncated` end one."""
+    none = np.zeros((sum(files.lengths), 1), bool)
+    done = steps.get(features.DONE, none)[:, 0] != 0
+    truncated = steps.get(features.TRUNCATED, none)[:, 0] != 0
+    found: list[_Part] = []
+    repeated = dropped = 0
+    for source, start, stop, is_last in _stretches(files, done | truncated):
+        frames = np.arange(start, stop + 1)
+        flags = bool(done[stop - 1]), bool(truncated[stop - 1])
+        if is_last and flags[0]:
+            frames[-1] = stop - 1
+            repeated += 1
+        elif is_last:
+            frames, flags = frames[:-1], (False, True)
+            dropped += 1
+        if len(frames) > 1:
+            found.append(_Part(frames, slice(start, start + len(frames) - 1), *flags, source))
+    _warn_of_ends(files, repeated, dropped)
+    return found
+
+
+def _stretches(files: Files, ends: NDArray[np.bool_]) -> Iterator[tuple[int, int, int, bool]]:
+    """Yield LeRobot's episodes, divided after each end: its index, rows, and if it is the last."""
+    for source, (start, stop) in enumerate(files.ranges()):
+        inner = (start + 1 + np.flatnonzero(ends[start : stop - 1])).tolist()
+        for first, last in zip([start, *inner], [*inner, stop], strict=True):
+            yield source, first, last, last == stop
+
+
+def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
+    if repeated:
+        _warn(
+            files,
+            f"the observation after the end is not stored of {repeated} episodes that end in a"
+            " terminal state; the last observation is repeated in its place",
+        )
+    if dropped:
+        _warn(
+            files,
+            f"the observation after the last action is not stored of {dropped} other episodes;"
+            " that action is left out, and the episodes are marked as truncated",
+        )
+
+
+def _step_ns(files: Files) -> int:
+    return round(1e9 / files.fps)
+
+
+def _times_ns(files: Files) -> NDArray[np.int64]:
+    """Return the time (N,) of each frame, nanoseconds; two steps lie between two episodes."""
+    seconds = files.times_s()
+    numbers = np.concatenate([np.arange(length) for length in files.lengths])
+    regular = numbers / files.fps
+    tolerance = np.maximum(_TIME_TOLERANCE_S, np.spacing(np.float32(regular)))
+    is_regular = np.abs(seconds - regular) <= tolerance
+    step_ns = _step_ns(files)
+    times = np.where(is_regular, numbers * step_ns, np.round(seconds * 1e9)).astype(np.int64)
+    lengths = times[files.stops - 1] + 2 * step_ns
+    found: NDArray[np.int64] = times + np.repeat(np.cumsum(lengths) - lengths, files.lengths)
+    return found
+
+
+def _frame_times(times: NDArray[np.int64], part: _Part, step_ns: int) -> NDArray[np.int64]:
+    """Return the times (T + 1,) of the frames of an episode."""
+    found = times[part.frames]
+    if part.frames[-1] == part.frames[-2]:
+        found[-1] += step_ns
+    return found
+
+
+def _options(files: Files, episode: int) -> str:
+    """Return the texts of an episode's tasks as options of its reset."""
+    tasks = list(files.episodes[episode].get("tasks") or ())
+    if not tasks:
+        return ""
+    return json.dumps({"task": tasks[0]} if len(tasks) == 1 else {"tasks": tasks})
+
+
+def _values_and_space(
+    values: NDArray[Any], *, is_action: bool = False
+) -> tuple[NDArray[Any], spaces.Space[Any]]:
+    """Return values (N, *shape) in a dtype of a space, and the space."""
+    if values.dtype.kind == "b":
+        return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
+    if is_action and values.shape[1:] == (1,) and values.dtype.kind in "iu":
+        scalars = values[:, 0].astype(np.int64)
+        return scalars, action_space_of(scalars)
+    return values, box_of(values)
+
+
+def _labels(feature: Feature) -> tuple[str, ...]:
+    """Return the names of a vector's elements, from a list or from lists by their kind."""
+    names = feature.names
+    if isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    is_vector = isinstance(names, list) and not feature.is_image
+    return tuple(map(str, names)) if is_vector and (len(names),) == feature.shape else ()
+
+
+def _info_rows(values: NDArray[Any]) -> Any:
+    """Return the info (T + 1, *shape) of the steps' values (T, *shape): there is none at reset."""
+    plain = values[:, 0] if values.shape[1:] == (1,) else values
+    rows = np.concatenate([np.zeros((1, *plain.shape[1:]), plain.dtype), plain])
+    mask = np.zeros(rows.shape, bool)
+    mask[0] = True
+    return np.ma.MaskedArray(rows, mask)
+
+
+def _warn(files: Files, text: str) -> None:
+    warnings.warn(f"{files.path}: {text}", stacklevel=2)
