@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import OURS, Side, Table, compare
+from mcaprl.recorder import forget_types, open_bag
 
 MESSAGES = 100_000
 SLOW_SHARE = 0.02
@@ -60,9 +61,6 @@ def _fields(path: Path, kind: str) -> Table:
 
 
 def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
-    from mcaprl.recorder.bags.bag import open_bag
-    from mcaprl.recorder.columns.cdr import forget_types
-
     # Each turn is a first opening, which parses the definitions.
     forget_types()
     with closing(open_bag(path)) as bag:

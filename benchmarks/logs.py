@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import mcaprl
-from benchmarks import limits, log_parts, rivals
+from benchmarks import limits, loading, log_parts, rivals
 from benchmarks.limits import LEAST_WORK, PLAIN
 from benchmarks.measure import OURS, SLOW_SHARE, SLOWEST_SHARE, Side, Table, after, compare
 from benchmarks.workloads import EPISODE_STEPS, Constant, run_env, vectors
@@ -31,6 +31,7 @@ def tables(folder: Path, transitions: int) -> list[Table]:
         _threads(log),
         *log_parts.tables(folder, log, data, minari),
         _checking(folder, log),
+        loading.table(log, data),
     ]
 
 

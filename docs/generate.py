@@ -92,12 +92,19 @@ def api_reference() -> str:
         value = getattr(mcaprl, name)
         if name == "__version__":
             parts.append(_section(f"mcaprl.{name}", "Version of the package."))
-            continue
-        texts = [f"mcaprl.{name}{_signature(value)}", str(inspect.getdoc(value))]
-        if inspect.isclass(value):
-            texts += [_member(value, member) for member in _members(value)]
-        parts.append(_section(f"mcaprl.{name}", "\n\n".join(texts)))
+        elif inspect.ismodule(value):
+            parts.append(_section(f"mcaprl.{name}", str(inspect.getdoc(value))))
+            parts += [_reference(f"{name}.{one}", getattr(value, one)) for one in value.__all__]
+        else:
+            parts.append(_reference(name, value))
     return "\n".join(parts)
+
+
+def _reference(name: str, value: Any) -> str:
+    texts = [f"mcaprl.{name}{_signature(value)}", str(inspect.getdoc(value))]
+    if inspect.isclass(value):
+        texts += [_member(value, member) for member in _members(value)]
+    return _section(f"mcaprl.{name}", "\n\n".join(texts))
 
 
 def mapping_reference() -> str:
@@ -125,10 +132,12 @@ def _default(value: Any) -> str:
 
 
 def _members(value: type) -> list[str]:
-    """Return the names of the documented methods and properties that a class defines."""
+    """Return the documented methods and properties that a class and its bases of ours define."""
+    ours = [base for base in value.__mro__ if base.__module__.startswith("mcaprl")]
     return [
         name
-        for name, member in vars(value).items()
+        for base in ours
+        for name, member in vars(base).items()
         if not name.startswith("_")
         and inspect.getdoc(getattr(value, name))
         # Fields of a dataclass are described in the docstring of the class.

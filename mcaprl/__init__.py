@@ -22,6 +22,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
+    from mcaprl import torch
     from mcaprl.api.annotate import annotate
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.estimate import estimate
@@ -57,6 +58,7 @@ __all__ = [
     "render",
     "replay",
     "suggest_mapping",
+    "torch",
     "train",
     "train_online",
     "verify",
@@ -72,6 +74,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.policies": ["export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
+        "mcaprl.torch": ["torch"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],
     },

@@ -13,14 +13,16 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
 
     Args:
         package: Name of the package.
-        sources: Names that each module defines, by the module's full name.
+        sources: Names that each module defines, by the module's full name; the name of a
+            submodule stands for the submodule.
     """
     modules = {name: module for module, names in sources.items() for name in names}
 
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(import_module(modules[name]), name)
+        module = import_module(modules[name])
+        value = module if modules[name] == f"{package}.{name}" else getattr(module, name)
         setattr(sys.modules[package], name, value)
         return value
 

@@ -23,8 +23,10 @@ __all__ = [
     "Track",
     "chunk_header",
     "crc32",
+    "forget_types",
     "map_file",
     "message_dtype",
+    "open_bag",
     "step_schema",
 ]
 
@@ -32,6 +34,8 @@ __all__ = [
 __getattr__ = lazy_attributes(
     __name__,
     {
+        "mcaprl.recorder.bags.bag": ("open_bag",),
+        "mcaprl.recorder.columns.cdr": ("forget_types",),
         "mcaprl.recorder.columns.checksum": ("crc32",),
         "mcaprl.recorder.columns.chunks": ("ChunkHeader", "chunk_header"),
         "mcaprl.recorder.columns.reader": ("McapReader",),

@@ -111,6 +111,7 @@ def _clear_errors(name: str, spec: SimSpec | None, kwargs: dict[str, Any]) -> It
 
 __all__ = [
     "SIMS",
+    "CarCamera",
     "EpsilonGreedy",
     "LaneKeepingEnv",
     "Policy",
@@ -134,6 +135,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.sims.evaluation.evaluate": ("PolicyScore", "evaluate", "normalize"),
         "mcaprl.sims.evaluation.pilots": ("make_pilot",),
         "mcaprl.sims.evaluation.rollout": ("EpsilonGreedy", "Policy", "episode_seed", "rollout"),
+        "mcaprl.sims.lane.camera": ("CarCamera",),
         "mcaprl.sims.lane.env": ("LaneKeepingEnv",),
     },
 )

@@ -13,14 +13,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
 
 from robot import PAUSE_S, Drive, Message
 from writers import WRITERS
 
 import mcaprl
-from mcaprl.sims.lane.camera import CarCamera
-from mcaprl.sims.lane.env import LaneKeepingEnv
+from mcaprl.sims import CarCamera
 
 START_NS = 1_700_000_000 * 10**9
 
@@ -42,22 +40,13 @@ def make_bag(log: str | Path, out: str | Path, form: str = "ros2") -> int:
 
 
 def _recorded(log: str | Path) -> Iterator[tuple[int, Message]]:
-    camera, start_ns = CarCamera(), START_NS
-    for drive in drives(log):
+    env, camera, start_ns = mcaprl.make_sim("lane"), CarCamera(), START_NS
+    for episode in mcaprl.open(log).episodes:
+        assert episode.seed is not None, f"{log} has no seeds"
+        drive = Drive(env, episode.seed, episode.actions.tolist())
         for message in drive.messages(camera, start_ns):
             yield start_ns + round(message.time_s * 1e9), message
         start_ns += round((drive.duration_s + PAUSE_S) * 1e9)
-
-
-def drives(log: str | Path) -> Iterator[Drive]:
-    """Yield the drives of a log, from their seeds and actions."""
-    env = mcaprl.make_sim("lane")
-    sim = cast(LaneKeepingEnv, env.unwrapped)
-    for episode in mcaprl.open(log).episodes:
-        env.reset(seed=episode.seed)
-        actions: list[Any] = episode.actions.tolist()
-        failed = bool(episode.terminated[-1])
-        yield Drive(sim.car, actions, is_failure=failed, seed=episode.index)
 
 
 def main() -> None:

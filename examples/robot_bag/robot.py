@@ -19,21 +19,11 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from mcaprl.sims.lane.camera import CarCamera
-from mcaprl.sims.lane.rules import (
-    BRAKE,
-    DECISION_S,
-    LOOKAHEADS_M,
-    MAX_SPEED_M_S,
-    MAX_STEERING_RAD,
-    STEERING,
-    SUBSTEP_S,
-    Car,
-    drive,
-    observe,
-)
+from mcaprl.sims import CarCamera
 
 TYPES = {
     "/odom": "nav_msgs/msg/Odometry",
@@ -46,6 +36,18 @@ TYPES = {
 }
 PAUSE_S = 5.0
 """Time between two drives."""
+COMMANDS = (
+    ("brake", 0.0, 0.0),
+    ("straight", 30.0, 0.0),
+    ("right", 30.0, -0.5),
+    ("left", 30.0, 0.5),
+    ("slightly right", 30.0, -0.25),
+    ("slightly left", 30.0, 0.25),
+)
+"""Name, wanted speed and steering (a share of the largest angle, left positive) of each action."""
+_STEP_S, _SUBSTEP_S = 0.25, 0.05
+_LOOKAHEADS_M = np.repeat([5.0, 10.0, 20.0, 40.0], 2)
+_FULL_STEERING_RAD = math.radians(40.0)
 _ODOMETRY_S, _COMMAND_S, _IMAGE_S, _DIAGNOSTICS_S = 0.02, 0.05, 0.1, 1.0
 _JITTER_S = 0.004
 """Largest delay of a measurement until it is recorded."""
@@ -69,31 +71,40 @@ class Message(NamedTuple):
 
 
 class Drive:
-    """One drive of the car: its start and the actions of the controller."""
+    """One drive of the car in the lane sim."""
 
-    def __init__(self, start: Car, actions: list[int], *, is_failure: bool, seed: int) -> None:
-        """Compute the motion; each action lasts 0.25 s.
+    def __init__(self, env: gym.Env[Any, Any], seed: int, actions: list[int]) -> None:
+        """Drive the car.
 
         Args:
-            start: State of the car at the start.
-            actions: Actions of the lane sim.
-            is_failure: Whether the safety monitor stops the car at the end.
-            seed: Seed of the delays.
+            env: Lane sim with its default rules.
+            seed: Seed of the start.
+            actions: Actions of the controller; each lasts 0.25 s.
         """
-        self.actions = actions
-        self._is_failure = is_failure
         self._random = np.random.default_rng(seed)
-        self._cars = [start]
+        self._actions = actions
+        sim: Any = env.unwrapped
+        seen, _ = env.reset(seed=seed)
+        self._lanes = [_lane(sim.car, seen)]
+        self._cars = [sim.car]
+        self._stopped = False
         for action in actions:
-            self._cars.append(drive(self._cars[-1], action))
+            self._cars += sim.fleet.substeps(sim.car, action)
+            seen, _, self._stopped, _, _ = env.step(action)
+            self._lanes.append(_lane(sim.car, seen))
 
     @property
     def duration_s(self) -> float:
         """Length of the drive, seconds."""
-        return len(self.actions) * DECISION_S
+        return len(self._actions) * _STEP_S
 
     def messages(self, camera: CarCamera, start_ns: int) -> list[Message]:
-        """Return all messages in the order of recording; header stamps count from `start_ns`."""
+        """Return all messages in the order of recording.
+
+        Args:
+            camera: Camera at the front of the car.
+            start_ns: Time of the start for the stamps of headers, nanoseconds.
+        """
         parts = (
             self._odometry(start_ns),
             self._joints(start_ns),
@@ -128,29 +139,25 @@ class Drive:
             content = {
                 "header": _header(start_ns, time_s, ""),
                 "name": ["steering"],
-                "position": [self._car(time_s).steering * MAX_STEERING_RAD],
+                "position": [self._car(time_s).steering * _FULL_STEERING_RAD],
             }
             yield self._measured(time_s, "/joint_states", content)
 
     def _lane(self) -> Iterator[Message]:
-        seen = np.empty(12, np.float32)
-        for step, car in enumerate(self._cars):
-            observe(car, seen)
-            ahead_m = seen[4:] * np.repeat(LOOKAHEADS_M, 2)
-            data = [car.offset_m, car.heading_error_rad, car.along_m, *ahead_m.tolist()]
-            yield Message(step * DECISION_S + _LANE_DELAY_S, "/lane", {"data": data})
+        for step, data in enumerate(self._lanes):
+            yield Message(step * _STEP_S + _LANE_DELAY_S, "/lane", {"data": data})
 
     def _commands(self) -> Iterator[Message]:
-        for step, action in enumerate(self.actions):
-            speed = 0.0 if action == BRAKE else MAX_SPEED_M_S
-            content = {"linear": {"x": speed}, "angular": {"z": STEERING[action]}}
-            for repeat in range(round(DECISION_S / _COMMAND_S)):
-                time_s = step * DECISION_S + repeat * _COMMAND_S + _COMMAND_DELAY_S
+        for step, action in enumerate(self._actions):
+            _, speed, steering = COMMANDS[action]
+            content = {"linear": {"x": speed}, "angular": {"z": steering}}
+            for repeat in range(round(_STEP_S / _COMMAND_S)):
+                time_s = step * _STEP_S + repeat * _COMMAND_S + _COMMAND_DELAY_S
                 yield Message(time_s, "/cmd_vel", content)
 
     def _stops(self) -> Iterator[Message]:
         yield Message(0.0, "/e_stop", {"data": False})
-        if self._is_failure:
+        if self._stopped:
             yield Message(self.duration_s, "/e_stop", {"data": True})
 
     def _images(self, camera: CarCamera, start_ns: int) -> Iterator[Message]:
@@ -173,37 +180,35 @@ class Drive:
             content = {"header": _header(start_ns, time_s, ""), "status": [status]}
             yield self._measured(time_s, "/diagnostics", content)
 
-    def _times(self, period_s: float) -> Iterator[float]:
-        count = round(self.duration_s / period_s)
-        return (
-            number * period_s for number in range(count + 1) if number * period_s <= self.duration_s
-        )
+    def _times(self, period_s: float) -> list[float]:
+        count = math.floor(self.duration_s / period_s + 1e-9)
+        return [number * period_s for number in range(count + 1)]
 
     def _measured(self, time_s: float, topic: str, content: dict[str, Any]) -> Message:
         delay_s = float(self._random.uniform(0.0, _JITTER_S))
         return Message(time_s + delay_s, topic, content)
 
-    def _car(self, time_s: float) -> Car:
+    def _car(self, time_s: float) -> Any:
         """Return the car at a time, interpolated between two substeps of the sim."""
-        step = min(int(time_s / DECISION_S + 1e-9), len(self.actions))
-        rest = (time_s - step * DECISION_S) / SUBSTEP_S
-        before = self._cars[step]
-        if step == len(self.actions) or rest < 1e-6:
-            return before
-        count = int(rest + 1e-9)
-        low = drive(before, self.actions[step], count) if count else before
-        high = drive(before, self.actions[step], count + 1)
-        return _between(low, high, rest - count)
+        number, share = divmod(time_s / _SUBSTEP_S + 1e-9, 1.0)
+        low = self._cars[int(number)]
+        if share < 1e-6:
+            # A measurement at the time of a decision precedes it.
+            return low
+        high = self._cars[int(number) + 1]
+        turn = math.remainder(high.yaw_rad - low.yaw_rad, 2 * math.pi)
+        return high._replace(
+            x_m=low.x_m + share * (high.x_m - low.x_m),
+            y_m=low.y_m + share * (high.y_m - low.y_m),
+            yaw_rad=low.yaw_rad + share * turn,
+            speed_m_s=low.speed_m_s + share * (high.speed_m_s - low.speed_m_s),
+        )
 
 
-def _between(low: Car, high: Car, share: float) -> Car:
-    turn = math.remainder(high.yaw_rad - low.yaw_rad, 2 * math.pi)
-    return high._replace(
-        x_m=low.x_m + share * (high.x_m - low.x_m),
-        y_m=low.y_m + share * (high.y_m - low.y_m),
-        yaw_rad=low.yaw_rad + share * turn,
-        speed_m_s=low.speed_m_s + share * (high.speed_m_s - low.speed_m_s),
-    )
+def _lane(car: Any, seen: NDArray[np.float32]) -> list[float]:
+    """Return what the lane detector publishes, in meters and radians."""
+    ahead_m = seen[4:] * _LOOKAHEADS_M
+    return [car.offset_m, car.heading_error_rad, car.along_m, *ahead_m.tolist()]
 
 
 def _header(start_ns: int, time_s: float, frame: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.offline.batches.items import n_step_returns
 from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
 from mcaprl.recorder.format.spaces import check_actions
 
@@ -131,7 +132,7 @@ class TransitionBuffer:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
         counts = lengths + 1
-        places, returns = _n_step(dataset, packing)
+        places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
         frames = encoder.encode(dataset.frames)
         actions = dataset.actions.astype(np.int64) - int(action_space.start)
         if actions.min() < 0 or actions.max() >= action_space.n:
@@ -256,28 +257,6 @@ def discrete_actions(space: spaces.Space[Any]) -> spaces.Discrete:
         raise SpaceError(f"offline learning needs discrete actions, got {space}")
     check_actions(space)
     return space
-
-
-def _n_step(dataset: Dataset, packing: Packing) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Compute `places` and `returns` of `TransitionBuffer`; a return stops at the episode's end.
-
-    A return that ends with termination has no bootstrap value; one that ends with truncation
-    bootstraps from the last next observation.
-    """
-    n_rows, lengths = len(dataset), dataset.episode_lengths
-    rows = np.arange(n_rows)
-    ends = np.repeat(np.cumsum(lengths), lengths)
-    ahead = np.minimum(packing.n_steps, ends - rows)
-    rewards = np.zeros(n_rows)
-    for k in range(packing.n_steps):
-        counts = ahead > k
-        rewards[counts] += packing.gamma**k * dataset.rewards[rows[counts] + k]
-    lasts = rows + ahead - 1
-    discounts = np.where(dataset.terminated[lasts], 0.0, packing.gamma ** ahead.astype(float))
-    here = dataset.frame_of_step
-    places = np.stack([here, here + ahead])
-    with np.errstate(over="ignore"):
-        return places, np.stack([rewards, discounts]).astype(np.float32)
 
 
 def _check_data(dataset: Dataset, frames: Observations, actions: NDArray[np.int64]) -> None:

@@ -35,6 +35,7 @@ ONLY_OPTIONS = {
     "help": "click adds it",
     "json": "a function returns a dataclass, whose to_json the command prints",
     "convert --dry-run": "out=None",
+    "convert --from": "`from` is a keyword of Python: source_format",
     "convert --suggest": "it selects the function suggest_mapping",
     "info --strict": "an exit code",
     "replay --verify": "it selects the function verify",

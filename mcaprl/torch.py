@@ -1,0 +1,13 @@
+"""Datasets of PyTorch: transitions and sequences of logs, in memory or as a stream.
+
+loader = mcaprl.torch.TransitionDataset("logs/").loader(256, shuffle=True)
+stream = mcaprl.torch.TransitionStream("logs/", batch_size=256)     # for data beyond the memory
+"""
+
+from mcaprl.offline.batches.loading import TransitionDataset
+from mcaprl.offline.batches.stream import TransitionStream
+
+__all__ = ["TransitionDataset", "TransitionStream"]
+
+# Public import paths, for reprs and pickles.
+TransitionDataset.__module__ = TransitionStream.__module__ = "mcaprl.torch"

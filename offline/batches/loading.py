@@ -1,0 +1,218 @@
+"""A dataset of PyTorch whose items are transitions, or sequences of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.utils.data
+
+from mcaprl.errors import UsageError
+from mcaprl.offline.batches.items import Arrays, ItemOptions, Items
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.mapped import MappedImages
+from mcaprl.recorder.dataset.open import open_logs
+from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, Transitions
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
+
+Paths = str | Path | Sequence[str | Path]
+_COLUMNS = ("log_time_ns", *STEP_COLUMNS)
+Tensors = dict[str, Any]
+"""Tensors by name; observations of a Dict space are dicts of tensors."""
+
+
+class TransitionDataset(torch.utils.data.Dataset[Tensors]):
+    """Map-style dataset of the transitions of logs, or of sequences of them.
+
+    An item is a dict of tensors; `dataset[rows]` with a sequence of B rows is a batch, in which
+    each tensor has B rows. Without `length` it contains, for each transition:
+
+        observation         in the space's dtype; a dict for a Dict space
+        action              int64, or the space's dtype
+        reward              float32, the discounted sum of up to n_steps rewards
+        next_observation    up to n_steps later
+        terminated          bool, whether next_observation is terminal
+        truncated           bool, whether the episode was truncated at next_observation
+        discount            float32, gamma to the power of the number of rewards; 0 if terminated
+        behavior_prob       float32, NaN if unknown
+
+    With `length` L, an item is a sequence of L transitions of one episode, with single rewards.
+    Each tensor has a further axis of length L after that of the batch; rows after the end of the
+    episode are 0. There is no `discount`; in addition there are:
+
+        mask                bool, whether the row is a transition of the episode
+        return_to_go        float32, discounted sum of the rewards from this transition on
+        step                int64, number of the transition in its episode
+
+    With `frame_stack` n, observations have a further axis of length n before the axes of their
+    shape, the last observation last.
+    """
+
+    def __init__(
+        self,
+        data: Dataset | Paths,
+        *,
+        n_steps: int = 1,
+        gamma: float = 1.0,
+        frame_stack: int = 1,
+        length: int | None = None,
+        stride: int = 1,
+    ) -> None:
+        """Read the logs, and compute the returns.
+
+        Args:
+            data: Dataset, or paths of logs as in `mcaprl.open`.
+            n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
+            gamma: Discount per step.
+            frame_stack: Number of successive observations in one item; an episode's first
+                observation also pads the stacks.
+            length: Number of transitions in a sequence; None for single transitions.
+            stride: Number of steps between the starts of two sequences of an episode.
+
+        Raises:
+            UsageError: An option is out of range, or two options exclude each other.
+            LogError: A log cannot be read.
+        """
+        options = ItemOptions(n_steps, gamma, frame_stack, length, stride)
+        self._paths = None if isinstance(data, Dataset) else data
+        self._shared: _Shared | None = None
+        self._items = Items(data if isinstance(data, Dataset) else open_logs(data), options)
+
+    @property
+    def data(self) -> Dataset:
+        """The transitions."""
+        return self._items.dataset
+
+    def __len__(self) -> int:
+        """Return the number of items."""
+        return len(self._items)
+
+    def __getitem__(self, rows: Any) -> Tensors:
+        """Return one item for an integer, or a batch for a sequence or slice of integers."""
+        if isinstance(rows, slice):
+            rows = np.arange(len(self))[rows]
+        chosen = np.asarray(rows, np.int64)
+        count = len(self)
+        if chosen.size and not (-count <= chosen.min() and chosen.max() < count):
+            raise IndexError(f"item {rows} of {count}")
+        batch = tensors_of(self._items.batch(np.atleast_1d(chosen) % max(count, 1)))
+        return batch if chosen.ndim else _row(batch, 0)
+
+    def __getitems__(self, rows: Sequence[int]) -> list[Tensors]:
+        """Return several items, gathered at once; `DataLoader` calls this."""
+        batch = self[rows]
+        return [_row(batch, k) for k in range(len(rows))]
+
+    def loader(
+        self, batch_size: int, *, shuffle: bool = True, drop_last: bool = False, **options: Any
+    ) -> torch.utils.data.DataLoader[Tensors]:
+        """Return a DataLoader of batches that are gathered at once instead of item by item.
+
+        Args:
+            batch_size: Number of items of a batch.
+            shuffle: Whether each epoch has a new random order; `generator` among the options seeds
+                it.
+            drop_last: Whether a last batch with fewer items is left out.
+            options: Further arguments of `torch.utils.data.DataLoader`; `sampler` replaces the
+                order of `shuffle`.
+        """
+        sampler = options.pop("sampler", None)
+        if sampler is None and shuffle:
+            generator = options.get("generator")
+            sampler = torch.utils.data.RandomSampler(range(len(self)), generator=generator)
+        elif sampler is None:
+            sampler = torch.utils.data.SequentialSampler(range(len(self)))
+        batches = torch.utils.data.BatchSampler(sampler, batch_size, drop_last)
+        return torch.utils.data.DataLoader(self, batch_size=None, sampler=batches, **options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a worker process needs: tensors, which PyTorch shares without copies.
+
+        Raises:
+            UsageError: The images are on disk, and the dataset was not made from paths.
+        """
+        data = self._items.dataset
+        columns = data._transitions
+        if any(isinstance(leaf, MappedImages) for leaf in columns.frames):
+            if self._paths is None:
+                raise UsageError(
+                    "images on disk cannot be sent to another process: make the TransitionDataset"
+                    " from the paths of the logs, or use the start method fork"
+                )
+            return {"paths": self._paths, "options": self._items.options}
+        if self._shared is None:
+            # From here on this process uses the shared memory, too. Without a reference, PyTorch
+            # would remove it before a worker has opened it.
+            self._shared = _Shared(
+                frames=tuple(_shared(leaf) for leaf in columns.frames),
+                columns={name: _shared(getattr(columns, name)) for name in _COLUMNS},
+                episodes=columns.episodes,
+                description=data._description,
+                sources=data.sources,
+            )
+            self._items = Items(self._shared.dataset(), self._items.options)
+        return {"paths": self._paths, "options": self._items.options, "shared": self._shared}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore the dataset in a worker process."""
+        self._paths, self._shared = state["paths"], state.get("shared")
+        if self._shared is None:
+            data = open_logs(state["paths"], images="mapped")
+        else:
+            data = self._shared.dataset()
+        self._items = Items(data, state["options"])
+
+
+class _Shared(NamedTuple):
+    """Parts of a dataset, with the arrays as tensors, which processes share."""
+
+    frames: tuple[torch.Tensor, ...]
+    columns: dict[str, torch.Tensor]
+    episodes: tuple[EpisodeSummary, ...]
+    description: LogMetadata
+    sources: tuple[Path, ...]
+
+    def dataset(self) -> Dataset:
+        columns = Transitions(
+            frames=tuple(leaf.numpy() for leaf in self.frames),
+            episodes=self.episodes,
+            **{name: column.numpy() for name, column in self.columns.items()},
+        )
+        return Dataset(columns, self.description, sources=self.sources)
+
+
+def _shared(array: Any) -> torch.Tensor:
+    """Copy an array to memory that processes share."""
+    tensor = torch.from_numpy(np.array(array))
+    tensor.share_memory_()  # type: ignore[no-untyped-call]
+    return tensor
+
+
+def tensors_of(arrays: Arrays) -> Tensors:
+    """Return arrays as tensors with the same memory."""
+    return {
+        name: tensors_of(part) if isinstance(part, dict) else torch.from_numpy(part)
+        for name, part in arrays.items()
+    }
+
+
+def _row(batch: Tensors, k: int) -> Tensors:
+    return {
+        name: _row(part, k) if isinstance(part, dict) else part[k] for name, part in batch.items()
+    }
+
+
+def joined_arrays(parts: Sequence[Arrays]) -> Arrays:
+    """Concatenate the rows of several batches."""
+    if len(parts) == 1:
+        return parts[0]
+    return {
+        name: joined_arrays([part[name] for part in parts])
+        if isinstance(first, dict)
+        else np.concatenate([part[name] for part in parts])
+        for name, first in parts[0].items()
+    }
