@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.measure import OURS, Side, Table, compare
-from mcaprl.recorder import forget_types, open_bag
+from mcaprl.recorder import clear_types, open_bag
 
 MESSAGES = 100_000
 SLOW_SHARE = 0.02
@@ -62,7 +62,7 @@ def _fields(path: Path, kind: str) -> Table:
 
 def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
     # Each turn is a first opening, which parses the definitions.
-    forget_types()
+    clear_types()
     with closing(open_bag(path)) as bag:
         return bag.read(topic, fields).columns
 
@@ -136,7 +136,7 @@ def _open(path: Path) -> Any:
 
 
 def _gigabyte(path: Path) -> Table:
-    """Read images in a process of its own, whose peak memory is that of the reading."""
+    """Read images in a separate process, whose peak memory is that of the reading."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         seconds, memory = pool.submit(_cost, path).result()
     table = Table(

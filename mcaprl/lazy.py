@@ -14,7 +14,7 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
     Args:
         package: Name of the package.
         sources: Names that each module defines, by the module's full name; the name of a
-            submodule stands for the submodule.
+            submodule is the submodule itself.
     """
     modules = {name: module for module, names in sources.items() for name in names}
 

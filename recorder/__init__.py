@@ -22,8 +22,8 @@ __all__ = [
     "Player",
     "Track",
     "chunk_header",
+    "clear_types",
     "crc32",
-    "forget_types",
     "map_file",
     "message_dtype",
     "open_bag",
@@ -35,7 +35,7 @@ __getattr__ = lazy_attributes(
     __name__,
     {
         "mcaprl.recorder.bags.bag": ("open_bag",),
-        "mcaprl.recorder.columns.cdr": ("forget_types",),
+        "mcaprl.recorder.columns.cdr": ("clear_types",),
         "mcaprl.recorder.columns.checksum": ("crc32",),
         "mcaprl.recorder.columns.chunks": ("ChunkHeader", "chunk_header"),
         "mcaprl.recorder.columns.reader": ("McapReader",),

@@ -184,7 +184,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         full = [self._batch_size] * min(count // self._batch_size, number - 1)
         rest = count - sum(full)
         if rest == 0 and full and self._batch_size > 1:
-            # Another shard has one item more, in a batch of its own.
+            # Another shard has one item more, in a separate batch.
             full[-1] -= 1
             rest = 1
         return [*full, rest] if rest else full

@@ -280,8 +280,8 @@ def message_type(schema: Schema) -> MessageType:
 _parsed = lru_cache(maxsize=64)(MessageType)
 
 
-def forget_types() -> None:
-    """Forget all parsed types, so that a benchmark measures a first opening."""
+def clear_types() -> None:
+    """Drop all parsed types, so that a benchmark measures a first opening."""
     _parsed.cache_clear()
     definitions_of.cache_clear()
 
