@@ -225,7 +225,10 @@ class FrameReplayBuffer(BaseBuffer):
     def _places(
         self, rows: NDArray[Any], envs: NDArray[Any], before: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return the rows of the frames `before` steps earlier, limited to the same episode."""
+        """Return the rows of the frames that were stored `before` steps earlier.
+
+        Rows before the episode are replaced by its first frame.
+        """
         oldest = self.pos if self.full else 0
         stored = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
         places: NDArray[np.int64] = rows[:, None] - np.minimum(before, stored[:, None])

@@ -155,7 +155,7 @@ def choose_task(
         task = Task.of_preset(preset, sim_options, **given)
         for name, value, own in (("SIM", sim, task.sim), ("--algo", algo, task.algo)):
             if value not in (None, own):
-                raise UsageError(f"preset {preset} has {name} {own}, not {value}: omit it")
+                raise UsageError(f"preset {preset} sets {name} to {own}: omit {name} {value}")
         return task
     if sim is None:
         raise UsageError("train-online needs a SIM, such as lane, or a --preset")

@@ -118,7 +118,7 @@ class ProtobufDecoder:
             return self._class.FromString(data)
         except Exception as error:
             raise LogError(
-                f"{len(data)} bytes are not a {self._descriptor.name}: {error}"
+                f"cannot decode {len(data)} bytes as {self._descriptor.name}: {error}"
             ) from error
 
     def _collect(self, descriptor: Any, prefix: str, parents: tuple[str, ...]) -> None:

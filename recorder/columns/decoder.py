@@ -246,7 +246,7 @@ def _value_at(message: Any, path: str) -> Any:
 
 
 def _as_array(value: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return a value as an array; a list of strings or messages as an array of one object."""
+    """Return a value as an array; a list of strings or messages becomes its only element."""
     if not isinstance(value, list):
         return np.asarray(value, dtype)
     found = np.empty((), object)

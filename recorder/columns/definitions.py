@@ -73,7 +73,7 @@ class Definitions:
             return decoded(data, self.name)
         # The library raises errors of many types; each means that the bytes do not fit.
         except Exception as error:
-            raise LogError(f"{len(data)} bytes are not a {self.name}: {error}") from error
+            raise LogError(f"cannot decode {len(data)} bytes as {self.name}: {error}") from error
 
 
 @lru_cache(maxsize=256)

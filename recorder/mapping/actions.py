@@ -21,7 +21,7 @@ class Actions(NamedTuple):
         space: Action space.
         values: (N,) int64, or (N, K) float32 for a Box; 0 where missing.
         missing: (N,) bool: whether there is no command.
-        far: (N,) bool: whether the command is far from every named one, or beyond the Box.
+        far: (N,) bool: whether the command is far from those of all actions, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
     """
 

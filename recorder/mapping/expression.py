@@ -224,7 +224,7 @@ def _number(value: Any) -> Any:
     """
     found = np.asarray(value)
     if found.dtype.kind not in "biuf":
-        raise TypeError("a text can only be compared")
+        raise TypeError("a string can only be compared")
     return found.astype(np.float64)
 
 
@@ -232,6 +232,6 @@ def _compared(op: ast.cmpop, left: Any, right: Any) -> Any:
     are_texts = [np.asarray(side).dtype.kind not in "biuf" for side in (left, right)]
     if any(are_texts):
         if not all(are_texts) or not isinstance(op, ast.Eq | ast.NotEq):
-            raise TypeError("a text can only be compared with a text, by == or !=")
+            raise TypeError("a string can only be compared with a string, using == or !=")
         left, right = np.asarray(left, object), np.asarray(right, object)
     return _COMPARED[type(op)](left, right)

@@ -117,7 +117,7 @@ class Pace:
     _spent_s: float = field(default=0.0, init=False)
 
     def due(self) -> bool:
-        """Return whether there is time for a frame now."""
+        """Return whether the next frame is due."""
         return self.clock() >= self._next_s
 
     def begin(self) -> None:

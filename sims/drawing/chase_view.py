@@ -208,7 +208,10 @@ def _pieces(shape: Shape, poses: Mapping[str, Pose]) -> list[_Piece]:
 
 
 def _outlines(shape: Shape) -> tuple[list[Floats], float]:
-    """Return polygons (K, 3) and 0, or strokes (2, 3) and their width, in the shape's own axes."""
+    """Return outlines in the shape's own axes, and a line width.
+
+    Polygons are (K, 3) with the width 0; strokes are (2, 3) with their width.
+    """
     points, size = shape.points, shape.size
     match shape.kind:
         case "box":

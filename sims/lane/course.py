@@ -89,7 +89,7 @@ def pavement(
 
 
 def outline(half_width_m: float) -> NDArray[np.float64]:
-    """Return the outline of all streets as segments (M, start and end, x and y), meters."""
+    """Return the outline of all streets as (M, 2, 2) segments: x and y of start and end, meters."""
     x_m, y_m, paved = pavement(half_width_m)
     padded = np.pad(paved, 1)
     across_x = np.argwhere(padded[1:, 1:-1] != padded[:-1, 1:-1])
