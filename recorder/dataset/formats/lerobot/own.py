@@ -11,9 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.errors import import_extra
 from mcaprl.files import parse_json
-from mcaprl.recorder.dataset.formats.lerobot.features import OWN, feature_of
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.lerobot.features import OWN, Feature, feature_of
 from mcaprl.recorder.dataset.formats.lerobot.files import read_table
+from mcaprl.recorder.dataset.formats.lerobot.infos import Infos, infos_of, read_infos, write_infos
+from mcaprl.recorder.dataset.formats.lerobot.tables import write_json, write_table
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of
 
@@ -30,6 +34,7 @@ class Own:
         finals: (E, *shape) final observations by the names of the leaves.
         times_ns: Times (T + 1,) of each episode's observations, nanoseconds since the Unix epoch.
         summaries: Fields of each `EpisodeSummary`.
+        infos: Infos of all observations.
     """
 
     metadata: LogMetadata
@@ -37,6 +42,37 @@ class Own:
     finals: Mapping[str, NDArray[Any]]
     times_ns: Sequence[NDArray[np.int64]]
     summaries: Sequence[Mapping[str, Any]]
+    infos: Infos
+
+
+def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> None:
+    """Write what LeRobot has no place for.
+
+    Args:
+        path: Folder of the dataset.
+        dataset: Dataset that is written.
+        observations: Features of the leaves of the observation.
+    """
+    arrow = import_extra("pyarrow", "tables")
+    folder = path / OWN
+    folder.mkdir()
+    names = [feature.name for feature in observations]
+    infos = write_infos(folder, infos_of(dataset))
+    description = {"metadata": dataset.metadata, "features": names, "infos": infos}
+    write_json(folder / "description.json", description)
+    rows = [episode.summary._asdict() for episode in dataset.episodes]
+    columns = {name: arrow.array([row[name] for row in rows]) for name in rows[0]}
+    times = [episode.log_time_ns.tolist() for episode in dataset.episodes]
+    columns["log_time_ns"] = arrow.array(times, arrow.list_(arrow.int64()))
+    write_table(columns, folder / "episodes.parquet")
+    lasts = np.cumsum(dataset.episode_lengths + 1) - 1
+    finals = {}
+    for leaf, name in zip(leaves_of(dataset.observation_space), names, strict=True):
+        # The final observations of videos are stored without loss.
+        kept = feature_of(name, leaf)
+        values = np.asarray(leaf.of(dataset.frames)[lasts])
+        finals[name] = kept.encode(values.reshape(len(lasts), *kept.shape))
+    write_table(finals, folder / "final_observations.parquet")
 
 
 def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
@@ -65,4 +101,5 @@ def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
         finals[leaf.name] = values.reshape(len(lengths), *leaf.shape)
     rows = episodes.select(list(_SUMMARY)).to_pylist()
     times = [np.array(found, np.int64) for found in episodes["log_time_ns"].to_pylist()]
-    return Own(metadata, names, finals, times, rows)
+    infos = read_infos(folder, description["infos"])
+    return Own(metadata, names, finals, times, rows, infos)

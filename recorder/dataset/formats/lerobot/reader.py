@@ -60,7 +60,7 @@ def _own_dataset(files: Files, own: Own) -> Dataset:
     steps = files.steps()
     actions = steps[features.ACTION].reshape(-1, *action.shape)
     probabilities = steps.get(features.PROBABILITY)
-    episodes = []
+    infos, episodes = own.infos.items(), []
     for index, (start, stop) in enumerate(files.ranges()):
         parts = [
             np.concatenate([column[start:stop], own.finals[leaf.name][index : index + 1]])
@@ -74,6 +74,7 @@ def _own_dataset(files: Files, own: Own) -> Dataset:
             truncated=bool(steps[features.TRUNCATED][stop - 1, 0]),
             behavior_probs=None if probabilities is None else probabilities[start:stop, 0],
             times_ns=own.times_ns[index],
+            infos={name: values[start + index : stop + index + 1] for name, values in infos},
             summary=own.summaries[index],
         )
         episodes.append(episode)

@@ -23,10 +23,11 @@ from mcaprl.recorder.dataset.formats.lerobot import features
 from mcaprl.recorder.dataset.formats.lerobot.features import (
     DATA_PATH,
     EPISODES_PATH,
-    OWN,
     VIDEO_PATH,
     Feature,
 )
+from mcaprl.recorder.dataset.formats.lerobot.infos import info_features, infos_of
+from mcaprl.recorder.dataset.formats.lerobot.own import write_own
 from mcaprl.recorder.dataset.formats.lerobot.statistics import Stats, describe, pooled, sampled
 from mcaprl.recorder.dataset.formats.lerobot.tables import (
     CHUNK_FILES,
@@ -137,7 +138,9 @@ class _Writer:
             features.feature_of(name, leaf, () if leaf.path else labels, video=video)
             for name, leaf in named
         ]
-        self._features = [*self._observations, *_step_features(dataset)]
+        self._infos = info_features(infos_of(dataset), dataset.frame_of_step + 1)
+        others = [*self._infos.values(), *features.default_features()]
+        self._features = [*self._observations, *_step_features(dataset), *others]
         self._slices = episode_slices(dataset)
         self._tasks: dict[str, int] = {}
         self._rows: list[dict[str, Any]] = []
@@ -188,7 +191,7 @@ class _Writer:
         }
         plain = {name: _plain(found) for name, found in stats.items()}
         write_json(self._path / "meta/stats.json", plain)
-        self._write_own()
+        write_own(self._path, self._dataset, self._observations)
 
     def _values(
         self, index: int, steps: slice, frames: slice, task_index: int
@@ -211,6 +214,8 @@ class _Writer:
         rows = slice(frames.start, frames.stop - 1)
         for leaf, feature in zip(self._leaves, self._observations, strict=True):
             given[feature.name] = np.asarray(leaf.of(self._dataset.frames)[rows])
+        for name, feature in self._infos.items():
+            given[feature.name] = infos_of(self._dataset)[name][frames.start + 1 : frames.stop].data
         for feature in self._features:
             values = given[feature.name]
             if feature.dtype == "video":
@@ -255,33 +260,9 @@ class _Writer:
             columns[f"meta/episodes/{name}"] = arrow.array([0] * len(self._rows))
         write_table(columns, self._path / EPISODES_PATH.format(chunk_index=0, file_index=0))
 
-    def _write_own(self) -> None:
-        """Write the final observations, times and summaries."""
-        arrow = import_extra("pyarrow", "tables")
-        folder = self._path / OWN
-        folder.mkdir()
-        names = [feature.name for feature in self._observations]
-        write_json(
-            folder / "description.json", {"metadata": self._dataset.metadata, "features": names}
-        )
-        episodes = self._dataset.episodes
-        rows = [episode.summary._asdict() for episode in episodes]
-        columns = {name: arrow.array([row[name] for row in rows]) for name in rows[0]}
-        times = [episode.log_time_ns.tolist() for episode in episodes]
-        columns["log_time_ns"] = arrow.array(times, arrow.list_(arrow.int64()))
-        write_table(columns, folder / "episodes.parquet")
-        lasts = np.array([frames.stop - 1 for _, frames in self._slices])
-        finals = {}
-        for leaf, feature in zip(self._leaves, self._observations, strict=True):
-            # The final observations of videos are stored without loss.
-            kept = features.feature_of(feature.name, leaf)
-            values = np.asarray(leaf.of(self._dataset.frames)[lasts])
-            finals[kept.name] = kept.encode(values.reshape(len(lasts), *kept.shape))
-        write_table(finals, folder / "final_observations.parquet")
-
 
 def _step_features(dataset: Dataset) -> list[Feature]:
-    """Return the features besides the observations."""
+    """Return the features of actions, rewards, ends and probabilities."""
     leaf = action_leaf(dataset.action_space)
     rewards = dataset.rewards
     with np.errstate(over="ignore"):
@@ -294,7 +275,7 @@ def _step_features(dataset: Dataset) -> list[Feature]:
     ]
     if not np.isnan(dataset.behavior_probs).all():
         found.append(Feature(features.PROBABILITY, "float32", (1,)))
-    return [*found, *features.default_features()]
+    return found
 
 
 def _plain(stats: Stats) -> dict[str, Any]:

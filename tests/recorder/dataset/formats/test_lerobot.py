@@ -25,6 +25,7 @@ from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.lerobot import tables, writer
 from mcaprl.recorder.dataset.formats.lerobot.features import Feature
+from mcaprl.recorder.dataset.formats.lerobot.infos import info_features, read_infos, write_infos
 from mcaprl.recorder.dataset.formats.lerobot.statistics import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
@@ -133,6 +134,37 @@ def test_all_spaces_and_values_come_back(arguments: dict[str, Any]) -> None:
     with TemporaryDirectory() as folder:
         dataset.to_lerobot(Path(folder) / "out")
         _same_values(dataset, Dataset.from_lerobot(Path(folder) / "out"))
+
+
+def _infos() -> dict[str, Any]:
+    """Return infos of an episode of three steps: some are missing, one comes from reset alone."""
+    everywhere = np.ma.MaskedArray([0, 1, 2, 3], [True, False, False, False])
+    at_end = np.ma.MaskedArray([0, 0, 0, 1.5], [True, True, True, False])
+    texts = np.ma.MaskedArray(["", "a", "", "longer"], [True, False, False, False])
+    at_reset = np.ma.MaskedArray(np.arange(24, dtype=np.int16).reshape(4, 2, 3), True)
+    at_reset[0] = np.arange(6).reshape(2, 3)
+    flags = np.ma.MaskedArray([[True, False]] * 4, False)
+    return {
+        "lap": everywhere,
+        "episode.r": at_end,
+        "says": texts,
+        "map": at_reset,
+        "an image/x": flags,
+    }
+
+
+def test_infos_come_back_and_those_of_every_step_are_features(tmp_path: Path) -> None:
+    found = read_infos(tmp_path, write_infos(tmp_path, _infos()))
+    assert list(found) == list(_infos())
+    for name, values in _infos().items():
+        assert found[name].dtype == values.dtype
+        np.testing.assert_array_equal(np.ma.getmaskarray(found[name]), np.ma.getmaskarray(values))
+        assert found[name].tolist() == values.tolist()
+    shown = info_features(_infos(), np.array([1, 2, 3]))
+    assert {name: (f.name, f.dtype, f.shape) for name, f in shown.items()} == {
+        "lap": ("complementary_info.lap", "int64", (1,)),
+        "an image/x": ("complementary_info.an_img_x", "bool", (2,)),
+    }
 
 
 def test_the_files_have_lerobots_names_types_and_numbers(tmp_path: Path) -> None:
