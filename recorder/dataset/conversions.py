@@ -85,12 +85,19 @@ class Conversions:
         return _read("minari", path)
 
     def to_parquet(
-        self, path: str | Path, *, lossy: bool = False, overwrite: bool = False
+        self,
+        path: str | Path,
+        *,
+        next_observations: bool = True,
+        lossy: bool = False,
+        overwrite: bool = False,
     ) -> list[str]:
         """Write Parquet files, one of transitions and one of episodes.
 
         Args:
             path: Path of the folder.
+            next_observations: Whether each row has its next observation, too. Other tools may need
+                it; `from_parquet` does not. It doubles the size of images.
             lossy: Whether what the format cannot hold is left out or converted.
             overwrite: Whether what exists at the path is replaced.
 
@@ -98,12 +105,12 @@ class Conversions:
             One sentence for each thing that was left out or changed.
 
         Raises:
-            SpaceError: The format cannot hold a space or dtype, and `lossy` is not set.
             OutputExistsError: Something exists at the path, and `overwrite` is not set.
             LogError: The files cannot be written, or the dataset has no episodes.
             MissingExtraError: A package of the format is not installed.
         """
-        return self._written("parquet", path, lossy=lossy, overwrite=overwrite)
+        options = {"next_observations": next_observations}
+        return self._written("parquet", path, lossy=lossy, overwrite=overwrite, **options)
 
     @staticmethod
     def from_parquet(path: str | Path) -> Dataset:
@@ -202,32 +209,59 @@ class Conversions:
 
         return from_buffer(buffer)
 
-    def to_sb3(self, *, device: str = "cpu", **options: Any) -> Any:
+    def to_sb3(self, *, device: str = "cpu", buffer_class: Any = None, **options: Any) -> Any:
         """Return a Stable-Baselines3 `ReplayBuffer` or `DictReplayBuffer` with all transitions.
+
+        As SB3's algorithms do, it puts the channels of images first and scales the actions of a
+        bounded Box to [-1, 1].
 
         Args:
             device: Torch device of the samples.
-            options: Further arguments of the buffer.
+            buffer_class: Class of the buffer, such as `NStepReplayBuffer`; default: by the space.
+            options: Further arguments of the buffer. The default of `buffer_size` is the number of
+                rows that the dataset needs.
 
         Raises:
-            SpaceError: The buffer cannot hold a space.
+            SpaceError: SB3 does not support a space.
+            UsageError: `buffer_size` is too small, or `n_envs` is not 1.
             MissingExtraError: Stable-Baselines3 is not installed.
         """
         from mcaprl.recorder.dataset.formats.sb3 import to_buffer
 
-        return to_buffer(cast("Dataset", self), device=device, **options)
+        dataset = cast("Dataset", self)
+        return to_buffer(dataset, device=device, buffer_class=buffer_class, **options)
 
     @staticmethod
-    def from_sb3(buffer: Any) -> Dataset:
-        """Copy the transitions of a Stable-Baselines3 replay buffer, column by column in order.
+    def from_sb3(
+        buffer: Any,
+        *,
+        channels_last: bool = True,
+        scaled_actions: bool = True,
+        lossy: bool = False,
+    ) -> Dataset:
+        """Copy the transitions of a Stable-Baselines3 replay buffer.
+
+        The environments follow each other; the transitions of each are in order from old to new.
+
+        Args:
+            buffer: `ReplayBuffer` or `DictReplayBuffer`.
+            channels_last: Whether images are returned as (height, width, channels), as environments
+                have them, and not as SB3 transposes them.
+            scaled_actions: Whether the buffer has the actions of a bounded Box scaled to [-1, 1],
+                as SB3's algorithms store them. They are scaled back, which rounds them.
+            lossy: Whether a buffer with `handle_timeout_termination=False` is read, with all its
+                truncations as terminations. If it also has `optimize_memory_usage`, its final
+                observations are lost: each becomes a copy of the observation before it.
 
         Raises:
             SpaceError: A log cannot hold a space or dtype of the data.
-            LogError: The buffer is empty.
+            LogError: The buffer is empty, or has lost information and `lossy` is not set.
         """
         from mcaprl.recorder.dataset.formats.sb3 import from_buffer
 
-        return from_buffer(buffer)
+        return from_buffer(
+            buffer, channels_last=channels_last, scaled_actions=scaled_actions, lossy=lossy
+        )
 
     def _written(
         self, name: str, path: str | Path, *, lossy: bool, overwrite: bool, **options: Any

@@ -315,20 +315,35 @@ class Dataset(Conversions):
             path, self._transitions, self._description, compression=compression, overwrite=overwrite
         )
 
-    def to_arrow(self, table: Literal["transitions", "episodes"] = "transitions") -> pyarrow.Table:
+    def to_arrow(
+        self,
+        table: Literal["transitions", "episodes"] = "transitions",
+        *,
+        tensors: Literal["columns", "lists"] = "columns",
+    ) -> pyarrow.Table:
         """Return a PyArrow table with one row per transition or per episode. Extra: `tables`.
+
+        Args:
+            table: `transitions` or `episodes`.
+            tensors: Form of vectors and images in the table of transitions: `columns` for one
+                column per element up to 64 elements, otherwise flat lists; `lists` for one column
+                of fixed-size lists each, which shares its memory with the dataset where possible.
 
         Raises:
             MissingExtraError: PyArrow is not installed.
-            UnknownNameError: `table` is neither `transitions` nor `episodes`.
+            UnknownNameError: There is no such table, or no such form of tensors.
         """
         from mcaprl.recorder.dataset.tables import episode_table, transition_table
 
-        if table not in ("transitions", "episodes"):
-            raise UnknownNameError("table", table, ["transitions", "episodes"])
+        for what, name, names in (
+            ("table", table, ["transitions", "episodes"]),
+            ("form of tensors", tensors, ["columns", "lists"]),
+        ):
+            if name not in names:
+                raise UnknownNameError(what, name, names)
         if table == "episodes":
             return episode_table(self._transitions)
-        return transition_table(self._transitions, self._leaves, self._description)
+        return transition_table(self._transitions, self._leaves, self._description, tensors=tensors)
 
     def to_pandas(
         self, table: Literal["transitions", "episodes"] = "transitions"

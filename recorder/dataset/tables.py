@@ -1,75 +1,176 @@
 """Conversion of datasets to PyArrow tables. Requires the extra `tables`.
 
-A vector becomes one column per element, `observation.<name>` or `observation.<index>`. An array of
-more than MAX_COLUMNS elements, such as an image, becomes one column of flat lists.
+A tensor is an array of more than one dimension: a row of it is not a single number. With
+`tensors="columns"`, a tensor becomes one column per element, `observation.<name>` or
+`observation.<index>`; a row of more than MAX_COLUMNS elements, such as an image, becomes a flat
+list. With `tensors="lists"`, each tensor becomes one column of flat fixed-size lists in C order,
+and the metadata of the column's field has its shape, as a JSON list in `shape`. The metadata of the
+table's schema has the spaces: see `described`.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import import_extra
 from mcaprl.recorder.dataset.transitions import Transitions
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf
 
+Tensors = Literal["columns", "lists"]
 MAX_COLUMNS = 64
+# A chunk per episode costs more than a copy if the chunks are small.
+_MIN_SHARED_BYTES = 1 << 14
 
 
-def transition_table(columns: Transitions, leaves: Sequence[Leaf], description: LogMetadata) -> Any:
-    """Return a table with one row per transition, which contains both of its observations."""
-    pyarrow = import_extra("pyarrow", "tables")
-    step_frames = columns.frame_of_step()
-    lengths = columns.lengths
-    names = ["episode", "step", "log_time_ns", "reward", "terminated", "truncated", "behavior_prob"]
-    arrays = [
-        np.repeat(np.arange(len(lengths)), lengths),
-        np.arange(len(columns.rewards)) - np.repeat(columns.first_steps, lengths),
-        columns.log_time_ns[step_frames],
-        columns.rewards,
-        columns.terminated,
-        columns.truncated,
-        columns.behavior_probs,
-    ]
-    converted = [pyarrow.array(array) for array in arrays]
-    parts: list[tuple[str, NDArray[Any], tuple[str, ...]]] = [("action", columns.actions, ())]
-    for leaf, frames in zip(leaves, columns.frames, strict=True):
-        named = description.observation_names if leaf.path == () else ()
-        name = leaf.name if leaf.name.startswith("observation") else f"observation_{leaf.name}"
-        parts.append((name, frames[step_frames], named))
-        parts.append((f"next_{name}", frames[step_frames + 1], named))
-    for name, values, element_names in parts:
-        for column_name, column in _columns(pyarrow, name, values, element_names):
-            names.append(column_name)
-            converted.append(column)
-    return pyarrow.Table.from_arrays(converted, names=names)
+def transition_table(
+    columns: Transitions,
+    leaves: Sequence[Leaf],
+    description: LogMetadata,
+    *,
+    tensors: Tensors = "columns",
+) -> Any:
+    """Return a table with one row per transition, which contains both of its observations.
+
+    With `tensors="lists"`, columns share their memory with the dataset where Arrow stores the
+    values in the same way: actions, rewards and probabilities always, observations if they take
+    16 KiB or more per episode on average. Their columns then have one chunk per episode. Flags,
+    images on disk and times are copied.
+    """
+    arrow = import_extra("pyarrow", "tables")
+    found = [(name, arrow.array(array)) for name, array in _step_columns(columns).items()]
+    if tensors == "lists":
+        found += _tensor_lists(arrow, columns, leaves)
+    else:
+        found += _tensor_columns(arrow, columns, leaves, description)
+    shapes = _shapes(columns, leaves) if tensors == "lists" else {}
+    fields = [field_of(arrow, name, array, shapes.get(name, ())) for name, array in found]
+    schema = arrow.schema(fields, metadata=described(description))
+    return arrow.Table.from_arrays([array for _, array in found], schema=schema)
 
 
 def episode_table(columns: Transitions) -> Any:
     """Return a table with one episode summary per row, numbered in the dataset's order."""
-    pyarrow = import_extra("pyarrow", "tables")
+    arrow = import_extra("pyarrow", "tables")
+    types = {
+        "episode": arrow.int64(),
+        "length": arrow.int64(),
+        "total_reward": arrow.float64(),
+        "terminated": arrow.bool_(),
+        "truncated": arrow.bool_(),
+        "start_time_ns": arrow.int64(),
+        "end_time_ns": arrow.int64(),
+        "reason": arrow.string(),
+        "policy": arrow.string(),
+        "epsilon": arrow.float64(),
+        "seed": arrow.int64(),
+        "options": arrow.string(),
+    }
     rows = [episode._asdict() | {"episode": k} for k, episode in enumerate(columns.episodes)]
-    return pyarrow.Table.from_pylist(rows)
+    return arrow.Table.from_pylist(rows, schema=arrow.schema(list(types.items())))
+
+
+def described(description: LogMetadata) -> dict[str, str]:
+    """Return a schema's metadata: the log's metadata as a JSON object under `METADATA_NAME`."""
+    return {METADATA_NAME: json.dumps(description.to_strings())}
+
+
+def observation_names(leaves: Sequence[Leaf]) -> list[str]:
+    """Return the name of the column of each leaf of the observation."""
+    names: list[str] = []
+    for leaf in leaves:
+        name = leaf.name if leaf.name.startswith("observation") else f"observation_{leaf.name}"
+        number, base = 2, name
+        while name in names:
+            name, number = f"{base}_{number}", number + 1
+        names.append(name)
+    return names
+
+
+def field_of(arrow: Any, name: str, array: Any, shape: Sequence[int]) -> Any:
+    """Return the field of a column without nulls; its metadata has the shape of a row, if any."""
+    metadata = {"shape": json.dumps(list(shape))} if shape else None
+    return arrow.field(name, array.type, nullable=False, metadata=metadata)
+
+
+def fixed_lists(arrow: Any, values: NDArray[Any]) -> Any:
+    """Return an Arrow array of rows (N, *shape): numbers, or flat lists. Copied only if needed."""
+    flat = arrow.array(np.ascontiguousarray(values).reshape(-1))
+    if values.ndim == 1:
+        return flat
+    # Parquet files of lists whose elements may be null are larger and slower.
+    element = arrow.field("element", flat.type, nullable=False)
+    kind = arrow.list_(element, math.prod(values.shape[1:]))
+    return arrow.FixedSizeListArray.from_arrays(flat, type=kind)
+
+
+def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int, ...]]:
+    """Return the shape of a row of each column of actions and observations, by name."""
+    shapes = {"action": columns.actions.shape[1:]}
+    for name, leaf in zip(observation_names(leaves), leaves, strict=True):
+        shapes |= {name: leaf.shape, f"next_{name}": leaf.shape}
+    return shapes
+
+
+def _step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
+    lengths = columns.lengths
+    return {
+        "episode": np.repeat(np.arange(len(lengths)), lengths),
+        "step": np.arange(len(columns.rewards)) - np.repeat(columns.first_steps, lengths),
+        "log_time_ns": columns.log_time_ns[columns.frame_of_step()],
+        "reward": columns.rewards,
+        "terminated": columns.terminated,
+        "truncated": columns.truncated,
+        "behavior_prob": columns.behavior_probs,
+    }
+
+
+def _tensor_lists(
+    arrow: Any, columns: Transitions, leaves: Sequence[Leaf]
+) -> Iterator[tuple[str, Any]]:
+    yield "action", fixed_lists(arrow, columns.actions)
+    step_frames = columns.frame_of_step()
+    starts, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
+    for name, frames in zip(observation_names(leaves), columns.frames, strict=True):
+        values = np.asarray(frames)
+        shared = values.nbytes >= _MIN_SHARED_BYTES * max(len(lengths), 1)
+        whole = fixed_lists(arrow, values) if shared else None
+        for column, offset in ((name, 0), (f"next_{name}", 1)):
+            if whole is None:
+                yield column, fixed_lists(arrow, values[step_frames + offset])
+                continue
+            chunks = [
+                whole.slice(start + offset, length)
+                for start, length in zip(starts, lengths, strict=True)
+            ]
+            yield column, arrow.chunked_array(chunks, whole.type)
+
+
+def _tensor_columns(
+    arrow: Any, columns: Transitions, leaves: Sequence[Leaf], description: LogMetadata
+) -> Iterator[tuple[str, Any]]:
+    yield from _columns(arrow, "action", columns.actions, ())
+    step_frames = columns.frame_of_step()
+    for name, leaf, frames in zip(observation_names(leaves), leaves, columns.frames, strict=True):
+        named = description.observation_names if leaf.path == () else ()
+        for column, offset in ((name, 0), (f"next_{name}", 1)):
+            yield from _columns(arrow, column, frames[step_frames + offset], named)
 
 
 def _columns(
-    pyarrow: Any, name: str, values: NDArray[Any], element_names: Sequence[str]
+    arrow: Any, name: str, values: NDArray[Any], element_names: Sequence[str]
 ) -> Iterator[tuple[str, Any]]:
-    if values.ndim == 1:
-        yield name, pyarrow.array(values)
+    count = math.prod(values.shape[1:])
+    if values.ndim == 1 or count > MAX_COLUMNS:
+        yield name, fixed_lists(arrow, values)
         return
-    flat = np.ascontiguousarray(values.reshape(len(values), math.prod(values.shape[1:])))
-    if flat.shape[1] > MAX_COLUMNS:
-        yield (
-            name,
-            pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(flat.ravel()), flat.shape[1]),
-        )
-        return
-    labels = element_names if len(element_names) == flat.shape[1] else range(flat.shape[1])
+    flat = values.reshape(len(values), count)
+    labels = element_names if len(element_names) == count else range(count)
     for index, label in enumerate(labels):
-        yield f"{name}.{label}", pyarrow.array(np.ascontiguousarray(flat[:, index]))
+        yield f"{name}.{label}", arrow.array(np.ascontiguousarray(flat[:, index]))

@@ -1,10 +1,267 @@
-"""Placeholder until the module is written."""
+"""Parquet files: a folder with a table of transitions and a table of episodes.
+
+`transitions.parquet` has a row for each transition: `episode`, `step`, `log_time_ns`, `reward`,
+`terminated`, `truncated`, `behavior_prob`, `action`, `observation` and `next_observation`. The
+parts of a Dict observation are `observation_<key>` and `next_observation_<key>`. A tensor is a
+fixed-size list in C order; the field's metadata has its shape. The metadata of the schema has the
+spaces, as `tables.described` writes them.
+
+`episodes.parquet` has a row for each episode: the fields of `EpisodeSummary`, `final_log_time_ns`
+and the last observation, `final_observation`. The columns `next_observation` are for other tools:
+they are not read.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, SpaceError, import_extra
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.arrays import exactly
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.tables import (
+    episode_table,
+    field_of,
+    fixed_lists,
+    observation_names,
+    transition_table,
+)
+from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
+
+TRANSITIONS, EPISODES = "transitions.parquet", "episodes.parquet"
+_BLOCK_BYTES = 64 << 20
+_FLAG, _TIME = np.dtype(np.bool_), np.dtype(np.int64)
 
 
 def matches(path: Path) -> bool:
-    """Return False."""
-    return False
+    """Return whether a folder has both tables."""
+    return (path / TRANSITIONS).is_file() and (path / EPISODES).is_file()
+
+
+def write(
+    dataset: Dataset, path: Path, *, lossy: bool = False, next_observations: bool = True
+) -> list[str]:
+    """Write a dataset to an empty folder.
+
+    Args:
+        dataset: Episodes to write.
+        path: Empty folder.
+        lossy: Ignored, because the files hold everything.
+        next_observations: Whether the rows have next observations, for other tools.
+
+    Returns:
+        An empty list.
+
+    Raises:
+        MissingExtraError: PyArrow is not installed.
+    """
+    arrow, parquet = _pyarrow()
+    leaves, columns = leaves_of(dataset.observation_space), dataset._transitions
+    metadata = LogMetadata.from_strings(dataset.metadata)
+    unwanted = [] if next_observations else [f"next_{name}" for name in observation_names(leaves)]
+    writer = None
+    try:
+        for first, block in _blocks(columns):
+            table = transition_table(block, leaves, metadata, tensors="lists")
+            numbers = arrow.array(np.asarray(table["episode"]) + first)
+            table = table.set_column(0, table.field(0), numbers).drop_columns(unwanted)
+            if writer is None:
+                target = path / TRANSITIONS
+                writer = parquet.ParquetWriter(target, table.schema, **_settings(arrow, table))
+            row_bytes = max(table.nbytes // len(table), 1)
+            writer.write_table(table, max(_BLOCK_BYTES // row_bytes, 1))
+    finally:
+        if writer is not None:
+            writer.close()
+    episodes = _episodes_with_ends(arrow, columns, leaves)
+    parquet.write_table(episodes, path / EPISODES, **_settings(arrow, episodes))
+    return []
+
+
+def read(path: Path) -> Dataset:
+    """Read a folder that `write` wrote. Whole episodes may have been removed from both tables.
+
+    Raises:
+        LogError: A file is damaged, lacks a column or the metadata, or the tables do not agree.
+        SpaceError: The values do not fit the spaces.
+        MissingExtraError: PyArrow is not installed.
+    """
+    steps, episodes = _Table(path / TRANSITIONS), _Table(path / EPISODES)
+    metadata = steps.metadata()
+    lengths = episodes.values("length", (), _TIME)
+    if not len(lengths) or (lengths < 1).any():
+        raise LogError(f"{path / EPISODES} has no episodes, or one without transitions")
+    numbers = steps.values("episode", (), _TIME), steps.values("step", (), _TIME)
+    first_steps = np.cumsum(lengths) - lengths
+    expected = (
+        np.repeat(episodes.values("episode", (), _TIME), lengths),
+        np.arange(lengths.sum()) - np.repeat(first_steps, lengths),
+    )
+    if not all(map(np.array_equal, numbers, expected)):
+        raise LogError(f"{path}: {TRANSITIONS} and {EPISODES} do not have the same steps in order")
+    leaves, action = leaves_of(metadata.observation_space), action_leaf(metadata.action_space)
+    columns = Transitions(
+        frames=tuple(
+            _with_finals(
+                steps.values(name, leaf.shape, leaf.dtype),
+                episodes.values(f"final_{name}", leaf.shape, leaf.dtype),
+                lengths,
+            )
+            for name, leaf in zip(observation_names(leaves), leaves, strict=True)
+        ),
+        log_time_ns=_with_finals(
+            steps.values("log_time_ns", (), _TIME),
+            episodes.values("final_log_time_ns", (), _TIME),
+            lengths,
+        ),
+        actions=steps.values("action", action.shape, action.dtype),
+        rewards=steps.values("reward", (), np.dtype(np.float64)),
+        terminated=steps.values("terminated", (), _FLAG),
+        truncated=steps.values("truncated", (), _FLAG),
+        behavior_probs=steps.values("behavior_prob", (), np.dtype(np.float32)),
+        episodes=episodes.summaries(),
+    )
+    return Dataset(columns, metadata)
+
+
+class _Table:
+    """A table that was read from a file, without the columns that are not needed.
+
+    Raises:
+        LogError: The file is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        arrow, parquet = _pyarrow()
+        self._path = path
+        try:
+            names = [n for n in parquet.read_schema(path).names if not n.startswith("next_")]
+            # A folder named `key=value` above the file is not a partition.
+            self._table = parquet.read_table(
+                path, columns=names, partitioning=None, page_checksum_verification=True
+            )
+        # Names that are not UTF-8 raise a ValueError, as many of PyArrow's errors are.
+        except (OSError, ValueError, arrow.ArrowException) as error:
+            raise LogError(f"{path} cannot be read: {error}") from error
+
+    def metadata(self) -> LogMetadata:
+        """Return the log's metadata.
+
+        Raises:
+            LogError: The file has none, or it cannot be parsed.
+        """
+        found = (self._table.schema.metadata or {}).get(METADATA_NAME.encode())
+        if found is None:
+            raise LogError(
+                f"{self._path} has no metadata '{METADATA_NAME}', so its spaces are unknown; build"
+                " the dataset with Dataset.from_arrays"
+            )
+        try:
+            return LogMetadata.from_strings(parse_json(found))
+        except (AttributeError, ValueError) as error:
+            raise LogError(f"{self._path}: metadata '{METADATA_NAME}': {error}") from error
+
+    def values(self, name: str, shape: Sequence[int], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """Return a column (N, *shape) in this dtype.
+
+        Raises:
+            LogError: There is no such column, or it has nulls.
+            SpaceError: The column has another shape, or values that the dtype cannot hold.
+        """
+        if name not in self._table.column_names:
+            raise LogError(f"{self._path} has no column '{name}'")
+        arrow, _ = _pyarrow()
+        where, column = f"{self._path}: {name}", self._table[name]
+        parts = [np.empty((0, *shape), dtype)]
+        for chunk in column.chunks:
+            flat = chunk.flatten() if _is_list(arrow, chunk.type) else chunk
+            if not _is_number(arrow, flat.type):
+                raise SpaceError(f"{where} is {column.type}, expected numbers")
+            if chunk.null_count or flat.null_count:
+                raise LogError(f"{where} has nulls")
+            if len(flat) != len(chunk) * int(np.prod(shape)):
+                raise SpaceError(f"{where} is {column.type}, expected rows of shape {shape}")
+            found = flat.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+            parts.append(found if found.dtype == dtype else exactly(where, found, dtype))
+        return np.concatenate(parts)
+
+    def summaries(self) -> tuple[EpisodeSummary, ...]:
+        """Return the rows of the table of episodes.
+
+        Raises:
+            LogError: A column is missing.
+        """
+        missing = [n for n in EpisodeSummary._fields if n not in self._table.column_names]
+        if missing:
+            raise LogError(f"{self._path} has no column '{missing[0]}'")
+        rows = self._table.select(list(EpisodeSummary._fields)).to_pylist()
+        return tuple(EpisodeSummary(**row | {"episode": k}) for k, row in enumerate(rows))
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    return import_extra("pyarrow", "tables"), import_extra("pyarrow.parquet", "tables")
+
+
+def _is_list(arrow: Any, kind: Any) -> bool:
+    types = arrow.types
+    return bool(types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind))
+
+
+def _is_number(arrow: Any, kind: Any) -> bool:
+    types = arrow.types
+    return bool(types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind))
+
+
+def _blocks(columns: Transitions) -> Iterator[tuple[int, Transitions]]:
+    """Yield groups of episodes of about `_BLOCK_BYTES`, and the index of the first episode."""
+    frame_bytes = sum(part.nbytes // len(part) for part in (*columns.frames, columns.actions))
+    sizes = np.cumsum(columns.lengths * max(frame_bytes, 1)) // _BLOCK_BYTES
+    firsts = np.flatnonzero(np.diff(sizes, prepend=-1)).tolist()
+    for first, stop in zip(firsts, [*firsts[1:], len(sizes)], strict=True):
+        yield first, columns.take(range(first, stop))
+
+
+def _settings(arrow: Any, table: Any) -> dict[str, Any]:
+    """Return the settings of the writer.
+
+    A dictionary keeps one NaN for all, and makes columns of many distinct values slower. It makes
+    columns of bytes smaller, because Parquet stores each in four bytes.
+    """
+    small = []
+    for field in table.schema:
+        nested = _is_list(arrow, field.type)
+        kind = field.type.value_type if nested else field.type
+        if kind in (arrow.int8(), arrow.uint8(), arrow.string()) or field.name == "episode":
+            small.append(f"{field.name}.list.element" if nested else field.name)
+    return {"compression": "zstd", "use_dictionary": small, "write_page_checksum": True}
+
+
+def _episodes_with_ends(arrow: Any, columns: Transitions, leaves: Sequence[Leaf]) -> Any:
+    table = episode_table(columns)
+    finals = columns.first_frames + columns.lengths
+    parts = zip(observation_names(leaves), columns.frames, strict=True)
+    for name, frames in [("log_time_ns", columns.log_time_ns), *parts]:
+        array = fixed_lists(arrow, np.asarray(frames[finals]))
+        field = field_of(arrow, f"final_{name}", array, frames.shape[1:])
+        table = table.append_column(field, array)
+    return table
+
+
+def _with_finals(
+    steps: NDArray[Any], finals: NDArray[Any], lengths: NDArray[np.int64]
+) -> NDArray[Any]:
+    """Return frames: the rows of each episode's steps, and after them its final row."""
+    ends = np.cumsum(lengths) + np.arange(len(lengths))
+    frames = np.empty((len(steps) + len(finals), *steps.shape[1:]), steps.dtype)
+    is_step = np.ones(len(frames), bool)
+    is_step[ends] = False
+    frames[is_step], frames[ends] = steps, finals
+    return frames
