@@ -158,7 +158,10 @@ def write_format(
     """
     if not len(dataset.episode_lengths):
         raise LogError(f"nothing to write to {path}: the dataset has no episodes")
+    place = target_path(path, form)
+    if hasattr(form.module, "options_for"):
+        options = {**form.module.options_for(place), **options}
     target = replacing if form.suffix else replacing_folder
-    with target(target_path(path, form), LogError, overwrite=overwrite) as unfinished:
+    with target(place, LogError, overwrite=overwrite) as unfinished:
         lost: list[str] = form.module.write(dataset, unfinished, lossy=lossy, **options)
     return lost

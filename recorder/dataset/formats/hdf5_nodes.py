@@ -1,0 +1,189 @@
+"""Names and arrays in HDF5 files.
+
+The files may be of others: sizes are checked, and links to other files are not followed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+EXTRA = "interop"
+# The filters of HDF5 compress at most to 1/1032. A larger dataset was declared, but never written.
+_MAX_RATIO = 2_000
+_SMALL_BYTES = 1 << 20
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a path is a file that begins as HDF5."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(SIGNATURE)) == SIGNATURE
+    except OSError:
+        return False
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Open a file for reading.
+
+    Raises:
+        LogError: The file is missing, or damaged where it is read.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_extra("h5py", EXTRA)
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    # h5py raises RuntimeError for some damaged structures.
+    except (OSError, RuntimeError) as error:
+        raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
+
+
+def has(group: Any, name: str) -> bool:
+    """Return whether a group has a member with this name."""
+    return group.get(name, getlink=True) is not None
+
+
+def group_in(parent: Any, name: str) -> Any:
+    """Return a group.
+
+    Raises:
+        LogError: There is no such group.
+    """
+    found = _member(parent, name)
+    if not hasattr(found, "keys"):
+        raise LogError(f"{_place(parent, name)} is not a group")
+    return found
+
+
+def array_in(parent: Any, name: str) -> NDArray[Any]:
+    """Read an array; text becomes strings.
+
+    Raises:
+        LogError: There is no such array, or it is not stored in this file.
+    """
+    h5py = import_extra("h5py", EXTRA)
+    found, place = _member(parent, name), _place(parent, name)
+    if not isinstance(found, h5py.Dataset) or found.shape is None:
+        raise LogError(f"{place} is not an array")
+    if found.is_virtual or found.external:
+        raise LogError(f"{place} is stored in another file: copy it into one file")
+    stored = found.id.get_storage_size()
+    if found.size * found.dtype.itemsize > _MAX_RATIO * stored + _SMALL_BYTES:
+        raise LogError(f"{place} has shape {found.shape}, but only {stored} bytes are stored")
+    if h5py.check_string_dtype(found.dtype) is None:
+        return np.asarray(found[()])
+    try:
+        return np.asarray(found.asstr()[()]).astype(np.str_)
+    except UnicodeDecodeError as error:
+        raise LogError(f"{place} is not UTF-8 text") from error
+
+
+def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
+    """Read the array at a path of names; a number is the index in a Tuple of Minari.
+
+    Raises:
+        LogError: There is no such array, or it is not stored in this file.
+    """
+    *groups, last = (f"_index_{key}" if isinstance(key, int) else key for key in path)
+    for name in groups:
+        parent = group_in(parent, name)
+    return array_in(parent, last)
+
+
+def tree_in(parent: Any, name: str) -> Any:
+    """Read an array, or the arrays of a group as nested dicts.
+
+    Raises:
+        LogError: There is no such member, or it is not stored in this file.
+    """
+    if not is_group(parent, name):
+        return array_in(parent, name)
+    group = group_in(parent, name)
+    return {key: tree_in(group, key) for key in group}
+
+
+def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield all arrays of a group and its groups by their dotted names."""
+    for name in group:
+        if is_group(group, name):
+            yield from arrays_below(group_in(group, name), (*path, name))
+        else:
+            yield ".".join((*path, name)), array_in(group, name)
+
+
+def attributes_of(group: Any) -> dict[str, Any]:
+    """Return the attributes as JSON types; `a/b` is `b` in the dict `a`.
+
+    Raises:
+        LogError: The attributes are damaged.
+    """
+    found: dict[str, Any] = {}
+    for path, value in group.attrs.items():
+        *groups, name = path.split("/")
+        inner = found
+        for key in groups:
+            inner = inner.setdefault(key, {})
+        inner[name] = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
+    return found
+
+
+def with_names_for_hdf5(space: spaces.Space[Any]) -> tuple[spaces.Space[Any], list[str]]:
+    """Rename the keys of a Dict space that cannot be names in an HDF5 file.
+
+    Returns:
+        The space with its leaves in the same order, and the keys that were renamed.
+    """
+    if not isinstance(space, spaces.Dict):
+        return space, []
+    parts: dict[str, spaces.Space[Any]] = {}
+    renamed = []
+    for key, part in space.spaces.items():
+        name = _storable_name(key)
+        if name != key:
+            renamed.append(key)
+            while name in parts or name in space.spaces:
+                name += "_"
+        parts[name], inner = with_names_for_hdf5(part)
+        renamed += inner
+    return spaces.Dict(list(parts.items())), renamed
+
+
+def is_group(parent: Any, name: str) -> bool:
+    """Return whether a member is a group.
+
+    Raises:
+        LogError: There is no such member.
+    """
+    return hasattr(_member(parent, name), "keys")
+
+
+def _member(parent: Any, name: str) -> Any:
+    h5py = import_extra("h5py", EXTRA)
+    link = parent.get(name, getlink=True)
+    if isinstance(link, h5py.ExternalLink):
+        raise LogError(f"{_place(parent, name)} is stored in another file: copy it into one file")
+    found = None if link is None else parent.get(name)
+    if found is None:
+        raise LogError(f"{_place(parent, name)} is missing")
+    return found
+
+
+def _place(parent: Any, name: str) -> str:
+    return f"{parent.file.filename}: {parent.name.rstrip('/')}/{name}"
+
+
+def _storable_name(key: str) -> str:
+    name = re.sub(r"[/\0\ud800-\udfff]", "_", key)
+    return name if name.strip(".") else f"_{name}"

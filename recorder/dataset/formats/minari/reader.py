@@ -1,0 +1,238 @@
+"""Reading of Minari datasets in all their forms, without Minari.
+
+Minari cuts episodes of more than 32,767 steps when it reads its Arrow form; here they are whole.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import warnings
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, import_extra
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats import hdf5_nodes as hdf5
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.minari import arrow_nodes as arrow
+from mcaprl.recorder.dataset.formats.minari.description import (
+    MAIN,
+    OWN,
+    Description,
+    data_folder,
+    read_description,
+)
+from mcaprl.recorder.dataset.formats.minari.spaces import may_be_jpeg
+from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
+
+_FLAGS = ("terminations", "truncations")
+_OWN_TEXTS = ("reason", "policy", "options")
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What is stored of one episode.
+
+    Attributes:
+        observations: Array of T + 1 rows, or JPEG files, of each leaf of the observation.
+        steps: Arrays of T rows: `actions`, `rewards`, `terminations` and `truncations`.
+        infos: Arrays by dotted name.
+        attributes: `seed`, `options` and others.
+        own: Arrays that only our writer stores: `behavior_probs` and `log_time_ns`.
+    """
+
+    observations: Sequence[Any]
+    steps: Mapping[str, NDArray[Any]]
+    infos: Mapping[str, NDArray[Any]]
+    attributes: Mapping[str, Any]
+    own: Mapping[str, Any] = field(default_factory=dict)
+
+
+def read(path: Path) -> Dataset:
+    """Read a dataset.
+
+    Args:
+        path: Folder of the dataset, or its folder `data`.
+
+    Raises:
+        LogError: A file is missing or damaged.
+        SpaceError: A log cannot store a space.
+        MissingExtraError: h5py, PyArrow or Pillow is not installed.
+    """
+    description = read_description(path)
+    forms = {"hdf5": _in_hdf5, "arrow": _in_arrow, "parquet": _in_arrow}
+    if description.form not in forms:
+        raise LogError(f"{path}: unknown data format '{description.form}' of Minari")
+    reader = _Reader(path, description)
+    # The file is closed if an episode is refused, too.
+    with closing(forms[description.form](data_folder(path), description)) as stored:
+        episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
+    reader.warn()
+    return dataset_of(episodes, description.metadata, path)
+
+
+class _Reader:
+    """Conversion of stored episodes to arrays."""
+
+    def __init__(self, path: Path, description: Description) -> None:
+        self._path = path
+        self._space = description.metadata.observation_space
+        self._leaves = leaves_of(self._space)
+        self._action = action_leaf(description.metadata.action_space)
+        self._is_jpeg = [
+            description.is_jpeg and may_be_jpeg(self._space, leaf) for leaf in self._leaves
+        ]
+        self._tuples = any(isinstance(key, int) for keys in description.keys for key in keys)
+        self._odd_infos: set[str] = set()
+
+    def episode(self, index: int, stored: _Stored) -> EpisodeArrays:
+        where = f"{self._path}: episode {index}"
+        steps = {name: _column(values) for name, values in stored.steps.items()}
+        count = len(steps["rewards"])
+        ends = []
+        for name in _FLAGS:
+            if len(steps[name]) != count:
+                raise LogError(f"{where} has {len(steps[name])} {name}, but {count} rewards")
+            flags = steps[name].astype(bool)
+            if flags[:-1].any():
+                raise LogError(f"{where} goes on after step {int(flags.argmax())} with {name}")
+            ends.append(bool(flags.any()))
+        observations = [
+            self._images(leaf, values, where) if is_jpeg else values
+            for leaf, values, is_jpeg in zip(
+                self._leaves, stored.observations, self._is_jpeg, strict=True
+            )
+        ]
+        return EpisodeArrays(
+            observations=nest(self._leaves, observations),
+            actions=stored.steps["actions"].reshape(-1, *self._action.shape),
+            rewards=steps["rewards"],
+            terminated=ends[0],
+            truncated=ends[1],
+            behavior_probs=stored.own.get("behavior_probs"),
+            times_ns=stored.own.get("log_time_ns"),
+            infos=self._infos(stored.infos, count),
+            summary=_summary(stored.attributes, where),
+        )
+
+    def warn(self) -> None:
+        """Warn of what was changed or left out."""
+        images = [leaf.name for leaf, jpeg in zip(self._leaves, self._is_jpeg, strict=True) if jpeg]
+        if images:
+            warnings.warn(
+                f"{self._path}: {', '.join(images)} is stored as JPEG, which changed its pixels"
+                " when the dataset was written",
+                stacklevel=4,
+            )
+        if self._tuples:
+            warnings.warn(
+                f"{self._path}: Tuple observations are read as Dict observations with the keys"
+                " '0', '1', ...",
+                stacklevel=4,
+            )
+        if self._odd_infos:
+            warnings.warn(
+                f"{self._path}: infos without a row for each step are left out:"
+                f" {', '.join(sorted(self._odd_infos))}",
+                stacklevel=4,
+            )
+
+    def _infos(self, infos: Mapping[str, NDArray[Any]], count: int) -> dict[str, Any]:
+        """Return the infos with T + 1 rows; those with T rows have none of the reset."""
+        found: dict[str, Any] = {}
+        for name, values in infos.items():
+            if values.ndim == 0 or values.dtype == object or len(values) not in (count, count + 1):
+                self._odd_infos.add(name)
+                continue
+            missing = count + 1 - len(values)
+            rows = np.concatenate([np.zeros((missing, *values.shape[1:]), values.dtype), values])
+            mask = np.zeros(rows.shape, bool)
+            mask[:missing] = True
+            found[name] = np.ma.MaskedArray(rows, mask)
+        return found
+
+    def _images(self, leaf: Leaf, values: Any, where: str) -> NDArray[np.uint8]:
+        if getattr(values, "dtype", None) == np.uint8 and values.shape[1:] == leaf.shape:
+            return np.asarray(values)
+        image_module = import_extra("PIL.Image", hdf5.EXTRA)
+        images = np.empty((len(values), *leaf.shape), np.uint8)
+        for row, data in enumerate(values):
+            try:
+                # The size is known before the pixels are decoded.
+                with image_module.open(io.BytesIO(bytes(data)), formats=["JPEG"]) as image:
+                    if image.size != (leaf.shape[1], leaf.shape[0]):
+                        raise OSError(f"{image.size[0]} x {image.size[1]} pixels")
+                    images[row] = np.asarray(image)
+            except (OSError, ValueError) as error:
+                raise LogError(f"{where}: {leaf.name} of step {row}: {error}") from error
+        return images
+
+
+def _column(values: NDArray[Any]) -> NDArray[Any]:
+    """Return one value for each step; some datasets have an array of one element for each."""
+    values = np.asarray(values)
+    return values.reshape(len(values)) if values.size == len(values) else values
+
+
+def _summary(attributes: Mapping[str, Any], where: str) -> dict[str, Any]:
+    try:
+        own = parse_json(str(attributes.get(OWN, "{}")))
+        summary: dict[str, Any] = {name: str(own[name]) for name in _OWN_TEXTS if name in own}
+        summary["epsilon"] = float(own.get("epsilon", math.nan))
+        if attributes.get("seed") is not None:
+            summary["seed"] = int(attributes["seed"])
+        if "options" not in summary and attributes.get("options"):
+            summary["options"] = json.dumps(attributes["options"])
+        return summary
+    except (ValueError, TypeError, AttributeError) as error:
+        raise LogError(f"{where}: the attributes cannot be read: {error}") from error
+
+
+def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
+    with hdf5.opened(folder / MAIN) as file:
+        for index in range(description.episodes):
+            group = hdf5.group_in(file, f"episode_{index}")
+            own = hdf5.group_in(group, OWN) if hdf5.has(group, OWN) else None
+            infos = hdf5.group_in(group, "infos") if hdf5.has(group, "infos") else None
+            yield _Stored(
+                observations=[
+                    hdf5.array_at(group, ("observations", *keys)) for keys in description.keys
+                ],
+                steps={
+                    name: hdf5.array_in(group, name) for name in ("actions", "rewards", *_FLAGS)
+                },
+                infos={} if infos is None else dict(hdf5.arrays_below(infos)),
+                attributes=hdf5.attributes_of(group),
+                own={} if own is None else {name: hdf5.array_in(own, name) for name in own},
+            )
+
+
+def _in_arrow(folder: Path, description: Description) -> Generator[_Stored]:
+    for index in range(description.episodes):
+        table = arrow.read_table(folder / str(index), description.form)
+        yield _Stored(
+            observations=[
+                arrow.array_at(table, ("observations", *keys), leaf.shape)
+                for keys, leaf in zip(
+                    description.keys,
+                    leaves_of(description.metadata.observation_space),
+                    strict=True,
+                )
+            ],
+            # The last row contains the final observation; its other columns are padding.
+            steps={
+                name: arrow.array_at(table, (name,), None)[:-1]
+                for name in ("actions", "rewards", *_FLAGS)
+            },
+            infos=arrow.infos_of(table),
+            attributes=arrow.attributes_of(folder / str(index)),
+        )

@@ -1,0 +1,161 @@
+"""Writing of Minari datasets in their HDF5 form, without Minari.
+
+Images are stored exactly, not as JPEG. Minari has no place for times, probabilities and some fields
+of an episode's summary: they are in the attribute and the group `mcaprl` of each episode, which
+Minari does not read.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import SpaceError, import_extra
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.columns import episode_slices
+from mcaprl.recorder.dataset.formats.hdf5_nodes import EXTRA, with_names_for_hdf5
+from mcaprl.recorder.dataset.formats.minari.description import (
+    DATA,
+    FILE,
+    MAIN,
+    OWN,
+    description_text,
+)
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.spaces import observation_leaves
+
+# HDF5 stores attributes of at most 64 KiB.
+_MAX_ATTRIBUTE_BYTES = 60_000
+
+
+def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str = "") -> list[str]:
+    """Write a dataset to an empty folder.
+
+    Args:
+        dataset: Episodes to write.
+        path: Empty folder.
+        lossy: Whether what Minari cannot hold is left out or converted.
+        dataset_id: Id of the dataset; default: the name of the folder.
+
+    Returns:
+        One sentence for each thing that was left out or changed.
+
+    Raises:
+        SpaceError: Minari cannot hold a key of a space or an option, and `lossy` is not set.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_extra("h5py", EXTRA)
+    metadata = LogMetadata.from_strings(dataset.metadata)
+    space, renamed = with_names_for_hdf5(dataset.observation_space)
+    lost = [f"the key '{key}' is renamed, because HDF5 cannot hold its name" for key in renamed]
+    lost += _lost_options(dataset)
+    if lost and not lossy:
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write it")
+    leaves = observation_leaves(dataset.observation_space)
+    keys = [leaf.path for leaf in observation_leaves(space)]
+    columns = [leaf.of(dataset.frames) for leaf in leaves]
+    data = path / DATA
+    data.mkdir()
+    with h5py.File(data / MAIN, "w", track_order=True) as file:
+        for index, (steps, frames) in enumerate(episode_slices(dataset)):
+            group = file.create_group(f"episode_{index}")
+            episode = dataset.episodes[index]
+            _put_attributes(group, index, episode.summary)
+            for leaf, key, column in zip(leaves, keys, columns, strict=True):
+                values = np.asarray(column[frames])
+                name = "/".join(("observations", *key))
+                _put(group, name, values, compression="lzf" if leaf.encoding else None)
+            _put(group, "actions", dataset.actions[steps])
+            _put(group, "rewards", dataset.rewards[steps])
+            _put(group, "terminations", dataset.terminated[steps])
+            _put(group, "truncations", dataset.truncated[steps])
+            group.create_group("infos")
+            _put(group, f"{OWN}/behavior_probs", dataset.behavior_probs[steps])
+            _put(group, f"{OWN}/log_time_ns", episode.log_time_ns)
+    counts = {
+        "total_episodes": len(dataset.episode_lengths),
+        "total_steps": len(dataset),
+        "dataset_size": round((data / MAIN).stat().st_size / 1e6, 1),
+    }
+    text = description_text(metadata, space, dataset_id=dataset_id or path.name, counts=counts)
+    (data / FILE).write_text(text)
+    return lost
+
+
+def _put(group: Any, name: str, values: NDArray[Any], compression: str | None = None) -> None:
+    # Minari appends to arrays that can grow.
+    group.create_dataset(
+        name,
+        data=values,
+        chunks=True,
+        maxshape=(None, *values.shape[1:]),
+        compression=compression,
+    )
+
+
+def _put_attributes(group: Any, index: int, summary: EpisodeSummary) -> None:
+    group.attrs["id"] = index
+    group.attrs["total_steps"] = summary.length
+    if summary.seed is not None:
+        group.attrs["seed"] = summary.seed
+    for name, value in _flat_options(summary.options).items():
+        if _is_attribute(name, value):
+            group.attrs[f"options/{name}"] = value
+    own = {name: getattr(summary, name) for name in ("reason", "policy", "epsilon", "options")}
+    group.attrs[OWN] = json.dumps(own)
+
+
+def _lost_options(dataset: Dataset) -> list[str]:
+    names = {
+        name: None
+        for episode in dataset.episodes
+        for name, value in _flat_options(episode.summary.options).items()
+        if not _is_attribute(name, value)
+    }
+    return [f"the reset option '{name}' is left out, because HDF5 cannot hold it" for name in names]
+
+
+def _flat_options(options: str) -> dict[str, Any]:
+    """Return the options of a reset by path, such as `start/x`."""
+    try:
+        found = parse_json(options or "{}")
+    except ValueError:
+        return {}
+    return dict(_flat(found, ())) if isinstance(found, dict) else {}
+
+
+def _flat(options: dict[str, Any], path: tuple[str, ...]) -> list[tuple[str, Any]]:
+    found = []
+    for key, value in options.items():
+        if isinstance(value, dict):
+            found += _flat(value, (*path, key))
+        else:
+            found.append(("/".join((*path, key)), value))
+    return found
+
+
+def _is_attribute(name: str, value: Any) -> bool:
+    """Return whether HDF5 can hold an option: a number, text, or an array of numbers."""
+    if not _is_text(name):
+        return False
+    if isinstance(value, str):
+        return _is_text(value)
+    if value is None:
+        return False
+    try:
+        array = np.asarray(value)
+    except (ValueError, OverflowError):
+        return False
+    return array.dtype.kind in "biuf" and array.nbytes <= _MAX_ATTRIBUTE_BYTES
+
+
+def _is_text(text: str) -> bool:
+    """Return whether HDF5 can hold a text."""
+    return not re.search("[\\0\\ud800-\\udfff]", text)

@@ -1,0 +1,114 @@
+"""Minari datasets that Minari itself collects, and an environment with Dict observations."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+import mcaprl
+
+AUTHOR = {
+    "author": "A. Author",
+    "author_email": "a@example.org",
+    "code_permalink": "https://example.org/code",
+    "description": "Test data.",
+}
+
+
+class Cameras(gym.Env[dict[str, Any], np.ndarray[Any, Any]]):
+    """Two cameras and an arm; it terminates after five steps, or is truncated after three."""
+
+    observation_space = spaces.Dict(
+        {
+            "arm": spaces.Dict(
+                {
+                    "joints": spaces.Box(-np.inf, np.inf, (2,), np.float32),
+                    "grip": spaces.Discrete(3, start=-1),
+                }
+            ),
+            "front": spaces.Box(0, 255, (32, 40, 3), np.uint8),
+            "gray": spaces.Box(0, 255, (36, 33), np.uint8),
+        }
+    )
+    action_space = spaces.MultiDiscrete([3, 2])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        super().reset(seed=seed)
+        self._step, self._limit = 0, int((options or {}).get("limit", 5))
+        return self._observation(), self._info()
+
+    def step(
+        self, action: np.ndarray[Any, Any]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        terminated, truncated = self._step == 5, self._step == self._limit < 5
+        return self._observation(), 0.1 * self._step, terminated, truncated, self._info()
+
+    def _observation(self) -> dict[str, Any]:
+        draw = self.np_random
+        return {
+            "arm": {
+                "joints": draw.normal(size=2).astype(np.float32),
+                "grip": np.int64(draw.integers(-1, 2)),
+            },
+            "front": draw.integers(0, 256, (32, 40, 3), np.uint8),
+            "gray": draw.integers(0, 256, (36, 33), np.uint8),
+        }
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "battery": 1 - self._step / 8,
+            "pose": {"xy": np.array([self._step, -self._step], np.float32)},
+            "late": self._step > 2,
+        }
+
+
+def collect(
+    env: gym.Env[Any, Any],
+    dataset_id: str,
+    *,
+    log: Path | None = None,
+    data_format: str = "hdf5",
+    jpeg: bool = False,
+    infos: bool = False,
+    options: Sequence[dict[str, Any] | None] = (None, {"limit": 3}, {"limit": 4, "task": "turn"}),
+) -> Any:
+    """Collect episodes with Minari, and record the same episodes as a log.
+
+    The seeds are 3, 4, ..., and the actions are random.
+
+    Returns:
+        The `MinariDataset`.
+    """
+    import minari
+
+    recorded = env if log is None else mcaprl.RecordMcap(env, log)
+    collector = minari.DataCollector(
+        recorded, data_format=data_format, jpeg_encoding=jpeg, record_infos=infos
+    )
+    for seed, option in enumerate(options, 3):
+        collector.reset(seed=seed, options=option)
+        collector.action_space.seed(seed)
+        is_over = False
+        while not is_over:
+            _, _, terminated, truncated, _ = collector.step(collector.action_space.sample())
+            is_over = terminated or truncated
+    if log is not None:
+        recorded.close()
+    with warnings.catch_warnings():
+        # Minari warns of an environment that is not registered, and leaves folders to the collector
+        # of garbage.
+        warnings.simplefilter("ignore")
+        made = collector.create_dataset(dataset_id, algorithm_name="random", **AUTHOR)
+        del collector
+        gc.collect()
+    return made

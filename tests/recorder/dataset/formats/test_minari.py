@@ -1,0 +1,441 @@
+"""Minari datasets: collected by Minari and read here, written here and loaded by Minari."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import warnings
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+
+import mcaprl
+from mcaprl import Dataset
+from mcaprl.errors import LogError, OutputExistsError, SpaceError, UsageError
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.format.metadata import LogMetadata
+from tests.conftest import need
+from tests.recorder.dataset.formats.minari_sets import Cameras, collect
+from tests.support.strategies import transitions
+
+h5py = pytest.importorskip("h5py", reason="needs the extra interop")
+
+_HAS_MINARI = all(importlib.util.find_spec(name) for name in ("minari", "jax", "pyarrow"))
+_FORMS = ["hdf5", "arrow", "parquet"]
+# Options of each reset.
+_OPTIONS: dict[str, list[dict[str, Any] | None]] = {
+    "mcaprl/LaneKeeping-v0": [None, {"pose": [1.0, 0.5, 0.25]}, {"pose": [2.0, 0.0, 0.0]}],
+    "CartPole-v1": [None, {"low": -0.01, "high": 0.02}, None],
+    "cameras": [None, {"limit": 3}, {"limit": 4, "task": "turn"}],
+}
+
+
+@pytest.fixture(autouse=True)
+def _datasets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+
+
+@pytest.fixture
+def minari() -> Any:
+    need(_HAS_MINARI, "minari[create,hdf5,arrow]")
+    import minari
+
+    return minari
+
+
+def _same_tree(first: Any, second: Any) -> None:
+    """Check that arrays, or nested dicts of arrays, have equal dtypes, shapes and bits."""
+    if isinstance(first, dict):
+        assert set(first) == set(second)
+        for key, part in first.items():
+            _same_tree(part, second[key])
+        return
+    first, second = np.asarray(first), np.asarray(second)
+    assert (first.dtype, first.shape) == (second.dtype, second.shape)
+    assert first.tobytes() == second.tobytes()
+
+
+def _same_transitions(ours: Dataset, theirs: Any) -> None:
+    """Check that each episode of a MinariDataset is ours, bit for bit."""
+    assert len(ours.episodes) == len(theirs)
+    for index, episode in enumerate(theirs):
+        own = ours.episodes[index]
+        frames = slice(
+            *(ours.episode_lengths[:index].sum() + index + np.array([0, own.length + 1]))
+        )
+        _same_tree(_rows(ours.frames, frames), episode.observations)
+        _same_tree(own.actions, episode.actions)
+        _same_tree(own.rewards, episode.rewards)
+        _same_tree(own.terminated, episode.terminations)
+        _same_tree(own.truncated, episode.truncations)
+
+
+def _rows(tree: Any, rows: slice) -> Any:
+    if isinstance(tree, dict):
+        return {key: _rows(part, rows) for key, part in tree.items()}
+    return tree[rows]
+
+
+def _summaries(data: Dataset, *names: str) -> list[tuple[Any, ...]]:
+    return [tuple(getattr(episode.summary, name) for name in names) for episode in data.episodes]
+
+
+def _vector(**fields: Any) -> Dataset:
+    """Return one episode of two steps that terminates, and one of one step without a flag."""
+    metadata = LogMetadata(
+        spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(3, start=-1), env_id="Toy-v0"
+    )
+    first = EpisodeArrays(
+        observations=np.array([[0, 1], [0.5, 0], [1, 1]], np.float32),
+        actions=np.array([-1, 1]),
+        rewards=np.array([0.1, 2]),
+        terminated=True,
+        truncated=False,
+        behavior_probs=np.array([0.25, np.nan], np.float32),
+        times_ns=np.array([5, 6, 8]) * 10**9,
+        summary={"reason": "goal", "seed": 7, "policy": "pid", "epsilon": 0.5, **fields},
+    )
+    second = EpisodeArrays(
+        observations=np.zeros((2, 2), np.float32),
+        actions=np.array([0]),
+        rewards=np.array([-0.0]),
+        terminated=False,
+        truncated=False,
+        times_ns=np.array([20, 21]) * 10**9,
+    )
+    return dataset_of([first, second], metadata, "test")
+
+
+@pytest.mark.parametrize("form", _FORMS)
+@pytest.mark.parametrize("env_id", list(_OPTIONS))
+def test_a_collected_dataset_equals_the_log_of_the_same_episodes(
+    minari: Any, tmp_path: Path, env_id: str, form: str
+) -> None:
+    env = Cameras() if env_id == "cameras" else gym.make(env_id, max_episode_steps=30)
+    options = _OPTIONS[env_id]
+    path = tmp_path / "log.mcap"
+    collect(env, "drive/part/collected-v2", log=path, data_format=form, options=options)
+    log = mcaprl.open(tmp_path / "log.mcap")
+    found = mcaprl.open("minari:drive/part/collected-v2")
+    assert found.fingerprint == log.fingerprint
+    fields = ("length", "total_reward", "terminated", "truncated", "seed")
+    assert _summaries(found, *fields) == _summaries(log, *fields)
+    assert [seed for *_, seed in _summaries(found, *fields)] == [3, 4, 5]
+    assert [json.loads(text or "null") for (text,) in _summaries(found, "options")] == options
+    assert (found.env_id, found.env_kwargs) == (log.env_id, log.env_kwargs)
+    assert found.metadata["policy"] == "random"
+
+
+@pytest.mark.parametrize("kind", ["lane", "cameras"])
+def test_minari_loads_what_is_written(minari: Any, tmp_path: Path, kind: str) -> None:
+    env = Cameras() if kind == "cameras" else gym.make("mcaprl/LaneKeeping-v0", max_episode_steps=9)
+    options = _OPTIONS["cameras" if kind == "cameras" else "mcaprl/LaneKeeping-v0"]
+    collect(env, "made-v0", log=tmp_path / "log.mcap", options=options)
+    log = mcaprl.open(tmp_path / "log.mcap")
+    assert log.to_minari("minari:a/b/written-v1") == []
+    loaded = minari.load_dataset("a/b/written-v1")
+    _same_transitions(log, loaded)
+    assert (loaded.observation_space, loaded.action_space) == (
+        log.observation_space,
+        log.action_space,
+    )
+    assert (loaded.total_episodes, loaded.total_steps) == (3, len(log))
+    assert [m["seed"] for m in loaded.storage.get_episode_metadata([0, 1, 2])] == [3, 4, 5]
+    if kind == "cameras":
+        (attributes,) = loaded.storage.get_episode_metadata([1])
+        assert attributes["options"] == {"limit": 3}
+    assert "observations" in repr(loaded[0])
+    assert "a/b/written-v1" in minari.list_local_datasets()
+    assert minari.namespace.list_local_namespaces() == ["a", "a/b"]
+    if kind == "lane":
+        assert loaded.recover_environment().spec.id == "mcaprl/LaneKeeping-v0"
+    back = mcaprl.open("minari:a/b/written-v1")
+    assert back.fingerprint == log.fingerprint
+    assert back.metadata == log.metadata
+    assert repr(_summaries(back, *log.episodes[0].summary._fields)) == repr(
+        _summaries(log, *log.episodes[0].summary._fields)
+    )
+
+
+def test_minari_appends_splits_and_combines_what_is_written(minari: Any) -> None:
+    data = _vector()
+    data.to_minari("minari:one-v0")
+    data.to_minari("minari:two-v0")
+    loaded = minari.load_dataset("one-v0")
+    buffer = minari.data_collector.EpisodeBuffer(
+        observations=np.ones((2, 2), np.float32),
+        actions=np.array([1]),
+        rewards=np.array([3.0]),
+        terminations=np.array([True]),
+        truncations=np.array([False]),
+        infos={},
+    )
+    loaded.update_dataset_from_buffer([buffer])
+    assert [len(part) for part in minari.split_dataset(loaded, [1, 2], seed=0)] == [1, 2]
+    found = mcaprl.open("minari:one-v0")
+    assert found.rewards.tolist() == [0.1, 2, -0.0, 3]
+    assert _summaries(found, "reason") == [("goal",), ("",), ("terminated",)]
+    minari.combine_datasets([loaded, minari.load_dataset("two-v0")], "both-v0")
+    assert mcaprl.open("minari:both-v0").rewards.tolist() == [0.1, 2, -0.0, 3, 0.1, 2, -0.0]
+
+
+def test_nothing_is_lost_on_the_way_back(tmp_path: Path) -> None:
+    data = _vector(options='{"start": {"x": 0.5, "name": "a b"}, "lanes": [1, 2], "on": true}')
+    assert data.to_minari(tmp_path / "toy-v0") == []
+    found = Dataset.from_minari(tmp_path / "toy-v0")
+    assert found.fingerprint == data.fingerprint
+    assert found.metadata == data.metadata
+    assert [repr(e.summary) for e in found.episodes] == [repr(e.summary) for e in data.episodes]
+    assert found.episodes[0].log_time_ns.tolist() == [5 * 10**9, 6 * 10**9, 8 * 10**9]
+    assert found.sources == (tmp_path / "toy-v0",)
+    with h5py.File(tmp_path / "toy-v0/data/main_data.hdf5") as file:
+        attributes = dict(file["episode_0"].attrs)
+    assert (attributes["options/start/x"], attributes["options/start/name"]) == (0.5, "a b")
+    assert attributes["options/lanes"].tolist() == [1, 2]
+    assert attributes["seed"] == 7
+
+
+@settings(max_examples=30)
+@given(given_arrays=transitions())
+def test_any_dataset_comes_back(given_arrays: dict[str, Any]) -> None:
+    data = Dataset.from_arrays(**given_arrays)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "any-v0"
+        renamed = data.to_minari(path, lossy=True)
+        found = mcaprl.open(path)
+        assert bool(renamed) == _has_odd_keys(data.observation_space)
+        _same_tree(_arrays(found.frames), _arrays(data.frames))
+        if not renamed:
+            assert found.fingerprint == data.fingerprint
+            assert found.metadata == data.metadata
+            if _HAS_MINARI:
+                from minari import MinariDataset
+
+                _same_transitions(data, MinariDataset(path / "data"))
+
+
+def _has_odd_keys(space: spaces.Space[Any]) -> bool:
+    keys = list(space.spaces) if isinstance(space, spaces.Dict) else []
+    return any(set(key) & {"/", "\0"} or not key.strip(".") for key in keys)
+
+
+def _arrays(tree: Any) -> Any:
+    """Return the arrays of a flat dict by number, without its keys."""
+    return dict(enumerate(tree.values())) if isinstance(tree, dict) else tree
+
+
+def test_keys_that_hdf5_cannot_hold_are_refused_or_renamed(tmp_path: Path) -> None:
+    space = spaces.Dict({"a/b": spaces.Box(0, 1, (), np.float32), "a_b": spaces.Discrete(2)})
+    data = Dataset.from_arrays(
+        observations={"a/b": np.zeros(1, np.float32), "a_b": np.ones(1, np.int64)},
+        next_observations={"a/b": np.ones(1, np.float32), "a_b": np.zeros(1, np.int64)},
+        actions=np.zeros(1, np.int64),
+        rewards=np.zeros(1),
+        terminated=[True],
+        truncated=[False],
+        observation_space=space,
+        action_space=spaces.Discrete(2),
+    )
+    with pytest.raises(SpaceError, match=r"the key 'a/b' is renamed.*--lossy"):
+        data.to_minari(tmp_path / "odd-v0")
+    assert not (tmp_path / "odd-v0").exists()
+    (sentence,) = data.to_minari(tmp_path / "odd-v0", lossy=True)
+    assert "'a/b'" in sentence
+    frames = mcaprl.open(tmp_path / "odd-v0").frames
+    assert frames["a_b_"].tolist() == [0, 1]
+    assert frames["a_b"].tolist() == [1, 0]
+
+
+def test_options_that_hdf5_cannot_hold_are_refused_or_left_out(tmp_path: Path) -> None:
+    data = _vector(options='{"goal": null, "x": 1}')
+    with pytest.raises(SpaceError, match="the reset option 'goal' is left out"):
+        data.to_minari(tmp_path / "odd-v0")
+    (sentence,) = data.to_minari(tmp_path / "odd-v0", lossy=True)
+    assert "'goal'" in sentence
+    # Minari does not see it, but it is not lost on the way back.
+    assert mcaprl.open(tmp_path / "odd-v0").episodes[0].summary.options == '{"goal": null, "x": 1}'
+
+
+@pytest.mark.parametrize("form", _FORMS)
+def test_jpeg_is_decoded_as_minari_does_and_reported(
+    minari: Any, tmp_path: Path, form: str
+) -> None:
+    made = collect(Cameras(), "jpeg-v0", jpeg=True, data_format=form)
+    with pytest.warns(UserWarning, match="front, gray is stored as JPEG"):
+        found = mcaprl.open("minari:jpeg-v0")
+    _same_transitions(found, made)
+    assert found.frames["front"].shape == (15, 32, 40, 3)
+    # Old versions of Minari always used JPEG, and did not say so.
+    metadata = tmp_path / "sets/jpeg-v0/data/metadata.json"
+    raw = json.loads(metadata.read_text())
+    del raw["jpeg_encoding"]
+    metadata.write_text(json.dumps(raw))
+    with pytest.warns(UserWarning, match="JPEG"):
+        assert mcaprl.open("minari:jpeg-v0").fingerprint == found.fingerprint
+
+
+@pytest.mark.parametrize("form", ["arrow", "parquet"])
+def test_long_episodes_of_the_arrow_form_are_whole(minari: Any, form: str) -> None:
+    count = 40_000
+    observations = np.arange(count + 1, dtype=np.float32)[:, None]
+    flags = np.arange(count) == count - 1
+    buffer = minari.data_collector.EpisodeBuffer(
+        seed=1,
+        observations=observations,
+        actions=np.arange(count) % 3,
+        rewards=np.arange(count) / 2,
+        terminations=flags,
+        truncations=np.zeros(count, bool),
+        infos={"k": np.arange(count + 1)[:, None].tolist()},
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        minari.create_dataset_from_buffers(
+            "long-v0",
+            [buffer, buffer],
+            observation_space=spaces.Box(0, np.inf, (1,), np.float32),
+            action_space=spaces.Discrete(3),
+            data_format=form,
+            jpeg_encoding=False,
+        )
+    found = mcaprl.open("minari:long-v0")
+    assert found.episode_lengths.tolist() == [count, count]
+    np.testing.assert_array_equal(found.frames, np.tile(observations, (2, 1)))
+    np.testing.assert_array_equal(found.rewards, np.tile(np.arange(count) / 2, 2))
+    assert np.flatnonzero(found.terminated).tolist() == [count - 1, 2 * count - 1]
+
+
+@pytest.mark.parametrize("form", _FORMS)
+def test_tuple_observations_become_a_dict(minari: Any, form: str) -> None:
+    part = spaces.Dict({"y": spaces.Discrete(4)})
+    space = spaces.Tuple([spaces.Box(0, 9, (2,), np.float32), part])
+    buffer = minari.data_collector.EpisodeBuffer(
+        observations=(np.array([[1, 2], [3, 4]], np.float32), {"y": np.array([3, 0])}),
+        actions=np.array([1]),
+        rewards=np.array([0.5]),
+        terminations=np.array([False]),
+        truncations=np.array([True]),
+        infos={},
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        minari.create_dataset_from_buffers(
+            "tuple-v0",
+            [buffer],
+            observation_space=space,
+            action_space=spaces.Discrete(2),
+            data_format=form,
+        )
+    with pytest.warns(UserWarning, match="Tuple observations are read as Dict"):
+        found = mcaprl.open("minari:tuple-v0")
+    assert found.frames["0"].tolist() == [[1, 2], [3, 4]]
+    assert found.frames["1"]["y"].tolist() == [3, 0]
+    assert found.truncated.tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("role", "plain", "message"),
+    [
+        ("observation", {"type": "Text", "max_length": 3}, "observation is a Text space"),
+        (
+            "observation",
+            {"type": "Dict", "subspaces": {"a": {"type": "Graph"}}},
+            "observation\\['a'\\] is a Graph space",
+        ),
+        ("action", {"type": "Tuple", "subspaces": []}, "action is a Tuple space"),
+        ("action", {"type": "Dict", "subspaces": {}}, "action is a Dict space"),
+        ("action", {"type": "Box"}, "not a description of a space"),
+        ("action", [1], "not a description of a space"),
+    ],
+)
+def test_spaces_that_a_log_cannot_hold_are_refused_by_name(
+    tmp_path: Path, role: str, plain: Any, message: str
+) -> None:
+    _vector().to_minari(tmp_path / "toy-v0")
+    _change(tmp_path / "toy-v0", **{f"{role}_space": json.dumps(plain)})
+    with pytest.raises(SpaceError, match=message):
+        mcaprl.open(tmp_path / "toy-v0")
+
+
+def _change(path: Path, **fields: Any) -> None:
+    """Replace fields of the metadata; None removes one."""
+    file = path / "data/metadata.json"
+    raw = {**json.loads(file.read_text()), **fields}
+    file.write_text(json.dumps({key: value for key, value in raw.items() if value is not None}))
+
+
+def test_old_datasets_have_the_spaces_of_their_environment(tmp_path: Path) -> None:
+    env = mcaprl.RecordMcap(gym.make("CartPole-v1"), tmp_path / "log.mcap")
+    env.reset(seed=0)
+    env.step(0)
+    env.close()
+    log = mcaprl.open(tmp_path / "log.mcap")
+    path = tmp_path / "cart-v0"
+    log.to_minari(path)
+    _change(path, observation_space=None, action_space=None, mcaprl=None, data_format=None)
+    assert mcaprl.open(path).fingerprint == log.fingerprint
+    _change(path, env_spec='{"id": "Other-v0"}')
+    with pytest.raises(SpaceError, match="'Other-v0' is not registered"):
+        mcaprl.open(path)
+
+
+@pytest.mark.parametrize("name", ["drive", "drive-v", "../drive-v0", "a//b-v0", "/a-v0"])
+def test_ids_without_a_version_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="version, such as"):
+        _vector().to_minari(f"minari:{name}")
+    assert not (tmp_path / "sets").exists()
+
+
+def test_folders_are_named_with_a_version_and_replaced_on_request(tmp_path: Path) -> None:
+    data = _vector()
+    with pytest.raises(UsageError, match="ends with its version, such as toy-v0"):
+        data.to_minari(tmp_path / "toy")
+    data.to_minari(tmp_path / "toy-v0")
+    with pytest.raises(OutputExistsError):
+        data.to_minari(tmp_path / "toy-v0")
+    data.to_minari(tmp_path / "toy-v0", overwrite=True)
+    # Its folder `data` is the dataset for Minari's own classes.
+    assert mcaprl.open(tmp_path / "toy-v0/data").fingerprint == data.fingerprint
+
+
+def test_damaged_datasets_give_one_clear_line(tmp_path: Path) -> None:
+    path = tmp_path / "toy-v0"
+    main = path / "data/main_data.hdf5"
+
+    def fails(message: str) -> None:
+        with pytest.raises(LogError, match=message) as caught:
+            mcaprl.open(path, format="minari")
+        assert "\n" not in str(caught.value)
+
+    with pytest.raises(LogError, match="no such file or folder"):
+        mcaprl.open("minari:none/there-v0")
+    _vector().to_minari(path)
+    _change(path, total_episodes=3)
+    fails("episode_2 is missing")
+    _change(path, total_episodes=2, data_format="zarr")
+    fails("unknown data format 'zarr'")
+    _change(path, data_format="arrow")
+    fails("has no .arrow file")
+    _change(path, data_format="hdf5")
+    with h5py.File(main, "a") as file:
+        file["episode_0/terminations"][0] = True
+    fails("episode 0 goes on after step 0 with terminations")
+    with h5py.File(main, "a") as file:
+        file["episode_0/terminations"][0] = False
+        del file["episode_0/rewards"]
+        file["episode_0"].create_dataset("rewards", (10**12,), np.float64, chunks=True)
+    fails("only 0 bytes are stored")
+    with h5py.File(main, "a") as file:
+        del file["episode_0/rewards"]
+        file["episode_0/rewards"] = h5py.ExternalLink("other.hdf5", "/rewards")
+    fails("stored in another file")
+    main.write_bytes(main.read_bytes()[:900])
+    fails("not a readable HDF5 file")
+    (path / "data/metadata.json").write_text("{")
+    fails("metadata.json cannot be read")
