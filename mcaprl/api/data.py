@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from mcaprl.errors import UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -77,14 +77,24 @@ def open_data(
     if other is not None:
         from mcaprl.recorder.dataset.formats.registry import read_format
 
-        return read_format(cast("str | Path", data), other)
+        one = _only(data)
+        if one is None:
+            raise UsageError(f"several paths are for logs; pass one dataset of format {other.name}")
+        return read_format(one, other)
     assert mapping is not None
     return mapped(data, mapping, trust_code=trust_code).dataset
 
 
+def _only(data: Paths) -> str | Path | None:
+    """Return the path if there is exactly one."""
+    if isinstance(data, str | Path):
+        return data
+    return data[0] if len(data) == 1 else None
+
+
 def _other_format(data: Paths, name: str | None) -> Format | None:
     """Return the format of another tool's dataset; None for logs."""
-    one = data if isinstance(data, str | Path) else data[0] if len(data) == 1 else None
+    one = _only(data)
     path = None if one is None else Path(one)
     is_log = path is None or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap")))
     if name is None and is_log:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl import Dataset
+from mcaprl.cli import run
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.lerobot import tables, writer
@@ -426,6 +427,14 @@ def test_lerobots_names_and_values_survive_a_way_through_a_log(tmp_path: Path) -
         )
     tasks = parquet.read_table(tmp_path / "out/meta/tasks.parquet")
     assert tasks["task"].to_pylist() == ["lift the cube", "drop the cube"]
+
+
+def test_the_command_converts_both_ways(tmp_path: Path) -> None:
+    dataset = _cameras()
+    dataset.save(tmp_path / "log.mcap")
+    assert run(["convert", f"{tmp_path}/log.mcap", f"{tmp_path}/out", "--to", "lerobot"]) == 0
+    assert run(["convert", f"{tmp_path}/out", f"{tmp_path}/back.mcap"]) == 0
+    _same(mcaprl.open(tmp_path / "log.mcap"), mcaprl.open(tmp_path / "back.mcap"))
 
 
 def _edited(path: Path, edit: Any) -> None:
