@@ -1,10 +1,159 @@
-"""Placeholder until the module is written."""
+"""HDF5 files: D4RL's form both ways, and robomimic's to read.
+
+D4RL's form is flat arrays of all transitions. Ours has `next_observations` too, which D4RL's own
+files often lack, and the group `mcaprl` with what D4RL has no place for.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, SpaceError, import_extra
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.flat import NAMES, flat_dataset
+from mcaprl.recorder.dataset.formats.npz import OWN, description_text, parse_description
+from mcaprl.recorder.dataset.formats.robomimic import read_demos
+from mcaprl.recorder.format.spaces import leaves_of, nest, observation_leaves
+
+_DESCRIPTION = "description"
+_BLOCK_ROWS = 1024
 
 
 def matches(path: Path) -> bool:
-    """Return False."""
-    return False
+    """Return whether a path is an HDF5 file."""
+    return nodes.is_hdf5(path)
+
+
+def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
+    """Write a dataset in D4RL's form.
+
+    Args:
+        dataset: Episodes to write.
+        path: New file.
+        lossy: Whether Dict observations are written, as one array for each key.
+
+    Returns:
+        One sentence for each thing that was changed for D4RL's readers.
+
+    Raises:
+        SpaceError: The observations are a Dict, and `lossy` is not set.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_extra("h5py", nodes.EXTRA)
+    lost = []
+    if isinstance(dataset.observation_space, spaces.Dict):
+        lost.append("Dict observations are one array for each key, which D4RL does not read")
+    if lost and not lossy:
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write them")
+    slices = episode_slices(dataset)
+    lasts = np.array([steps.stop - 1 for steps, _ in slices])
+    timeouts = dataset.truncated.copy()
+    timeouts[lasts] |= ~dataset.terminated[lasts]
+    changed = int((timeouts != dataset.truncated).sum())
+    if changed:
+        lost.append(f"{changed} episodes that end without a flag end with a timeout")
+    space, _ = nodes.with_names_for_hdf5(dataset.observation_space)
+    names = ["".join(f"/{key}" for key in leaf.path) for leaf in observation_leaves(space)]
+    with h5py.File(path, "w") as file:
+        for leaf, name in zip(leaves_of(dataset.observation_space), names, strict=True):
+            column, is_image = leaf.of(dataset.frames), leaf.encoding is not None
+            _put(file, f"observations{name}", column, dataset.frame_of_step, is_image)
+            _put(file, f"next_observations{name}", column, dataset.frame_of_step + 1, is_image)
+        file["actions"] = dataset.actions
+        file["rewards"] = dataset.rewards
+        file["terminals"] = dataset.terminated
+        file["timeouts"] = timeouts
+        own = file.create_group(OWN)
+        own[_DESCRIPTION] = description_text(dataset, names)
+        own["episode_lengths"] = dataset.episode_lengths
+        own["truncated"] = dataset.truncated[lasts]
+        own["behavior_probs"] = dataset.behavior_probs
+        own["log_time_ns"] = np.concatenate([e.log_time_ns for e in dataset.episodes])
+    return lost
+
+
+def read(path: Path) -> Dataset:
+    """Read a file in D4RL's or robomimic's form.
+
+    Raises:
+        LogError: The file is damaged, or has another form.
+        SpaceError: A log cannot store a dtype.
+        MissingExtraError: h5py is not installed.
+    """
+    with nodes.opened(path) as file:
+        if nodes.has(file, "data"):
+            return read_demos(file, path)
+        if nodes.has(file, "episode_0"):
+            raise LogError(f"{path} is a part of a Minari dataset: open the folder of the dataset")
+        if nodes.has(file, OWN):
+            found = _own(file, path)
+            if found is not None:
+                return found
+        known = [name for names in NAMES.values() for name in names]
+        return flat_dataset(
+            {name: nodes.tree_in(file, name) for name in file if name in known}, path
+        )
+
+
+def _own(file: Any, path: Path) -> Dataset | None:
+    """Return the dataset that was written; None if the arrays have other lengths now."""
+    own = nodes.group_in(file, OWN)
+    metadata, summaries, names = parse_description(str(nodes.array_in(own, _DESCRIPTION)), path)
+    leaves = leaves_of(metadata.observation_space)
+    steps = {name: nodes.array_in(file, name) for name in ("actions", "rewards", "terminals")}
+    columns = [
+        [nodes.array_at(file, f"{role}{name}".split("/")) for name in names]
+        for role in ("observations", "next_observations")
+    ]
+    parts = {
+        name: nodes.array_in(own, name)
+        for name in ("episode_lengths", "truncated", "behavior_probs", "log_time_ns")
+    }
+    lengths, count = parts["episode_lengths"].astype(int).tolist(), len(steps["rewards"])
+    rows = [*steps.values(), *columns[0], *columns[1], parts["behavior_probs"]]
+    same = sum(lengths) == count and all(len(array) == count for array in rows)
+    if not same or len(parts["log_time_ns"]) != count + len(lengths) or min(lengths) < 1:
+        warnings.warn(
+            f"{path}: {OWN} is ignored, because the arrays were changed after it was written",
+            stacklevel=4,
+        )
+        return None
+
+    def episodes() -> Iterator[EpisodeArrays]:
+        last = 0
+        for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
+            taken, last = slice(last, last + length), last + length
+            observations = [
+                np.concatenate([here[taken], there[last - 1 : last]])
+                for here, there in zip(*columns, strict=True)
+            ]
+            yield EpisodeArrays(
+                observations=nest(leaves, observations),
+                actions=steps["actions"][taken],
+                rewards=steps["rewards"][taken],
+                terminated=bool(steps["terminals"][last - 1]),
+                truncated=bool(parts["truncated"][index]),
+                behavior_probs=parts["behavior_probs"][taken],
+                times_ns=parts["log_time_ns"][taken.start + index : last + index + 1],
+                summary=summary,
+            )
+
+    return dataset_of(list(episodes()), metadata, path)
+
+
+def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: bool) -> None:
+    """Write rows of a column block by block, because images on disk need not fit into memory."""
+    shape = (len(rows), *column.shape[1:])
+    stored = file.create_dataset(name, shape, column.dtype, compression="lzf" if is_image else None)
+    for start in range(0, len(rows), _BLOCK_ROWS):
+        block = slice(start, start + _BLOCK_ROWS)
+        stored[block] = np.asarray(column[rows[block]])

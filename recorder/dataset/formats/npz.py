@@ -1,10 +1,203 @@
-"""Placeholder until the module is written."""
+"""NumPy archives: our own, with everything that a dataset has, and those of others.
+
+Our own archive has these arrays, for E episodes with N transitions:
+
+    observations              (N, *shape); or arrays `observations/KEY` for the keys of a Dict
+    final_observations        (E, *shape), named in the same way
+    actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
+    episode_lengths           (E,)
+    log_time_ns               (N + E,)
+    mcaprl                    JSON text: metadata, summaries and the names of the observations
+
+Other archives have the arrays of `flat.NAMES`. Nothing is unpickled.
+"""
 
 from __future__ import annotations
 
+import json
+import re
+import zipfile
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError
+from mcaprl.files import parse_json
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.flat import flat_dataset
+from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.spaces import Leaf, leaves_of, nest
+
+OWN = "mcaprl"
+SUMMARY = ("reason", "policy", "epsilon", "seed", "options")
+_OBSERVATIONS, _FINALS = "observations", "final_observations"
+_BLOCK_ROWS = 1024
 
 
 def matches(path: Path) -> bool:
-    """Return False."""
-    return False
+    """Return whether a path is a file of NumPy arrays by name."""
+    return path.suffix == ".npz" and path.is_file()
+
+
+def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
+    """Write a dataset; nothing is lost.
+
+    Args:
+        dataset: Episodes to write.
+        path: New file.
+        lossy: Has no effect.
+    """
+    leaves = leaves_of(dataset.observation_space)
+    names = [array_name(leaf) for leaf in leaves]
+    slices = episode_slices(dataset)
+    finals = np.array([frames.stop - 1 for _, frames in slices])
+    with zipfile.ZipFile(path, "w") as archive:
+        for leaf, name in zip(leaves, names, strict=True):
+            column = leaf.of(dataset.frames)
+            _put(archive, _OBSERVATIONS + name, column, dataset.frame_of_step)
+            _put(archive, _FINALS + name, column, finals)
+        for name, values in (
+            ("actions", dataset.actions),
+            ("rewards", dataset.rewards),
+            ("terminations", dataset.terminated),
+            ("truncations", dataset.truncated),
+            ("behavior_probs", dataset.behavior_probs),
+            ("episode_lengths", dataset.episode_lengths),
+            ("log_time_ns", np.concatenate([e.log_time_ns for e in dataset.episodes])),
+            (OWN, np.array(description_text(dataset, names))),
+        ):
+            _put_rows(archive, name, values.dtype, values.shape, [values])
+    return []
+
+
+def read(path: Path) -> Dataset:
+    """Read an archive.
+
+    Raises:
+        LogError: The file is damaged, or an array is missing.
+        SpaceError: A log cannot store a dtype.
+    """
+    try:
+        # NumPy does not close a file that is no archive.
+        with path.open("rb") as file, zipfile.ZipFile(file):
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+    # NumPy and zipfile raise these errors if the file is damaged, or contains Python objects.
+    except (OSError, ValueError, EOFError, MemoryError, KeyError, zipfile.BadZipFile) as error:
+        raise LogError(f"{path} is not a readable .npz file: {error}") from error
+    except (NotImplementedError, RuntimeError) as error:
+        raise LogError(f"{path} is compressed or encrypted in an unknown way: {error}") from error
+    if OWN in arrays:
+        return _own(arrays, path)
+    return flat_dataset(_nested(arrays), path)
+
+
+def array_name(leaf: Leaf) -> str:
+    """Return what follows `observations` in the name of a leaf's array.
+
+    Keys with other characters than letters, digits, `.`, `_` and `-` are named as in the log.
+    """
+    if all(re.fullmatch(r"[A-Za-z0-9_.-]+", key) for key in leaf.path):
+        return "".join(f"/{key}" for key in leaf.path)
+    return f":{leaf.name}"
+
+
+def description_text(dataset: Dataset, names: Iterable[str]) -> str:
+    """Return the metadata, the summaries and the names of the observations as JSON."""
+    summaries = [
+        {name: getattr(episode.summary, name) for name in SUMMARY} for episode in dataset.episodes
+    ]
+    return json.dumps(
+        {"metadata": dataset.metadata, "episodes": summaries, _OBSERVATIONS: list(names)}
+    )
+
+
+def parse_description(text: str, where: object) -> tuple[LogMetadata, list[dict[str, Any]], Any]:
+    """Parse what `description_text` wrote: metadata, fields of each summary, and names.
+
+    Raises:
+        LogError: The text is damaged.
+    """
+    try:
+        found = parse_json(text)
+        metadata = LogMetadata.from_strings(found["metadata"])
+        summaries = [{name: part[name] for name in SUMMARY} for part in found["episodes"]]
+        return metadata, summaries, list(map(str, found[_OBSERVATIONS]))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
+
+
+def _own(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
+    metadata, summaries, names = parse_description(str(arrays[OWN]), path)
+    leaves = leaves_of(metadata.observation_space)
+    try:
+        lengths = arrays["episode_lengths"].tolist()
+        columns = [(arrays[_OBSERVATIONS + name], arrays[_FINALS + name]) for name in names]
+        episodes, first = [], 0
+        for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
+            steps, frames = (
+                slice(first, first + length),
+                slice(first + index, first + index + length + 1),
+            )
+            parts = [
+                np.concatenate([rows[steps], finals[index : index + 1]]) for rows, finals in columns
+            ]
+            episode = EpisodeArrays(
+                observations=nest(leaves, parts),
+                actions=arrays["actions"][steps],
+                rewards=arrays["rewards"][steps],
+                terminated=bool(arrays["terminations"][steps][-1]),
+                truncated=bool(arrays["truncations"][steps][-1]),
+                behavior_probs=arrays["behavior_probs"][steps],
+                times_ns=arrays["log_time_ns"][frames],
+                summary=summary,
+            )
+            episodes.append(episode)
+            first += length
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise LogError(f"{path}: an array is missing or too short: {error}") from error
+    return dataset_of(episodes, metadata, path)
+
+
+def _nested(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return arrays with names such as `observations/state` as nested dicts."""
+    nested: dict[str, Any] = {}
+    for name, values in arrays.items():
+        *groups, last = name.split("/")
+        inner = nested
+        for group in groups:
+            inner = inner.setdefault(group, {})
+            if not isinstance(inner, dict):
+                break
+        else:
+            inner[last] = values
+    return nested
+
+
+def _put(archive: zipfile.ZipFile, name: str, column: Any, rows: NDArray[np.int64]) -> None:
+    """Write rows of a column block by block, because images on disk need not fit into memory."""
+    blocks = (
+        np.asarray(column[rows[start : start + _BLOCK_ROWS]])
+        for start in range(0, len(rows), _BLOCK_ROWS)
+    )
+    _put_rows(archive, name, column.dtype, (len(rows), *column.shape[1:]), blocks)
+
+
+def _put_rows(
+    archive: zipfile.ZipFile,
+    name: str,
+    dtype: np.dtype[Any],
+    shape: tuple[int, ...],
+    blocks: Iterable[NDArray[Any]],
+) -> None:
+    header = {"descr": npy.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+        npy.write_array_header_2_0(file, header)
+        for block in blocks:
+            file.write(block.tobytes())

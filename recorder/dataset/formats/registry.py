@@ -8,6 +8,7 @@ The module of a format has these functions; one that only writes has no `matches
                                                 writes the new file or the empty folder `path`;
                                                 returns one sentence for each thing lost
     local_path(name: str) -> Path               optional: the folder that `FORMAT:NAME` means
+    options_for(path: Path) -> dict             optional: further arguments of `write`
 """
 
 from __future__ import annotations

@@ -1,0 +1,128 @@
+"""Datasets from flat arrays of transitions, under the names that other tools use."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, SpaceError
+from mcaprl.recorder.dataset.arrays import description_of
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+
+NAMES = {
+    "observations": ("observations",),
+    "actions": ("actions",),
+    "rewards": ("rewards",),
+    "terminated": ("terminals", "terminations", "terminated"),
+    "truncated": ("timeouts", "truncations", "truncated"),
+    "next_observations": ("next_observations",),
+    "behavior_probs": ("behavior_probs",),
+}
+"""The names of each array of `Dataset.from_arrays`; the first that is there is read."""
+_REQUIRED = ("observations", "actions", "rewards", "terminated")
+_COLUMNS = ("rewards", "terminated", "truncated", "behavior_probs")
+
+
+def flat_dataset(found: Mapping[str, Any], where: object) -> Dataset:
+    """Return a dataset of flat arrays.
+
+    Without next observations, that of a terminal transition is the observation itself, and the
+    last transition before a timeout is left out, because its next observation is unknown.
+
+    Args:
+        found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
+        where: Name of the source, for errors and warnings.
+
+    Raises:
+        LogError: An array is missing.
+        SpaceError: The arrays have different lengths, or a log cannot store their dtype.
+    """
+    arrays = _named(found, where)
+    missing = [" or ".join(NAMES[name]) for name in _REQUIRED if name not in arrays]
+    if missing:
+        raise LogError(f"{where} has no {', '.join(missing)}; it has {', '.join(sorted(found))}")
+    for name in _COLUMNS:
+        if name in arrays:
+            arrays[name] = _one_column(arrays[name])
+    arrays.setdefault("truncated", np.zeros(len(arrays["rewards"]), bool))
+    try:
+        if "next_observations" in arrays:
+            return Dataset.from_arrays(**arrays)
+        return _without_next(arrays, where)
+    except SpaceError as error:
+        raise SpaceError(f"{where}: {error}") from error
+
+
+def rows_of_tree(tree: Any, rows: Any) -> Any:
+    """Return rows of an array or of nested dicts of arrays."""
+    if isinstance(tree, Mapping):
+        return {key: rows_of_tree(part, rows) for key, part in tree.items()}
+    return tree[rows]
+
+
+def joined_trees(trees: list[Any]) -> Any:
+    """Concatenate arrays, or nested dicts of arrays."""
+    if isinstance(trees[0], Mapping):
+        return {key: joined_trees([tree[key] for tree in trees]) for key in trees[0]}
+    return np.concatenate(trees)
+
+
+def _named(found: Mapping[str, Any], where: object) -> dict[str, Any]:
+    arrays = {}
+    for name, others in NAMES.items():
+        present = [other for other in others if other in found]
+        if len(present) > 1:
+            raise LogError(f"{where} has both {' and '.join(present)}: remove one of them")
+        if present:
+            arrays[name] = found[present[0]]
+    return arrays
+
+
+def _one_column(values: Any) -> NDArray[Any]:
+    """Return (N,) for an array (N, 1)."""
+    array = np.asarray(values)
+    return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
+
+
+def _without_next(arrays: Mapping[str, Any], where: object) -> Dataset:
+    observations, actions = arrays["observations"], np.asarray(arrays["actions"])
+    rewards, probs = arrays["rewards"], arrays.get("behavior_probs")
+    terminated, truncated = (arrays[name].astype(bool) for name in ("terminated", "truncated"))
+    for name in ("actions", *_COLUMNS):
+        if name in arrays and len(arrays[name]) != len(rewards):
+            raise SpaceError(f"there are {len(arrays[name])} {name}, but {len(rewards)} rewards")
+    ends = terminated | truncated
+    ends[-1:] = True
+    stops = (np.flatnonzero(ends) + 1).tolist()
+    episodes, dropped = [], 0
+    for start, stop in zip([0, *stops[:-1]], stops, strict=True):
+        is_terminal = bool(terminated[stop - 1])
+        last = stop if is_terminal else stop - 1
+        dropped += stop - last
+        steps, frames = slice(start, last), np.arange(start, last + 1)
+        episode = EpisodeArrays(
+            observations=rows_of_tree(observations, np.minimum(frames, stop - 1)),
+            actions=actions[steps],
+            rewards=rewards[steps],
+            terminated=is_terminal,
+            truncated=bool(truncated[stop - 1]),
+            behavior_probs=None if probs is None else probs[steps],
+        )
+        episodes.append(episode)
+    _warn(where, int(terminated.sum()), dropped)
+    return dataset_of(episodes, description_of("", observations, actions, None, None), where)
+
+
+def _warn(where: object, terminal: int, dropped: int) -> None:
+    found = []
+    if terminal:
+        found.append(f"the {terminal} observations after terminal steps repeat those before")
+    if dropped:
+        found.append(f"{dropped} last steps of episodes without a terminal step are left out")
+    if found:
+        warnings.warn(f"{where} has no next_observations: {', and '.join(found)}", stacklevel=5)

@@ -1,0 +1,94 @@
+"""Demonstrations in robomimic's HDF5 form: a group `data/demo_<i>` for each episode."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.dataset.arrays import description_of
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree
+
+
+def read_demos(file: Any, path: Path) -> Dataset:
+    """Read all demonstrations, in the order of their numbers.
+
+    A demonstration terminates if its last step is done; otherwise it is truncated. Without
+    `next_obs`, the last step of a truncated one is left out, because its next observation is
+    unknown.
+
+    Args:
+        file: Open HDF5 file.
+        path: Name of the source, for errors and warnings.
+
+    Raises:
+        LogError: The file has another form, or an array is missing.
+        SpaceError: A log cannot store a dtype.
+    """
+    data = nodes.group_in(file, "data")
+    names = sorted((name for name in data if name.startswith("demo_")), key=_number)
+    if not names:
+        raise LogError(f"{path}: the group data has no demo_0, demo_1, ...: unknown form of HDF5")
+    notes: dict[str, None] = {}
+    episodes = [_demo(nodes.group_in(data, name), f"{path}: {name}", notes) for name in names]
+    if notes:
+        warnings.warn(f"{path}: {', and '.join(notes)}", stacklevel=4)
+    actions = np.concatenate([episode.actions for episode in episodes])
+    metadata = description_of("", episodes[0].observations, actions, None, None)
+    return dataset_of(episodes, metadata, path)
+
+
+def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:
+    if not nodes.has(group, "obs"):
+        raise LogError(f"{where} has no observations: extract them with robomimic's scripts")
+    observations = nodes.tree_in(group, "obs")
+    actions, rewards = nodes.array_in(group, "actions"), nodes.array_in(group, "rewards")
+    dones = nodes.array_in(group, "dones").astype(bool) if nodes.has(group, "dones") else None
+    count = len(rewards)
+    is_done = dones is not None and count > 0 and bool(dones[-1])
+    if dones is not None and dones[:-1].any():
+        notes["dones before the last step of a demonstration are ignored"] = None
+    if nodes.has(group, "next_obs"):
+        following = nodes.tree_in(group, "next_obs")
+        _check_follows(observations, following, where)
+        frames = joined_trees([observations, rows_of_tree(following, slice(count - 1, count))])
+    elif is_done:
+        notes["without next_obs, the observation after the last step repeats the one before"] = None
+        frames = rows_of_tree(observations, np.minimum(np.arange(count + 1), count - 1))
+    else:
+        notes["without next_obs, the last step of a demonstration is left out"] = None
+        frames, count = observations, count - 1
+    return EpisodeArrays(
+        observations=frames,
+        actions=actions[:count],
+        rewards=rewards[:count],
+        terminated=is_done,
+        truncated=not is_done,
+    )
+
+
+def _check_follows(here: Any, there: Any, where: str) -> None:
+    """Check that each next observation is the observation of the following step."""
+    if isinstance(here, dict):
+        for key, part in here.items():
+            _check_follows(part, there.get(key), f"{where}/{key}")
+        return
+    if there is None or not np.array_equal(_bytes(here[1:]), _bytes(there[:-1])):
+        raise LogError(f"{where}: next_obs is not the observation of the following step")
+
+
+def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return an array as bytes, so that NaN equals NaN."""
+    return np.frombuffer(array.tobytes(), np.uint8)
+
+
+def _number(name: str) -> tuple[int, str]:
+    digits = name.removeprefix("demo_")
+    return (int(digits) if digits.isdecimal() else 0, name)

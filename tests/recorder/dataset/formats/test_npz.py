@@ -1,0 +1,219 @@
+"""Archives of NumPy arrays: ours come back whole, and those of others are read by usual names."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+
+import mcaprl
+from mcaprl import Dataset
+from mcaprl.errors import LogError, SpaceError
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.format.metadata import LogMetadata
+from tests.recorder.dataset.formats.minari_sets import Cameras
+from tests.support.strategies import transitions
+
+
+def _two_episodes() -> Dataset:
+    """Return episodes of two and one steps, the first with known times and probabilities."""
+    space = spaces.Dict(
+        {"pose": spaces.Dict({"x": spaces.Box(-9, 9, (2,), np.float32)}), "a b": spaces.Discrete(5)}
+    )
+    metadata = LogMetadata(space, spaces.Discrete(3), env_id="Toy-v0", policy="pid", seed="4")
+    first = EpisodeArrays(
+        observations={
+            "pose": {"x": np.array([[0, 1], [2, 3], [4, 5]], np.float32)},
+            "a b": np.array([0, 1, 4]),
+        },
+        actions=np.array([2, 0]),
+        rewards=np.array([0.1, -np.inf]),
+        terminated=True,
+        truncated=True,
+        behavior_probs=np.array([0.5, np.nan], np.float32),
+        times_ns=np.array([10, 20, 35]),
+        summary={"reason": "crash", "seed": 2**63 - 1, "policy": "pid", "options": "{}"},
+    )
+    second = EpisodeArrays(
+        observations={"pose": {"x": np.ones((2, 2), np.float32)}, "a b": np.array([3, 3])},
+        actions=np.array([1]),
+        rewards=np.array([-0.0]),
+        terminated=False,
+        truncated=False,
+        times_ns=np.array([40, 41]),
+    )
+    return dataset_of([first, second], metadata, "test")
+
+
+def _same(found: Dataset, data: Dataset) -> None:
+    assert found.fingerprint == data.fingerprint
+    assert found.metadata == data.metadata
+    assert [repr(e.summary) for e in found.episodes] == [repr(e.summary) for e in data.episodes]
+    for one, other in zip(found.episodes, data.episodes, strict=True):
+        assert one.log_time_ns.tolist() == other.log_time_ns.tolist()
+
+
+def test_a_dataset_comes_back_whole(tmp_path: Path) -> None:
+    data = _two_episodes()
+    assert data.to_npz(tmp_path / "toy.npz") == []
+    _same(Dataset.from_npz(tmp_path / "toy.npz"), data)
+    assert mcaprl.open(tmp_path / "toy.npz").sources == (tmp_path / "toy.npz",)
+
+
+def test_numpy_reads_the_arrays_by_their_usual_names(tmp_path: Path) -> None:
+    _two_episodes().to_npz(tmp_path / "toy.npz")
+    with np.load(tmp_path / "toy.npz", allow_pickle=False) as arrays:
+        assert arrays["observations/pose/x"].tolist() == [[0, 1], [2, 3], [1, 1]]
+        assert arrays["final_observations/pose/x"].tolist() == [[4, 5], [1, 1]]
+        assert arrays["observations:observation_a_b"].tolist() == [0, 1, 3]
+        assert arrays["actions"].tolist() == [2, 0, 1]
+        assert arrays["terminations"].tolist() == [False, True, False]
+        assert arrays["episode_lengths"].tolist() == [2, 1]
+        assert json.loads(str(arrays["mcaprl"]))["episodes"][0]["reason"] == "crash"
+
+
+@settings(max_examples=40)
+@given(given_arrays=transitions())
+def test_any_dataset_comes_back(given_arrays: dict[str, Any]) -> None:
+    data = Dataset.from_arrays(**given_arrays)
+    with TemporaryDirectory() as folder:
+        data.to_npz(f"{folder}/any.npz")
+        _same(mcaprl.open(f"{folder}/any.npz"), data)
+
+
+def test_images_are_read_from_disk_block_by_block(tmp_path: Path) -> None:
+    env = mcaprl.RecordMcap(Cameras(), tmp_path / "log.mcap", compression="none")
+    for seed in range(2):
+        env.reset(seed=seed)
+        for _ in range(5):
+            env.step(np.array([0, 1]))
+    env.close()
+    log = mcaprl.open(tmp_path / "log.mcap", images="mapped")
+    assert "on disk" in log.storage
+    log.to_npz(tmp_path / "log.npz")
+    _same(mcaprl.open(tmp_path / "log.npz"), log)
+    # The same data gives the same bytes.
+    log.to_npz(tmp_path / "again.npz")
+    assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "log.npz").read_bytes()
+
+
+@pytest.mark.parametrize("terminated", ["terminals", "terminations", "terminated"])
+@pytest.mark.parametrize("truncated", ["timeouts", "truncations", "truncated", None])
+def test_archives_of_others_are_read(
+    tmp_path: Path, terminated: str, truncated: str | None
+) -> None:
+    observations = np.array([[0.0], [1], [5], [6]], np.float32)
+    arrays: dict[str, Any] = {
+        "observations": observations,
+        "next_observations": observations + 1,
+        "actions": np.array([1, 0, 2, 1]),
+        "rewards": np.array([[1], [2], [3], [4]], np.float32),
+        terminated: np.array([0, 0, 0, 1], np.uint8),
+    }
+    if truncated is not None:
+        arrays[truncated] = np.array([[0], [1], [0], [0]], bool)
+    np.savez(tmp_path / "their.npz", **arrays)
+    found = mcaprl.open(tmp_path / "their.npz")
+    # Without a flag, the first episode ends where the observations do not follow each other.
+    assert found.episode_lengths.tolist() == [2, 2]
+    assert found.truncated.tolist() == [False, truncated is not None, False, False]
+    assert found.terminated.tolist() == [False, False, False, True]
+    assert found.frames.tolist() == [[0], [1], [2], [5], [6], [7]]
+    assert (found.action_space, found.rewards.tolist()) == (spaces.Discrete(3), [1, 2, 3, 4])
+
+
+def test_without_next_observations_the_last_step_is_left_out_unless_terminal(
+    tmp_path: Path,
+) -> None:
+    arrays: dict[str, Any] = {
+        "observations/x": np.arange(7.0)[:, None],
+        "observations/arm/y": np.arange(7),
+        "actions": np.arange(14, dtype=np.float32).reshape(7, 2),
+        "rewards": np.arange(7.0),
+        "terminals": np.array([0, 0, 1, 0, 0, 0, 0], bool),
+        "timeouts": np.array([0, 0, 0, 0, 1, 0, 0], bool),
+    }
+    np.savez_compressed(tmp_path / "their.npz", **arrays)
+    message = "1 observations after terminal steps repeat those before, and 2 last steps"
+    with pytest.warns(UserWarning, match=message):
+        found = mcaprl.open(tmp_path / "their.npz")
+    assert found.episode_lengths.tolist() == [3, 1, 1]
+    assert found.frames["x"].ravel().tolist() == [0, 1, 2, 2, 3, 4, 5, 6]
+    assert found.frames["arm"]["y"].tolist() == [0, 1, 2, 2, 3, 4, 5, 6]
+    assert found.rewards.tolist() == [0, 1, 2, 3, 5]
+    assert found.actions.tolist() == [[0, 1], [2, 3], [4, 5], [6, 7], [10, 11]]
+    assert np.flatnonzero(found.terminated).tolist() == [2]
+    assert np.flatnonzero(found.truncated).tolist() == [3]
+
+
+def _usual(**changes: Any) -> dict[str, Any]:
+    arrays = {
+        "observations": np.zeros((2, 3)),
+        "next_observations": np.zeros((2, 3)),
+        "actions": np.zeros(2, np.int64),
+        "rewards": np.zeros(2),
+        "terminals": np.zeros(2, bool),
+        **changes,
+    }
+    return {name: values for name, values in arrays.items() if values is not None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"rewards": None, "terminals": None}, LogError, "no rewards, terminals or terminations"),
+        ({"terminations": np.zeros(2)}, LogError, "both terminals and terminations"),
+        ({"actions": np.zeros(3, np.int64)}, SpaceError, r"actions has shape \(3,\)"),
+        ({"actions": np.zeros(3, int), "next_observations": None}, SpaceError, "3 actions"),
+        ({"observations": np.array([["a"], ["b"]])}, SpaceError, "no Box can hold"),
+        ({"rewards": np.array([object(), None])}, LogError, "not a readable .npz"),
+        ({"terminals": np.array([0.5, 0])}, SpaceError, "terminated are not flags"),
+    ],
+)
+def test_other_arrays_are_refused_by_name(
+    tmp_path: Path, changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    np.savez(tmp_path / "odd.npz", **_usual(**changes))
+    with pytest.raises(error, match=message) as caught:
+        mcaprl.open(tmp_path / "odd.npz")
+    assert "odd.npz" in str(caught.value)
+
+
+def test_damaged_archives_give_one_clear_line(tmp_path: Path) -> None:
+    path = tmp_path / "toy.npz"
+    _two_episodes().to_npz(path)
+    whole = path.read_bytes()
+    with np.load(path) as archive:
+        arrays = dict(archive)
+
+    def fails(message: str) -> None:
+        with pytest.raises(LogError, match=message) as caught:
+            mcaprl.open(path)
+        assert "\n" not in str(caught.value)
+
+    path.write_bytes(whole[:-30])
+    fails("not a readable .npz file")
+    path.write_bytes(b"")
+    fails("not a readable .npz file")
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    fails("not a readable .npz file: File is not a zip file")
+    np.savez(path, **{**arrays, "episode_lengths": arrays["episode_lengths"][:1]})
+    fails("an array is missing or too short")
+    np.savez(path, **{name: values for name, values in arrays.items() if name != "log_time_ns"})
+    fails("an array is missing or too short: 'log_time_ns'")
+    np.savez(path, **{**arrays, "mcaprl": np.array('{"metadata": 1}')})
+    fails("the array mcaprl is damaged")
+    with zipfile.ZipFile(path, "w") as archive_file:
+        # An array of an exabyte in a file of some bytes.
+        header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000000,), }"
+        data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
+        archive_file.writestr("rewards.npy", data)
+    fails("not a readable .npz file")
