@@ -100,8 +100,8 @@ $(VENV)/.rivals: $(SETTINGS) benchmarks/rivals.txt | $(VENV)/bin/python
 	$(VENV)/rivals/bin/python -m pip install -qq --no-deps d3rlpy==2.8.1 scope-rl==0.2.1
 	@touch $@
 
-# LeRobot, which the tests run in an environment of its own: it requires older versions of PyTorch,
-# NumPy and pandas than constraints.txt has. It runs with these; pip does not resolve it.
+# LeRobot, which the tests run in a separate environment: it requires older versions of PyTorch, NumPy
+# and pandas than constraints.txt has. It runs with those of tests/lerobot.txt, without its pins.
 $(VENV)/.lerobot: tests/lerobot.txt | $(VENV)/bin/python
 	@echo "installing into $(VENV)/lerobot"
 	$(BIN)/python -m venv $(VENV)/lerobot

@@ -220,7 +220,8 @@ def _numbers(name: str, column: Any) -> NDArray[Any]:
     while True:
         if column.null_count:
             raise LogError(f"{name} has missing values")
-        if not (types.is_list(column.type) or types.is_fixed_size_list(column.type)):
+        kind = column.type
+        if not (types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)):
             break
         column = column.flatten()
     if not (types.is_integer(column.type) or types.is_floating(column.type)) and (

@@ -236,7 +236,8 @@ def _values_and_space(
     """Return values (N, *shape) in a dtype of a space, and the space."""
     if values.dtype.kind == "b":
         return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
-    if is_action and values.shape[1:] == (1,) and values.dtype.kind in "iu":
+    is_index = values.shape[1:] == (1,) and values.dtype.kind in "iu" and (values >= 0).all()
+    if is_action and is_index:
         scalars = values[:, 0].astype(np.int64)
         return scalars, action_space_of(scalars)
     return values, box_of(values)

@@ -467,6 +467,24 @@ def test_a_done_frame_in_the_middle_ends_an_episode(written: Path) -> None:
     assert dataset.behavior_probs[0] == 0.25
 
 
+def test_lists_of_any_arrow_type_are_read(written: Path) -> None:
+    expected = Dataset.from_lerobot(written)
+    for kind in (pa.list_(pa.float64()), pa.large_list(pa.float32())):
+        _edited(
+            written,
+            lambda t, kind=kind: _with(t, "observation.state", t["observation.state"].cast(kind)),
+        )
+        _same_values(expected, Dataset.from_lerobot(written))
+
+
+def test_negative_integers_are_no_indexes_of_actions(written: Path) -> None:
+    shutil.rmtree(written / "meta/mcaprl")
+    _edited(written, lambda t: _with(t, "action", pa.array([1, -1, 0, 1, 2])))
+    dataset, _ = _opened(written)
+    assert dataset.actions.tolist() == [[1], [-1], [0], [1]]
+    assert isinstance(dataset.action_space, spaces.Box)
+
+
 def test_irregular_timestamps_become_times(written: Path) -> None:
     shutil.rmtree(written / "meta/mcaprl")
     times = pa.array([0, 0.1, 0.35, 0, 0.1], pa.float32())
