@@ -1,0 +1,329 @@
+"""Stable-Baselines3's replay buffers, filled as its algorithms fill them.
+
+SB3 stores images with the channels first, actions of a bounded Box scaled to [-1, 1], and rewards
+and float64 actions as float32. It marks the end of an episode in `dones`, and also in `timeouts` if
+the episode was truncated, so that the value of the last observation counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, SpaceError, UsageError, import_extra
+from mcaprl.recorder.dataset.arrays import with_fresh_times
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.format.metadata import DEFAULT_STEP_DURATION_NS, LogMetadata
+from mcaprl.recorder.format.spaces import (
+    MIN_IMAGE_EDGE,
+    Leaf,
+    action_leaf,
+    nest,
+    observation_leaves,
+)
+
+Order = tuple[int, int, int]
+
+
+def to_buffer(
+    dataset: Dataset, *, device: str = "cpu", buffer_class: Any = None, **options: Any
+) -> Any:
+    """Return a replay buffer that contains all transitions, in order.
+
+    Args:
+        dataset: Episodes to copy.
+        device: Torch device of the samples.
+        buffer_class: Class of the buffer, such as `NStepReplayBuffer`; default: `ReplayBuffer`, or
+            `DictReplayBuffer` for a Dict space.
+        options: Further arguments of the buffer. The default of `buffer_size` is the number of
+            rows that the dataset needs. With `optimize_memory_usage`, SB3 overwrites the final
+            observations, and with `handle_timeout_termination=False` it learns from truncations as
+            from terminations.
+
+    Raises:
+        SpaceError: SB3 does not support a space, or a number is too large for float32.
+        UsageError: `buffer_size` is too small, or `n_envs` is not 1.
+        MissingExtraError: Stable-Baselines3 is not installed.
+    """
+    buffers = import_extra("stable_baselines3.common.buffers", "online")
+    observation_space, action_space = dataset.observation_space, dataset.action_space
+    _check_spaces(observation_space, action_space)
+    if options.pop("n_envs", 1) != 1:
+        raise UsageError("n_envs must be 1: all episodes are stored as those of one environment")
+    count = len(dataset)
+    # If next observations are the following row's observations, the last one needs a row, too.
+    needed = count + bool(options.get("optimize_memory_usage"))
+    size = options.pop("buffer_size", needed)
+    if size < needed:
+        raise UsageError(f"buffer_size is {size}, but the dataset needs {needed} rows")
+    if buffer_class is None:
+        is_dict = isinstance(observation_space, spaces.Dict)
+        buffer_class = buffers.DictReplayBuffer if is_dict else buffers.ReplayBuffer
+    stored_space = _converted(observation_space, _sb3_order)
+    buffer = buffer_class(size, stored_space, action_space, device=device, **options)
+    _fill_observations(buffer, dataset)
+    actions = _scaled(action_space, dataset.actions).reshape(count, -1)
+    buffer.actions[:count, 0] = _rounded("action", actions, buffer.actions.dtype)
+    buffer.rewards[:count, 0] = _rounded("reward", dataset.rewards, buffer.rewards.dtype)
+    is_end = np.zeros(count, bool)
+    is_end[np.cumsum(dataset.episode_lengths) - 1] = True
+    buffer.dones[:count, 0] = is_end
+    if buffer.handle_timeout_termination:
+        buffer.timeouts[:count, 0] = is_end & ~dataset.terminated
+    buffer.pos, buffer.full = count % size, count == size
+    return buffer
+
+
+def from_buffer(
+    buffer: Any, *, channels_last: bool = True, scaled_actions: bool = True, lossy: bool = False
+) -> Dataset:
+    """Copy the transitions of a replay buffer: one environment after the other, from old to new.
+
+    If the buffer was full, the first episode of an environment lacks its overwritten beginning.
+
+    Args:
+        buffer: `ReplayBuffer` or `DictReplayBuffer`.
+        channels_last: Whether images are returned as (height, width, channels), as environments
+            have them, and not as SB3 transposes them.
+        scaled_actions: Whether actions of a bounded Box were scaled to [-1, 1], as SB3's algorithms
+            do. They are scaled back, which rounds them.
+        lossy: Whether a buffer with `handle_timeout_termination=False` is read, in which
+            truncations and terminations are the same: all become terminations. With
+            `optimize_memory_usage`, the buffer has no final observations: each repeats the one
+            before it.
+
+    Raises:
+        SpaceError: A log cannot hold a space or dtype of the data.
+        LogError: The buffer is empty, or has lost information and `lossy` is not set.
+    """
+    rows = _rows_in_order(buffer)
+    if not lossy and not buffer.handle_timeout_termination and buffer.dones[rows].any():
+        raise LogError(
+            "the replay buffer has handle_timeout_termination=False, so truncations and"
+            " terminations look the same; pass lossy=True to take all for terminations"
+        )
+    order_of = _environment_order if channels_last else _stored_order
+    space = _converted(buffer.observation_space, order_of)
+    orders = [order_of(part) for _, part in _parts(buffer.observation_space)]
+    parts = [
+        _of_environment(buffer, number, rows, space, orders, scaled_actions=scaled_actions)
+        for number in range(buffer.n_envs)
+    ]
+    joined = Dataset.concatenate(parts)
+    columns = with_fresh_times(joined._transitions, 0, DEFAULT_STEP_DURATION_NS)
+    return Dataset(columns, LogMetadata.from_strings(joined.metadata))
+
+
+def _fill_observations(buffer: Any, dataset: Dataset) -> None:
+    count = len(dataset)
+    for leaf, part in _parts(dataset.observation_space):
+        stored, order = leaf.of(buffer.observations), _sb3_order(part)
+        here, following = (
+            _reordered(np.asarray(leaf.of(values)), order).reshape(count, *stored.shape[2:])
+            for values in (dataset.observations, dataset.next_observations)
+        )
+        stored[:count, 0] = here
+        if buffer.optimize_memory_usage:
+            stored[count % len(stored), 0] = following[-1]
+        else:
+            leaf.of(buffer.next_observations)[:count, 0] = following
+
+
+def _rows_in_order(buffer: Any) -> NDArray[np.int64]:
+    """Return the indexes of a buffer's valid rows, from old to new.
+
+    Raises:
+        LogError: There are none.
+    """
+    # If next observations are shared, the newest one has overwritten the oldest observation.
+    oldest = buffer.pos + buffer.optimize_memory_usage if buffer.full else 0
+    stop = buffer.pos + buffer.buffer_size if buffer.full else buffer.pos
+    if oldest >= stop:
+        raise LogError("the replay buffer has no transitions")
+    rows: NDArray[np.int64] = np.arange(oldest, stop) % buffer.buffer_size
+    return rows
+
+
+def _of_environment(
+    buffer: Any,
+    number: int,
+    rows: NDArray[np.int64],
+    space: spaces.Space[Any],
+    orders: Sequence[Order | None],
+    *,
+    scaled_actions: bool,
+) -> Dataset:
+    """Return the transitions of one environment.
+
+    Args:
+        buffer: Replay buffer.
+        number: Index of the environment.
+        rows: Indexes of the buffer's rows, from old to new.
+        space: Space of the observations to return.
+        orders: Order of the axes of each leaf of `space` in the buffer; None if it is the same.
+        scaled_actions: See `from_buffer`.
+    """
+    dones, timeouts = (array[rows, number] > 0 for array in (buffer.dones, buffer.timeouts))
+    leaves = observation_leaves(space)
+    here: list[NDArray[Any]] = []
+    following: list[NDArray[Any]] = []
+    for leaf, order in zip(leaves, orders, strict=True):
+        both = _stored_observations(buffer, leaf, number, rows, dones)
+        for parts, values in zip((here, following), both, strict=True):
+            parts.append(_reordered(values, order).reshape(len(rows), *leaf.shape))
+    actions = buffer.actions[rows, number]
+    actions = actions.reshape(len(rows), *action_leaf(buffer.action_space).shape)
+    return Dataset.from_arrays(
+        observations=nest(leaves, here),
+        next_observations=nest(leaves, following),
+        actions=_unscaled(buffer.action_space, actions) if scaled_actions else actions,
+        rewards=buffer.rewards[rows, number],
+        terminated=dones & ~timeouts,
+        truncated=dones & timeouts,
+        observation_space=space,
+        action_space=buffer.action_space,
+    )
+
+
+def _stored_observations(
+    buffer: Any, leaf: Leaf, number: int, rows: NDArray[np.int64], dones: NDArray[np.bool_]
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the observations and next observations of these rows of an environment."""
+    stored = leaf.of(buffer.observations)[:, number]
+    here = stored[rows]
+    if not buffer.optimize_memory_usage:
+        return here, leaf.of(buffer.next_observations)[rows, number]
+    following = stored[(rows + 1) % len(stored)]
+    # After a row that ends an episode is the first observation of the next one.
+    lost = np.flatnonzero(dones[:-1])
+    following[lost] = here[lost]
+    return here, following
+
+
+def _parts(space: spaces.Space[Any]) -> list[tuple[Leaf, spaces.Space[Any]]]:
+    """Return the leaves of an observation space without nested Dicts, and their spaces."""
+    parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+    return list(zip(observation_leaves(space), parts, strict=True))
+
+
+def _check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """Check that SB3's algorithms can learn from data in these spaces.
+
+    Raises:
+        SpaceError: They cannot.
+    """
+    if isinstance(observation_space, spaces.Dict):
+        for key, part in observation_space.spaces.items():
+            if isinstance(part, spaces.Dict):
+                raise SpaceError(f"observation['{key}'] is a Dict; SB3 has no Dicts in Dicts")
+    for leaf, part in _parts(observation_space):
+        if isinstance(part, spaces.Box) and not leaf.shape:
+            raise SpaceError(f"{leaf.name} is a Box of shape (); SB3 needs at least (1,)")
+        _check_integers(leaf.name, part)
+    _check_integers("action", action_space)
+    if isinstance(action_space, spaces.MultiBinary) and len(action_space.shape) > 1:
+        raise SpaceError(f"action is {action_space}; SB3 has MultiBinary actions of one dimension")
+    if isinstance(action_space, spaces.Box) and action_space.dtype.kind != "f":
+        raise SpaceError(f"action is a Box of {action_space.dtype}; SB3 has Boxes of floats")
+
+
+def _check_integers(name: str, space: spaces.Space[Any]) -> None:
+    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        return
+    if np.any(space.start):
+        raise SpaceError(f"{name} is {space}; SB3 has {type(space).__name__} spaces from 0 only")
+    if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
+        raise SpaceError(f"{name} is {space}; SB3 has MultiDiscrete spaces of one dimension")
+
+
+def _converted(
+    space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
+) -> spaces.Space[Any]:
+    """Return an observation space with the axes of its parts in the orders of `order_of`."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
+    order = order_of(space)
+    if order is None or not isinstance(space, spaces.Box):
+        return space
+    return spaces.Box(space.low.transpose(order), space.high.transpose(order), dtype=np.uint8)
+
+
+def _sb3_order(space: spaces.Space[Any]) -> Order | None:
+    """Return the order in which SB3 stores the axes of an environment's image."""
+    return (2, 0, 1) if _is_image(space) and np.argmin(space.shape or ()) > 0 else None
+
+
+def _environment_order(space: spaces.Space[Any]) -> Order | None:
+    """Return the order in which an environment has the axes of an image that SB3 stored."""
+    if not _is_image(space):
+        return None
+    channels, height, width = space.shape or ()
+    return (1, 2, 0) if channels < MIN_IMAGE_EDGE <= min(height, width) else None
+
+
+def _stored_order(space: spaces.Space[Any]) -> Order | None:
+    """Return None: the axes stay as SB3 stored them."""
+    return None
+
+
+def _is_image(space: spaces.Space[Any]) -> bool:
+    if not isinstance(space, spaces.Box) or len(space.shape) != 3 or space.dtype != np.uint8:
+        return False
+    return not space.low.any() and bool((space.high == 255).all())
+
+
+def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
+    """Return rows (N, *shape) with the axes of a row in this order."""
+    return values if order is None else values.transpose(0, *(axis + 1 for axis in order))
+
+
+def _scaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
+    """Return actions as SB3 stores them: those of a bounded Box in [-1, 1].
+
+    Raises:
+        SpaceError: An action cannot be scaled.
+    """
+    if not isinstance(space, spaces.Box) or not space.is_bounded():
+        return actions
+    with np.errstate(all="ignore"):
+        scaled: NDArray[Any] = 2.0 * ((actions - space.low) / (space.high - space.low)) - 1.0
+    if not np.isfinite(scaled).all():
+        raise SpaceError(f"actions in {space} cannot be scaled to [-1, 1], as SB3 stores them")
+    return scaled
+
+
+def _rounded(name: str, values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return numbers in the dtype of the buffer.
+
+    Raises:
+        SpaceError: A number is too large for the dtype.
+    """
+    with np.errstate(over="ignore"):
+        found = values.astype(dtype)
+    changed = values[np.isinf(found) & ~np.isinf(values)]
+    if len(changed):
+        raise SpaceError(f"{name} {changed[0]} is too large for {dtype}, in which SB3 stores it")
+    return found
+
+
+def _unscaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
+    """Return actions of an environment for those that SB3 stored.
+
+    Raises:
+        SpaceError: An action is not in [-1, 1].
+    """
+    if not isinstance(space, spaces.Box) or not space.is_bounded():
+        return actions
+    if not (np.abs(actions) <= 1).all():
+        raise SpaceError(
+            "the replay buffer has actions outside [-1, 1], so they are not scaled as SB3 scales"
+            " them; pass scaled_actions=False"
+        )
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    found = low + 0.5 * (actions.astype(np.float64) + 1.0) * (high - low)
+    unscaled: NDArray[Any] = found.astype(space.dtype)
+    return unscaled
