@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,7 +26,7 @@ from mcaprl.cli import run
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.dataset.formats.lerobot import tables, writer
-from mcaprl.recorder.dataset.formats.lerobot.features import Feature
+from mcaprl.recorder.dataset.formats.lerobot.features import Feature, image_of
 from mcaprl.recorder.dataset.formats.lerobot.infos import info_features, read_infos, write_infos
 from mcaprl.recorder.dataset.formats.lerobot.statistics import QUANTILES, describe, pooled, sampled
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -34,7 +35,7 @@ from tests.support.strategies import transitions
 
 pa = pytest.importorskip("pyarrow", reason="needs the extra tables")
 parquet = pytest.importorskip("pyarrow.parquet")
-pytest.importorskip("PIL", reason="needs Pillow")
+images = pytest.importorskip("PIL.Image", reason="needs Pillow")
 
 _GOLDEN = Path(__file__).parents[3] / "golden"
 _PROGRAM = Path(__file__).parents[3] / "support/run_lerobot.py"
@@ -215,6 +216,27 @@ def test_the_files_have_lerobots_names_types_and_numbers(tmp_path: Path) -> None
     assert episodes[0]["stats/next.reward/q50"] == [0.5]
     # The gray images have the values 0, 10 and 20.
     assert episodes[0]["stats/observation.images.gray/mean"] == [[[pytest.approx(10 / 255)]]]
+
+
+@pytest.mark.parametrize(
+    ("values", "mode", "kind", "shape"),
+    [
+        (np.array([[0, 1], [256, 65535]], np.uint16), None, "PNG", (2, 2, 1)),
+        (np.array([[0.1, np.inf], [-1, 7]], np.float32), None, "TIFF", (2, 2, 1)),
+        (np.array([[0, 255], [7, 9]], np.uint8), None, "PNG", (2, 2, 1)),
+        (np.array([[[1, 2, 3]], [[4, 5, 6]]], np.uint8), "P", "PNG", (2, 1, 3)),
+    ],
+)
+def test_image_files_of_all_depths(
+    values: NDArray[Any], mode: str | None, kind: str, shape: tuple[int, ...]
+) -> None:
+    file = BytesIO()
+    image = images.fromarray(values)
+    # The colors of a palette are those of the pixels, because there are few of them.
+    (image if mode is None else image.convert(mode, palette=1, colors=2)).save(file, kind)
+    found = image_of("observation.image", file.getvalue())
+    assert (found.shape, found.dtype) == (shape, values.dtype)
+    np.testing.assert_array_equal(found, values.reshape(shape))
 
 
 def test_pandas_finds_the_tasks_as_the_index(tmp_path: Path) -> None:
