@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up_each
 from mcaprl.recorder.format.reading import Columns, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
@@ -121,7 +122,7 @@ class EpisodeTopic:
             columns[name] = columns[name].astype(bool)
         values = {name: columns[name].tolist() for name in fields if name in columns}
         if "seed" in values:
-            values["seed"] = [None if seed < 0 else seed for seed in values["seed"]]
+            values["seed"] = list(map(messages.seed_of, values["seed"]))
         defaults, count = EpisodeSummary._field_defaults, len(values["length"])
         every = [values[name] if name in values else [defaults[name]] * count for name in fields]
         return list(map(EpisodeSummary._make, zip(*every, strict=True)))

@@ -69,7 +69,7 @@ def episode_table(columns: Transitions) -> Any:
         "reason": arrow.string(),
         "policy": arrow.string(),
         "epsilon": arrow.float64(),
-        "seed": arrow.int64(),
+        "seed": arrow.uint64(),
         "options": arrow.string(),
     }
     rows = [episode._asdict() | {"episode": k} for k, episode in enumerate(columns.episodes)]

@@ -42,6 +42,8 @@ string policy
 # Options passed to reset(), as JSON.
 string options
 """
+MAX_SEED = 2**64 - 2
+"""Largest seed that can be stored."""
 INFO, WARN = 20, 30
 """Levels of log lines."""
 # CDR: the encapsulation header, then the fields, aligned relative to the end of the header.
@@ -103,11 +105,21 @@ def episode_message(
     policy: str,
     options: str,
 ) -> bytes:
-    """Encode the fields of `EPISODE_TEXT` as CDR bytes; a `seed` of None is stored as -1."""
-    times, counts = (start_time_ns, end_time_ns, -1 if seed is None else seed), (episode, length)
+    """Encode the fields of `EPISODE_TEXT` as CDR bytes."""
+    times, counts = (start_time_ns, end_time_ns, stored_seed(seed)), (episode, length)
     data = bytearray(_ENCAPSULATION)
     data += _EPISODE_START.pack(total_reward, *times, epsilon, *counts, terminated, truncated)
     return bytes(_append_strings(data, reason, policy, options))
+
+
+def stored_seed(seed: int | None) -> int:
+    """Return a seed as it is stored: -1 for None; from 2^63 on, it is less by 2^64."""
+    return -1 if seed is None else seed - 2**64 * (seed >= 2**63)
+
+
+def seed_of(stored: int) -> int | None:
+    """Return the seed that `stored_seed` stored."""
+    return None if stored == -1 else stored % 2**64
 
 
 def text_message(text: str) -> bytes:

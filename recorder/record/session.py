@@ -14,6 +14,7 @@ import numpy as np
 
 from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.files import check_target, locked_file
+from mcaprl.recorder.format import messages
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
@@ -108,13 +109,13 @@ class EpisodeLog:
         """Check that episodes with these seeds can be recorded.
 
         Raises:
-            UsageError: The recording is closed, or a seed does not fit 63 bits.
+            UsageError: The recording is closed, or a seed is too large.
         """
         if self.closed:
             raise UsageError(f"{self.log.mcap.path} is closed; record to another file")
         for seed in seeds:
-            if seed is not None and not 0 <= seed < 2**63:
-                raise UsageError(f"seed {seed}: a seed must be from 0 to 2**63 - 1")
+            if seed is not None and not 0 <= seed <= messages.MAX_SEED:
+                raise UsageError(f"seed {seed}: a seed must be from 0 to 2**64 - 2")
 
     def begin(self, display: Display) -> None:
         """Begin the display messages of the next episode; start a new file if this one is full.

@@ -138,7 +138,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
         Raises:
             SpaceError: An observation does not fit its space.
-            UsageError: The recording is closed, or a seed does not fit 63 bits.
+            UsageError: The recording is closed, or a seed is too large.
         """
         count = self.num_envs
         seeds = [seed + k for k in range(count)] if isinstance(seed, int) else seed

@@ -138,7 +138,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             SpaceError: The observation does not fit its space.
-            UsageError: The recording is closed, or the seed does not fit 63 bits.
+            UsageError: The recording is closed, or the seed is too large.
         """
         self._recording.check_can_begin([seed])
         self._interrupt()

@@ -61,7 +61,8 @@ def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> 
     description = {"metadata": dataset.metadata, "features": names, "infos": infos}
     write_json(folder / "description.json", description)
     rows = [episode.summary._asdict() for episode in dataset.episodes]
-    columns = {name: arrow.array([row[name] for row in rows]) for name in rows[0]}
+    types = {"seed": arrow.uint64()}
+    columns = {name: arrow.array([row[name] for row in rows], types.get(name)) for name in rows[0]}
     times = [episode.log_time_ns.tolist() for episode in dataset.episodes]
     columns["log_time_ns"] = arrow.array(times, arrow.list_(arrow.int64()))
     write_table(columns, folder / "episodes.parquet")

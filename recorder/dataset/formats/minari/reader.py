@@ -32,6 +32,7 @@ from mcaprl.recorder.dataset.formats.minari.description import (
     read_description,
 )
 from mcaprl.recorder.dataset.formats.minari.spaces import may_be_jpeg
+from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 
 _FLAGS = ("terminations", "truncations")
@@ -189,12 +190,18 @@ def _summary(attributes: Mapping[str, Any], where: str) -> dict[str, Any]:
         summary: dict[str, Any] = {name: str(own[name]) for name in _OWN_TEXTS if name in own}
         summary["epsilon"] = float(own.get("epsilon", math.nan))
         if attributes.get("seed") is not None:
-            summary["seed"] = int(attributes["seed"])
+            summary["seed"] = _seed(int(attributes["seed"]))
         if "options" not in summary and attributes.get("options"):
             summary["options"] = json.dumps(attributes["options"])
         return summary
     except (ValueError, TypeError, AttributeError) as error:
         raise LogError(f"{where}: the attributes cannot be read: {error}") from error
+
+
+def _seed(seed: int) -> int:
+    if not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"a log cannot store the seed {seed}")
+    return seed
 
 
 def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:

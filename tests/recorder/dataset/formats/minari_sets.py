@@ -80,11 +80,12 @@ def collect(
     data_format: str = "hdf5",
     jpeg: bool = False,
     infos: bool = False,
+    seeded: bool = True,
     options: Sequence[dict[str, Any] | None] = (None, {"limit": 3}, {"limit": 4, "task": "turn"}),
 ) -> Any:
     """Collect episodes with Minari, and record the same episodes as a log.
 
-    The seeds are 3, 4, ..., and the actions are random.
+    The seeds are 3, 4, ... or, if not `seeded`, drawn by Minari. The actions are random.
 
     Returns:
         The `MinariDataset`.
@@ -96,7 +97,7 @@ def collect(
         recorded, data_format=data_format, jpeg_encoding=jpeg, record_infos=infos
     )
     for seed, option in enumerate(options, 3):
-        collector.reset(seed=seed, options=option)
+        collector.reset(seed=seed if seeded else None, options=option)
         collector.action_space.seed(seed)
         is_over = False
         while not is_over:

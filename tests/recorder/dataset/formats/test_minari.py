@@ -185,6 +185,23 @@ def test_minari_appends_splits_and_combines_what_is_written(minari: Any) -> None
     assert mcaprl.open("minari:both-v0").rewards.tolist() == [0.1, 2, -0.0, 3, 0.1, 2, -0.0]
 
 
+@pytest.mark.parametrize("seed", [0, 2**63 - 1, 2**63, 2**64 - 2])
+def test_seeds_that_minari_draws_by_itself_are_kept(
+    minari: Any, tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("secrets.randbits", lambda bits: seed)
+    collect(Cameras(), "drawn-v0", log=tmp_path / "log.mcap", seeded=False)
+    log, found = mcaprl.open(tmp_path / "log.mcap"), mcaprl.open("minari:drawn-v0")
+    assert found.fingerprint == log.fingerprint
+    assert _summaries(found, "seed") == _summaries(log, "seed") == [(seed,)] * 3
+    found.save(tmp_path / "saved.mcap")
+    mcaprl.open(tmp_path / "saved.mcap").to_minari("minari:again-v0")
+    assert _summaries(mcaprl.open("minari:again-v0"), "seed") == [(seed,)] * 3
+    found.to_lerobot(tmp_path / "lerobot")
+    assert _summaries(mcaprl.open(tmp_path / "lerobot"), "seed") == [(seed,)] * 3
+    assert found.to_arrow("episodes")["seed"].to_pylist() == [seed] * 3
+
+
 def test_nothing_is_lost_on_the_way_back(tmp_path: Path) -> None:
     data = _vector(options='{"start": {"x": 0.5, "name": "a b"}, "lanes": [1, 2], "on": true}')
     assert data.to_minari(tmp_path / "toy-v0") == []
