@@ -25,7 +25,7 @@ help:
 demo: $(VENV)/.demo
 	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
 
-test: $(VENV)/.dev $(VENV)/.lerobot tests/node/node_modules
+test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.rivals tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 faults: $(VENV)/.dev

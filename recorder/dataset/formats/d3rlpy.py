@@ -1,10 +1,367 @@
-"""Placeholder until the module is written."""
+"""d3rlpy's episodes: `MDPDataset` and other replay buffers, and the HDF5 files of `dump`.
+
+An episode of d3rlpy has as many observations as actions. If it is terminated, each step is a
+transition, and the next observation of the last one is zero. Otherwise the last step is no
+transition: it only has the next observation of the step before it. So an episode that was not
+terminated is stored with one step more, whose observation is the final one, and whose action and
+reward are zero.
+
+Images have their channels first, other tensors are vectors, and a Dict is a list of arrays. The
+file has a group `mcaprl` with what d3rlpy has no place for; d3rlpy does not read it.
+"""
 
 from __future__ import annotations
 
+import itertools
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, MissingExtraError, SpaceError, import_extra
+from mcaprl.recorder.dataset.arrays import action_space_of, box_of
+from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.npz import OWN, description_text, parse_description
+from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
+from mcaprl.recorder.format.spaces import (
+    MIN_IMAGE_EDGE,
+    Leaf,
+    action_leaf,
+    leaves_of,
+    nest,
+    observation_leaves,
+)
+
+VERSION = "2.1"
+_KEYS = ("observations", "actions", "rewards", "terminated")
+_DESCRIPTION = "description"
 
 
 def matches(path: Path) -> bool:
-    """Return False."""
-    return False
+    """Return whether a path is a file of d3rlpy's `dump`."""
+    if not nodes.is_hdf5(path):
+        return False
+    with nodes.opened(path) as file:
+        return all(nodes.has(file, name) for name in ("columns", "num_episodes", "version"))
+
+
+def to_mdp_dataset(dataset: Dataset) -> Any:
+    """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
+
+    Raises:
+        SpaceError: d3rlpy does not support the action space.
+        MissingExtraError: d3rlpy is not installed.
+    """
+    _check_action_space(dataset.action_space)
+    try:
+        d3rlpy = import_extra("d3rlpy", "")
+    except MissingExtraError as error:
+        raise MissingExtraError(
+            "d3rlpy is not installed: pip install --no-deps d3rlpy, and what it imports:"
+            " docs/formats.md lists it"
+        ) from error
+    space, kinds = dataset.action_space, d3rlpy.ActionSpace
+    # Without them, d3rlpy takes whole numbers for discrete actions, and the largest one that occurs
+    # for the last one.
+    if isinstance(space, spaces.Discrete):
+        action_space, action_size = kinds.DISCRETE, int(space.n)
+    else:
+        action_space, action_size = kinds.CONTINUOUS, action_leaf(space).size
+    parts = list(_episodes_of(dataset))
+    flags = [_flags(part) for part in parts]
+    return d3rlpy.dataset.MDPDataset(
+        observations=_joined([part["observations"] for part in parts]),
+        actions=np.concatenate([part["actions"] for part in parts]),
+        rewards=np.concatenate([part["rewards"] for part in parts]),
+        terminals=np.concatenate([terminals for terminals, _ in flags]),
+        timeouts=np.concatenate([timeouts for _, timeouts in flags]),
+        action_space=action_space,
+        action_size=action_size,
+    )
+
+
+def from_buffer(buffer: Any) -> Dataset:
+    """Copy the episodes of a replay buffer of d3rlpy.
+
+    A terminated episode has no final observation in d3rlpy: the one before it is repeated.
+
+    Raises:
+        SpaceError: A log cannot hold a space or dtype of the data.
+        LogError: There are no transitions.
+    """
+    info = buffer.dataset_info
+    discrete = spaces.Discrete(int(info.action_size))
+    episodes = [{name: getattr(e, name) for name in _KEYS} for e in buffer.episodes]
+    action_space = discrete if info.action_space.name == "DISCRETE" else None
+    return _dataset_of(episodes, action_space, "the replay buffer")
+
+
+def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
+    """Write a file that d3rlpy's `ReplayBuffer.load` reads.
+
+    Args:
+        dataset: Episodes to write.
+        path: New file.
+        lossy: Whether MultiDiscrete and MultiBinary actions are written; d3rlpy takes them for
+            continuous ones.
+
+    Returns:
+        One sentence for each thing that d3rlpy takes for something else.
+
+    Raises:
+        SpaceError: d3rlpy does not support the action space, and `lossy` is not set.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_extra("h5py", nodes.EXTRA)
+    lost = []
+    try:
+        _check_action_space(dataset.action_space)
+    except SpaceError as error:
+        if not lossy:
+            raise SpaceError(f"{error}; pass --lossy (lossy=True in Python) to write it") from error
+        lost.append(f"{error}: they are written as they are")
+    with h5py.File(path, "w") as file:
+        for index, part in enumerate(_episodes_of(dataset)):
+            for name, values in part.items():
+                several = isinstance(values, list)
+                for number, array in enumerate(values if several else [values]):
+                    place = f"{name}_{index}_{number}" if several else f"{name}_{index}"
+                    file[place] = array
+        file["columns"] = list(_KEYS)
+        file["num_episodes"] = len(dataset.episode_lengths)
+        file["version"] = VERSION
+        _write_own(file.create_group(OWN), dataset)
+    return lost
+
+
+def read(path: Path) -> Dataset:
+    """Read a file of d3rlpy's `dump`, or of `write`.
+
+    The file does not say which actions are discrete: one integer for each step is.
+
+    Raises:
+        LogError: The file is damaged, or of another version.
+        SpaceError: A log cannot hold a space or dtype of the data.
+        MissingExtraError: h5py is not installed.
+    """
+    with nodes.opened(path) as file:
+        version = str(nodes.array_in(file, "version"))
+        if version != VERSION:
+            raise LogError(
+                f"{path} is of version {version} of d3rlpy's files; expected {VERSION}:"
+                " load it with d3rlpy and dump it again"
+            )
+        count = _whole_number(file, "num_episodes", path)
+        episodes = [
+            {name: _array(file, f"{name}_{index}") for name in _KEYS} for index in range(count)
+        ]
+        for index, episode in enumerate(episodes):
+            _check_arrays(episode, f"{path}: episode {index}")
+        own = _read_own(file, episodes, path) if nodes.has(file, OWN) else None
+    return own or _dataset_of(episodes, None, path)
+
+
+def _check_action_space(space: spaces.Space[Any]) -> None:
+    if isinstance(space, spaces.Discrete) and space.start != 0:
+        raise SpaceError(f"the actions are {space}; d3rlpy has discrete actions from 0 only")
+    if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
+        raise SpaceError(f"the actions are {space}; d3rlpy has discrete or continuous actions")
+
+
+def _episodes_of(dataset: Dataset) -> Iterator[dict[str, Any]]:
+    """Yield the arrays of each episode as d3rlpy stores them."""
+    leaves = observation_leaves(dataset.observation_space)
+    actions = dataset.actions.reshape(len(dataset), -1)
+    for steps, frames in episode_slices(dataset):
+        terminated = bool(dataset.terminated[steps.stop - 1])
+        rows = slice(frames.start, frames.stop - terminated)
+        more = ((0, 0 if terminated else 1), (0, 0))
+        found = [_stored(leaf, np.asarray(leaf.of(dataset.frames)[rows])) for leaf in leaves]
+        yield {
+            "observations": found[0] if len(found) == 1 else found,
+            "actions": np.pad(actions[steps], more),
+            "rewards": np.pad(dataset.rewards[steps, None], more),
+            "terminated": terminated,
+        }
+
+
+def _joined(observations: Sequence[Any]) -> Any:
+    if isinstance(observations[0], list):
+        return [np.concatenate(parts) for parts in zip(*observations, strict=True)]
+    return np.concatenate(observations)
+
+
+def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return terminals and timeouts; the last step of the episode has one of them."""
+    flags = np.zeros((2, len(episode["rewards"])), np.float32)
+    flags[0 if episode["terminated"] else 1, -1] = 1
+    return flags[0], flags[1]
+
+
+def _stored(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
+    """Return rows (N, *shape) as d3rlpy stores them: images (N, C, H, W), or vectors (N, size)."""
+    if leaf.dtype == np.uint8 and len(leaf.shape) == 3 and sorted(leaf.shape)[1] >= MIN_IMAGE_EDGE:
+        is_first = leaf.shape[0] == min(leaf.shape)
+        return values if is_first else np.moveaxis(values, -1, 1)
+    if leaf.encoding is not None:
+        return values[:, None]
+    return values.reshape(len(values), leaf.size)
+
+
+def _restored(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
+    """Return rows (N, *shape) for those that `_stored` returned."""
+    empty = np.empty((1, *leaf.shape), leaf.dtype)
+    if values.shape[1:] != _stored(leaf, empty).shape[1:]:
+        raise LogError(f"{leaf.name} has rows of shape {values.shape[1:]}")
+    is_moved = values.ndim == 4 and values.shape[1:] != leaf.shape and len(leaf.shape) == 3
+    ordered = np.moveaxis(values, 1, -1) if is_moved else values
+    return ordered.reshape(len(values), *leaf.shape)
+
+
+def _dataset_of(
+    episodes: Sequence[Mapping[str, Any]], action_space: spaces.Space[Any] | None, where: object
+) -> Dataset:
+    """Return a dataset of d3rlpy's episodes, whose spaces are inferred if needed."""
+    if not episodes:
+        raise LogError(f"{where} has no episodes")
+    frames = [_frames(episode) for episode in episodes]
+    first = frames[0]
+    is_dict = isinstance(first, dict)
+    metadata = LogMetadata(
+        spaces.Dict([(key, box_of(part)) for key, part in first.items()])
+        if is_dict
+        else box_of(first),
+        action_space or _action_space_of([episode["actions"] for episode in episodes]),
+        versions=installed_versions(),
+    )
+    shape = action_leaf(metadata.action_space).shape
+    found = []
+    for episode, observations in zip(episodes, frames, strict=True):
+        terminated = bool(episode["terminated"])
+        steps = slice(len(episode["rewards"]) - (not terminated))
+        arrays = EpisodeArrays(
+            observations=observations,
+            actions=episode["actions"][steps].reshape(-1, *shape),
+            rewards=episode["rewards"][steps].reshape(-1),
+            terminated=terminated,
+            truncated=not terminated,
+        )
+        found.append(arrays)
+    return dataset_of(found, metadata, where)
+
+
+def _frames(episode: Mapping[str, Any]) -> Any:
+    """Return the observations of an episode with a final one, and images with the channels last."""
+    stored = episode["observations"]
+    if isinstance(stored, list | tuple):
+        parts = [_frames({**episode, "observations": part}) for part in stored]
+        return {str(index): part for index, part in enumerate(parts)}
+    values = np.concatenate([stored, stored[-1:]]) if episode["terminated"] else stored
+    is_image = values.dtype == np.uint8 and values.ndim == 4
+    if is_image and values.shape[1] < MIN_IMAGE_EDGE <= min(values.shape[2:]):
+        values = np.moveaxis(values, 1, -1)
+    return values
+
+
+def _action_space_of(actions: Sequence[NDArray[Any]]) -> spaces.Space[Any]:
+    every = np.concatenate(actions)
+    is_discrete = every.dtype.kind in "iu" and every.shape[1:] == (1,)
+    return action_space_of(every[:, 0] if is_discrete else every)
+
+
+def _array(file: Any, name: str) -> Any:
+    """Read an array, or the list of arrays `NAME_0`, `NAME_1`, ..."""
+    if nodes.has(file, name) or not nodes.has(file, f"{name}_0"):
+        return nodes.array_in(file, name)
+    names = (f"{name}_{number}" for number in itertools.count())
+    return [nodes.array_in(file, part) for part in itertools.takewhile(file.__contains__, names)]
+
+
+def _whole_number(file: Any, name: str, where: object) -> int:
+    found = nodes.array_in(file, name)
+    if found.ndim or found.dtype.kind not in "iu":
+        raise LogError(f"{where}: {name} is not a whole number")
+    return int(found)
+
+
+def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
+    """Check that the arrays of an episode are numbers, and have a row for each step.
+
+    Raises:
+        LogError: They are not.
+    """
+    stored = episode["observations"]
+    parts = [*stored] if isinstance(stored, list) else [stored]
+    parts += [episode["actions"], episode["rewards"]]
+    if any(part.ndim < 2 for part in parts) or len({len(part) for part in parts}) > 1:
+        raise LogError(f"{where} has arrays of shapes {[part.shape for part in parts]}")
+    if any(part.dtype.kind not in "biuf" for part in (*parts, episode["terminated"])):
+        raise LogError(f"{where} has arrays that are not numbers")
+    if not parts[-1].size or parts[-1].shape[1] != 1 or episode["terminated"].ndim:
+        raise LogError(f"{where} has no rewards, or more than one for each step")
+
+
+def _write_own(group: Any, dataset: Dataset) -> None:
+    """Store what d3rlpy has no place for."""
+    lasts = np.cumsum(dataset.episode_lengths) - 1
+    ends = dataset.frame_of_step[lasts[dataset.terminated[lasts]]] + 1
+    names = []
+    for number, leaf in enumerate(observation_leaves(dataset.observation_space)):
+        names.append(f"final_observations_{number}")
+        group[names[-1]] = _stored(leaf, np.asarray(leaf.of(dataset.frames)[ends]))
+    group[_DESCRIPTION] = description_text(dataset, names)
+    group["truncated"] = dataset.truncated[lasts]
+    group["behavior_probs"] = dataset.behavior_probs
+    group["log_time_ns"] = np.concatenate([e.log_time_ns for e in dataset.episodes])
+
+
+def _read_own(file: Any, episodes: Sequence[Mapping[str, Any]], path: Path) -> Dataset | None:
+    """Return the dataset that was written; None if the episodes have changed since."""
+    group = nodes.group_in(file, OWN)
+    text = str(nodes.array_in(group, _DESCRIPTION))
+    metadata, summaries, names = parse_description(text, path)
+    leaves, action = leaves_of(metadata.observation_space), action_leaf(metadata.action_space)
+    finals = [nodes.array_in(group, name) for name in names]
+    truncated, probabilities, times = (
+        nodes.array_in(group, name) for name in ("truncated", "behavior_probs", "log_time_ns")
+    )
+    lengths = [len(e["rewards"]) - (not e["terminated"]) for e in episodes]
+    terminated = sum(bool(e["terminated"]) for e in episodes)
+    same = len(episodes) == len(summaries) == len(truncated) and len(finals) == len(leaves)
+    same &= sum(lengths) == len(probabilities) == len(times) - len(episodes)
+    if not same or any(len(final) != terminated for final in finals):
+        warnings.warn(
+            f"{path}: {OWN} is ignored, because the episodes were changed after it was written",
+            stacklevel=4,
+        )
+        return None
+    found, step, end = [], 0, 0
+    for index, (episode, length) in enumerate(zip(episodes, lengths, strict=True)):
+        stored = episode["observations"]
+        rows = stored if isinstance(stored, list) else [stored]
+        if episode["terminated"]:
+            rows = [
+                np.concatenate([part, final[end : end + 1]])
+                for part, final in zip(rows, finals, strict=True)
+            ]
+            end += 1
+        frames = [_restored(leaf, part) for leaf, part in zip(leaves, rows, strict=True)]
+        arrays = EpisodeArrays(
+            observations=nest(leaves, frames),
+            actions=episode["actions"][:length].reshape(-1, *action.shape),
+            rewards=episode["rewards"][:length, 0],
+            terminated=bool(episode["terminated"]),
+            truncated=bool(truncated[index]),
+            behavior_probs=probabilities[step : step + length],
+            times_ns=times[step + index : step + index + length + 1],
+            summary=summaries[index],
+        )
+        found.append(arrays)
+        step += length
+    return dataset_of(found, metadata, path)

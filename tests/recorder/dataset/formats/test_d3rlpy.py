@@ -1,0 +1,310 @@
+"""d3rlpy's files and replay buffers: written and read back, and as d3rlpy itself sees them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from numpy.typing import NDArray
+
+import mcaprl
+from mcaprl import Dataset
+from mcaprl.errors import LogError, MissingExtraError, SpaceError
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.format.metadata import LogMetadata
+from tests.conftest import need
+from tests.support.strategies import transitions
+
+h5py = pytest.importorskip("h5py", reason="needs the extra interop")
+
+_PROGRAM = Path(__file__).with_name("run_d3rlpy.py")
+_SPACE = spaces.Dict(
+    {
+        "camera": spaces.Box(0, 255, (8, 9, 3), np.uint8),
+        "gray": spaces.Box(0, 255, (9, 8), np.uint8),
+        "state": spaces.Box(-np.inf, np.inf, (2, 2), np.float32),
+    }
+)
+
+
+def _vectors() -> Dataset:
+    """Return observations 0, 1, 2, 3 and 10, 11, 12, one episode terminated and one truncated."""
+    metadata = LogMetadata(
+        spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Discrete(4), env_id="Line-v0"
+    )
+    first = EpisodeArrays(
+        observations=np.array([[0, 0.5], [1, 0.5], [2, 0.5], [3, 0.5]], np.float32),
+        actions=np.array([0, 1, 2]),
+        rewards=np.array([0, 0.5, 1]),
+        terminated=True,
+        truncated=False,
+        behavior_probs=np.array([0.25, np.nan, 1], np.float32),
+        times_ns=np.array([5, 6, 7, 9]),
+        summary={"reason": "goal", "seed": 3},
+    )
+    second = EpisodeArrays(
+        observations=np.array([[10, 0.5], [11, 0.5], [12, 0.5]], np.float32),
+        actions=np.array([0, 1]),
+        rewards=np.array([0, 0.5]),
+        terminated=False,
+        truncated=True,
+        times_ns=np.array([20, 21, 23]),
+        summary={"reason": "time", "options": '{"track": 2}'},
+    )
+    return dataset_of([first, second], metadata, "test")
+
+
+def _images() -> Dataset:
+    """Return two transitions and a truncation, with images whose pixels all differ."""
+
+    def rows(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        return np.arange(3 * np.prod(shape)).reshape(3, *shape).astype(dtype)
+
+    episode = EpisodeArrays(
+        observations={
+            "camera": rows((8, 9, 3), np.uint8),
+            "gray": rows((9, 8), np.uint8),
+            "state": rows((2, 2), np.float32),
+        },
+        actions=np.array([[0.25, -1], [0, 1]], np.float32),
+        rewards=np.array([1, 2]),
+        terminated=False,
+        truncated=True,
+    )
+    metadata = LogMetadata(_SPACE, spaces.Box(-1, 1, (2,), np.float32))
+    return dataset_of([episode], metadata, "test")
+
+
+def _same(first: Dataset, second: Dataset) -> None:
+    assert second.fingerprint == first.fingerprint
+    assert second.metadata == first.metadata
+    assert repr([e.summary for e in second.episodes]) == repr([e.summary for e in first.episodes])
+    for one, other in zip(first.episodes, second.episodes, strict=True):
+        np.testing.assert_array_equal(other.log_time_ns, one.log_time_ns)
+
+
+def _write(dataset: Dataset, path: Path, **options: Any) -> None:
+    mcaprl.convert(_saved(dataset, path.with_suffix(".mcap")), path, to="d3rlpy", **options)
+
+
+def _saved(dataset: Dataset, path: Path) -> Path:
+    dataset.save(path, overwrite=True)
+    return path
+
+
+@pytest.mark.parametrize("make", [_vectors, _images])
+def test_everything_comes_back(tmp_path: Path, make: Any) -> None:
+    log = _saved(make(), tmp_path / "log.mcap")
+    mcaprl.convert(log, tmp_path / "out.h5", to="d3rlpy")
+    _same(mcaprl.open(log), mcaprl.open(tmp_path / "out.h5"))
+
+
+@settings(max_examples=40)
+@given(transitions())
+def test_all_spaces_and_bits_come_back(arguments: dict[str, Any]) -> None:
+    dataset = Dataset.from_arrays(**arguments)
+    with TemporaryDirectory() as folder:
+        log = _saved(dataset, Path(folder) / "log.mcap")
+        mcaprl.convert(log, Path(folder) / "out.h5", to="d3rlpy", lossy=True)
+        _same(mcaprl.open(log), mcaprl.open(Path(folder) / "out.h5"))
+
+
+def test_the_layout_of_the_file(tmp_path: Path) -> None:
+    _write(_vectors(), tmp_path / "out.h5")
+    with h5py.File(tmp_path / "out.h5") as file:
+        assert file["version"][()] == b"2.1"
+        assert file["num_episodes"][()] == 2
+        assert file["columns"][()].tolist() == [
+            b"observations",
+            b"actions",
+            b"rewards",
+            b"terminated",
+        ]
+        # The terminated episode has a step for each transition, the truncated one has one more.
+        assert file["observations_0"][:, 0].tolist() == [0, 1, 2]
+        assert file["observations_1"][:, 0].tolist() == [10, 11, 12]
+        assert file["actions_1"][()].tolist() == [[0], [1], [0]]
+        assert file["rewards_1"][()].tolist() == [[0], [0.5], [0]]
+        assert [bool(file[f"terminated_{k}"][()]) for k in range(2)] == [True, False]
+
+
+def test_a_file_without_our_group_lacks_final_observations(tmp_path: Path) -> None:
+    _write(_vectors(), tmp_path / "out.h5")
+    with h5py.File(tmp_path / "out.h5", "r+") as file:
+        del file["mcaprl"]
+    found = mcaprl.open(tmp_path / "out.h5")
+    assert found.frames[:, 0].tolist() == [0, 1, 2, 2, 10, 11, 12]
+    assert found.actions.tolist() == [0, 1, 2, 0, 1]
+    assert found.action_space == spaces.Discrete(3)
+    assert found.terminated.tolist() == [False, False, True, False, False]
+    assert found.truncated.tolist() == [False, False, False, False, True]
+
+
+def test_images_and_several_arrays_are_read_without_our_group(tmp_path: Path) -> None:
+    dataset = _images()
+    _write(dataset, tmp_path / "out.h5")
+    with h5py.File(tmp_path / "out.h5", "r+") as file:
+        assert file["observations_0_0"].shape == (3, 3, 8, 9)
+        assert file["observations_0_1"].shape == (3, 1, 9, 8)
+        del file["mcaprl"]
+    found = mcaprl.open(tmp_path / "out.h5")
+    np.testing.assert_array_equal(found.frames["0"], dataset.frames["camera"])
+    np.testing.assert_array_equal(found.frames["1"][..., 0], dataset.frames["gray"])
+    assert found.frames["2"].tolist() == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
+    np.testing.assert_array_equal(found.actions, dataset.actions)
+
+
+def test_episodes_that_were_changed_since_are_read_as_they_are(tmp_path: Path) -> None:
+    _write(_vectors(), tmp_path / "out.h5")
+    with h5py.File(tmp_path / "out.h5", "r+") as file:
+        file["num_episodes"][()] = 1
+    with pytest.warns(UserWarning, match="mcaprl is ignored, because the episodes were changed"):
+        found = mcaprl.open(tmp_path / "out.h5")
+    assert found.frames[:, 0].tolist() == [0, 1, 2, 2]
+
+
+def test_actions_that_d3rlpy_does_not_have_are_refused(tmp_path: Path) -> None:
+    for space, values, message in (
+        (spaces.Discrete(3, start=1), [1, 3], r"actions are Discrete\(3, start=1\)"),
+        (spaces.MultiDiscrete([2, 3]), [[1, 2], [0, 0]], "actions are MultiDiscrete"),
+    ):
+        dataset = Dataset.from_arrays(
+            observations=np.zeros((2, 1)),
+            next_observations=np.zeros((2, 1)),
+            actions=np.array(values),
+            rewards=np.zeros(2),
+            terminated=[False, True],
+            truncated=[False, False],
+            action_space=space,
+            observation_space=spaces.Box(-1, 1, (1,), np.float64),
+        )
+        with pytest.raises(SpaceError, match=message):
+            dataset.to_d3rlpy()
+        with pytest.raises(SpaceError, match="pass --lossy"):
+            _write(dataset, tmp_path / "out.h5")
+        assert not (tmp_path / "out.h5").exists()
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    for name, value, message in (
+        ("version", "2.0", "is of version 2.0 of d3rlpy's files"),
+        ("num_episodes", 3, "observations_2"),
+        ("num_episodes", [1, 2], "num_episodes is not a whole number"),
+        ("num_episodes", 0, "has no episodes"),
+        ("rewards_1", np.zeros((2, 1)), "episode 1 has arrays of shapes"),
+        ("rewards_0", np.zeros((3, 2)), "more than one for each step"),
+        ("actions_0", [["a"], ["b"], ["c"]], "not numbers"),
+    ):
+        _write(_vectors(), path, overwrite=True)
+        with h5py.File(path, "r+") as file:
+            del file[name], file["mcaprl"]
+            file[name] = value
+        with pytest.raises(LogError, match=message):
+            mcaprl.open(path)
+
+
+def test_a_buffer_of_episodes_is_copied() -> None:
+    """Truncated episodes lose their last step, which d3rlpy does not use as a transition either."""
+    episodes = [
+        SimpleNamespace(
+            observations=np.array([[first], [first + 1]], np.float32),
+            actions=np.array([[0], [1]]),
+            rewards=np.array([[1], [2]], np.float32),
+            terminated=first == 0,
+        )
+        for first in (0, 5)
+    ]
+    info = SimpleNamespace(action_space=SimpleNamespace(name="DISCRETE"), action_size=6)
+    found = Dataset.from_d3rlpy(SimpleNamespace(episodes=episodes, dataset_info=info))
+    assert found.action_space == spaces.Discrete(6)
+    assert found.frames[:, 0].tolist() == [0, 1, 1, 5, 6]
+    assert found.rewards.tolist() == [1, 2, 1]
+    assert found.truncated.tolist() == [False, False, True]
+
+
+def test_a_missing_d3rlpy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "d3rlpy", None)
+    with pytest.raises(MissingExtraError, match="pip install --no-deps d3rlpy"):
+        _vectors().to_d3rlpy()
+
+
+def test_d3rlpys_picker_gives_every_transition(tmp_path: Path) -> None:
+    log = _saved(_vectors(), tmp_path / "log.mcap")
+    mcaprl.convert(log, tmp_path / "out.h5", to="d3rlpy")
+    direct = ["transitions", log, tmp_path / "direct.npz"]
+    _run(*direct, "--", "load", tmp_path / "out.h5", tmp_path / "loaded.npz")
+    for name in ("direct", "loaded"):
+        with np.load(tmp_path / f"{name}.npz") as found:
+            assert found["observation"][:, 0].tolist() == [0, 1, 2, 10, 11]
+            # After a terminal state, d3rlpy has zeros.
+            assert found["next_observation"].tolist() == [
+                [1, 0.5],
+                [2, 0.5],
+                [0, 0],
+                [11, 0.5],
+                [12, 0.5],
+            ]
+            assert found["action"][:, 0].tolist() == [0, 1, 2, 0, 1]
+            assert found["reward"][:, 0].tolist() == [0, 0.5, 1, 0, 0.5]
+            assert found["terminal"].tolist() == [0, 0, 1, 0, 0]
+            assert found["lengths"].tolist() == [3, 2]
+            assert found["space"] == "DISCRETE"
+            # A file does not have the number of actions: d3rlpy takes the largest one.
+            assert found["size"] == {"direct": 4, "loaded": 3}[name]
+
+
+def test_d3rlpy_has_images_with_the_channels_first_and_trains(tmp_path: Path) -> None:
+    dataset = _images()
+    log = _saved(dataset, tmp_path / "log.mcap")
+    vectors = _saved(_vectors(), tmp_path / "vectors.mcap")
+    _run("transitions", log, tmp_path / "out.npz", "--", "train", vectors)
+    with np.load(tmp_path / "out.npz") as found:
+        camera, gray = (dataset.frames[key] for key in ("camera", "gray"))
+        np.testing.assert_array_equal(found["observation_0"], np.moveaxis(camera[:2], -1, 1))
+        np.testing.assert_array_equal(found["next_observation_1"][:, 0], gray[1:])
+        assert found["next_observation_2"].tolist() == [[4, 5, 6, 7], [8, 9, 10, 11]]
+        assert (str(found["space"]), int(found["size"])) == ("CONTINUOUS", 2)
+        assert found["terminal"].tolist() == [0, 0]
+
+
+def test_d3rlpys_own_files_are_read(tmp_path: Path) -> None:
+    log = _saved(_vectors(), tmp_path / "log.mcap")
+    dump, back = ["dump", log, tmp_path / "dumped.h5"], ["back", log, tmp_path / "back.mcap"]
+    _run(*dump, "--", *back, "--", "collect", tmp_path / "collected.h5")
+    for path in (tmp_path / "dumped.h5", tmp_path / "back.mcap"):
+        found = mcaprl.open(path)
+        assert found.frames[:, 0].tolist() == [0, 1, 2, 2, 10, 11, 12]
+        assert found.rewards.tolist() == [0, 0.5, 1, 0, 0.5]
+        assert found.terminated.tolist() == [False, False, True, False, False]
+    assert mcaprl.open(tmp_path / "back.mcap").action_space == spaces.Discrete(4)
+    # The last of three steps before a timeout has no next observation: it is no transition.
+    found = mcaprl.open(tmp_path / "collected.h5")
+    assert found.observations[:, 0].tolist() == [0, 1, 2, 10, 11]
+    assert found.next_observations[:, 0].tolist() == [1, 2, 2, 11, 12]
+    assert found.truncated.tolist() == [False, False, False, False, True]
+
+
+def _run(*arguments: object) -> None:
+    """Run d3rlpy; skip the test where it is not installed."""
+    python = os.environ.get("MCAPRL_D3RLPY_PYTHON", f"{sys.prefix}/rivals/bin/python")
+    need(Path(python).exists(), "d3rlpy is not installed: make .venv/.rivals")
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        [python, "-W", "ignore", str(_PROGRAM), *map(str, arguments)],
+        env=kept,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
