@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.arrays import description_of
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
+from mcaprl.recorder.dataset.formats.infos import masked
+from mcaprl.recorder.format.metadata import LogMetadata
 
 NAMES = {
     "observations": ("observations",),
@@ -28,7 +30,9 @@ _REQUIRED = ("observations", "actions", "rewards", "terminated")
 _COLUMNS = ("rewards", "terminated", "truncated", "behavior_probs")
 
 
-def flat_dataset(found: Mapping[str, Any], where: object) -> Dataset:
+def flat_dataset(
+    found: Mapping[str, Any], where: object, infos: Mapping[str, NDArray[Any]] | None = None
+) -> Dataset:
     """Return a dataset of flat arrays.
 
     Without next observations, that of a terminal transition is the observation itself, and the
@@ -37,6 +41,8 @@ def flat_dataset(found: Mapping[str, Any], where: object) -> Dataset:
     Args:
         found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
         where: Name of the source, for errors and warnings.
+        infos: Arrays by dotted name; those of N rows are the infos of the observations. The final
+            observations have none.
 
     Raises:
         LogError: An array is missing.
@@ -50,10 +56,13 @@ def flat_dataset(found: Mapping[str, Any], where: object) -> Dataset:
         if name in arrays:
             arrays[name] = _one_column(arrays[name])
     arrays.setdefault("truncated", np.zeros(len(arrays["rewards"]), bool))
+    count = len(arrays["rewards"])
+    rows = {name: values for name, values in (infos or {}).items() if _is_info(values, count)}
     try:
         if "next_observations" in arrays:
-            return Dataset.from_arrays(**arrays)
-        return _without_next(arrays, where)
+            data = Dataset.from_arrays(**arrays)
+            return _with_infos(data, rows, where) if rows else data
+        return _without_next(arrays, rows, where)
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error
 
@@ -89,7 +98,38 @@ def _one_column(values: Any) -> NDArray[Any]:
     return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
 
 
-def _without_next(arrays: Mapping[str, Any], where: object) -> Dataset:
+def _is_info(values: NDArray[Any], count: int) -> bool:
+    return values.ndim > 0 and len(values) == count and values.dtype.kind in "biufU"
+
+
+def _info_rows(infos: Mapping[str, NDArray[Any]], first: int, last: int, count: int) -> Any:
+    """Return the rows [first, last) of infos, followed by missing rows up to `count` rows."""
+    is_missing = np.arange(count) >= last - first
+    return {
+        name: masked(np.resize(values[first:last], (count, *values.shape[1:])), is_missing)
+        for name, values in infos.items()
+    }
+
+
+def _with_infos(data: Dataset, infos: Mapping[str, NDArray[Any]], where: object) -> Dataset:
+    episodes = [
+        EpisodeArrays(
+            observations=rows_of_tree(data.frames, frames),
+            actions=data.actions[steps],
+            rewards=data.rewards[steps],
+            terminated=bool(data.terminated[steps.stop - 1]),
+            truncated=bool(data.truncated[steps.stop - 1]),
+            behavior_probs=data.behavior_probs[steps],
+            infos=_info_rows(infos, steps.start, steps.stop, frames.stop - frames.start),
+        )
+        for steps, frames in episode_slices(data)
+    ]
+    return dataset_of(episodes, LogMetadata.from_strings(data.metadata), where)
+
+
+def _without_next(
+    arrays: Mapping[str, Any], infos: Mapping[str, NDArray[Any]], where: object
+) -> Dataset:
     observations, actions = arrays["observations"], np.asarray(arrays["actions"])
     rewards, probs = arrays["rewards"], arrays.get("behavior_probs")
     terminated, truncated = (arrays[name].astype(bool) for name in ("terminated", "truncated"))
@@ -112,6 +152,7 @@ def _without_next(arrays: Mapping[str, Any], where: object) -> Dataset:
             terminated=is_terminal,
             truncated=bool(truncated[stop - 1]),
             behavior_probs=None if probs is None else probs[steps],
+            infos=_info_rows(infos, start, min(last + 1, stop), last - start + 1),
         )
         episodes.append(episode)
     _warn(where, int(terminated.sum()), dropped)

@@ -7,7 +7,7 @@ files often lack, and the group `mcaprl` with what D4RL has no place for.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,25 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
 from mcaprl.recorder.dataset.formats.flat import NAMES, flat_dataset
-from mcaprl.recorder.dataset.formats.npz import OWN, description_text, parse_description
+from mcaprl.recorder.dataset.formats.infos import (
+    StoredInfo,
+    infos_of,
+    masked,
+    nested_names,
+    stored_infos,
+)
+from mcaprl.recorder.dataset.formats.npz import (
+    INFOS,
+    MISSING,
+    OWN,
+    description_text,
+    parse_description,
+    parse_infos,
+)
 from mcaprl.recorder.dataset.formats.robomimic import read_demos
 from mcaprl.recorder.format.spaces import leaves_of, nest, observation_leaves
 
-_DESCRIPTION = "description"
+_DESCRIPTION, _FINALS = "description", "final_infos"
 _BLOCK_ROWS = 1024
 
 
@@ -39,21 +53,24 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether Dict observations are written, as one array for each key.
+        lossy: Whether Dict observations are written, as one array for each key, and infos that HDF5
+            cannot hold are left out.
 
     Returns:
         One sentence for each thing that was changed for D4RL's readers.
 
     Raises:
-        SpaceError: The observations are a Dict, and `lossy` is not set.
+        SpaceError: The observations are a Dict or HDF5 cannot hold an info, and `lossy` is not set.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", nodes.EXTRA)
-    lost = []
+    infos, lost = stored_infos(infos_of(dataset))
+    info_names, lost_names = nested_names(infos)
+    lost += lost_names
     if isinstance(dataset.observation_space, spaces.Dict):
-        lost.append("Dict observations are one array for each key, which D4RL does not read")
+        lost.append("a Dict observation is one array for each key, which D4RL does not read")
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write them")
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write it")
     slices = episode_slices(dataset)
     lasts = np.array([steps.stop - 1 for steps, _ in slices])
     timeouts = dataset.truncated.copy()
@@ -73,7 +90,11 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         file["terminals"] = dataset.terminated
         file["timeouts"] = timeouts
         own = file.create_group(OWN)
-        own[_DESCRIPTION] = description_text(dataset, names)
+        arrays = {}
+        for name, parts in info_names.items():
+            _put_info(file, "/".join(parts), infos[name], dataset)
+            arrays[name] = "/".join(parts), infos[name].dtype.str
+        own[_DESCRIPTION] = description_text(dataset, names, arrays)
         own["episode_lengths"] = dataset.episode_lengths
         own["truncated"] = dataset.truncated[lasts]
         own["behavior_probs"] = dataset.behavior_probs
@@ -99,15 +120,17 @@ def read(path: Path) -> Dataset:
             if found is not None:
                 return found
         known = [name for names in NAMES.values() for name in names]
-        return flat_dataset(
-            {name: nodes.tree_in(file, name) for name in file if name in known}, path
-        )
+        arrays = {name: nodes.tree_in(file, name) for name in file if name in known}
+        has_infos = nodes.has(file, INFOS) and nodes.is_group(file, INFOS)
+        infos = dict(nodes.arrays_below(nodes.group_in(file, INFOS))) if has_infos else {}
+        return flat_dataset(arrays, path, infos)
 
 
 def _own(file: Any, path: Path) -> Dataset | None:
     """Return the dataset that was written; None if the arrays have other lengths now."""
     own = nodes.group_in(file, OWN)
-    metadata, summaries, names = parse_description(str(nodes.array_in(own, _DESCRIPTION)), path)
+    text = str(nodes.array_in(own, _DESCRIPTION))
+    metadata, summaries, names = parse_description(text, path)
     leaves = leaves_of(metadata.observation_space)
     steps = {name: nodes.array_in(file, name) for name in ("actions", "rewards", "terminals")}
     columns = [
@@ -127,11 +150,13 @@ def _own(file: Any, path: Path) -> Dataset | None:
             stacklevel=4,
         )
         return None
+    infos = _own_infos(file, lengths, parse_infos(text, path))
 
     def episodes() -> Iterator[EpisodeArrays]:
         last = 0
         for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
             taken, last = slice(last, last + length), last + length
+            frames = slice(taken.start + index, last + index + 1)
             observations = [
                 np.concatenate([here[taken], there[last - 1 : last]])
                 for here, there in zip(*columns, strict=True)
@@ -143,11 +168,43 @@ def _own(file: Any, path: Path) -> Dataset | None:
                 terminated=bool(steps["terminals"][last - 1]),
                 truncated=bool(parts["truncated"][index]),
                 behavior_probs=parts["behavior_probs"][taken],
-                times_ns=parts["log_time_ns"][taken.start + index : last + index + 1],
+                times_ns=parts["log_time_ns"][frames],
+                infos={name: values[frames] for name, values in infos.items()},
                 summary=summary,
             )
 
     return dataset_of(list(episodes()), metadata, path)
+
+
+def _own_infos(
+    file: Any, lengths: Sequence[int], described: Mapping[str, tuple[str, np.dtype[Any]]]
+) -> dict[str, Any]:
+    """Return the infos (F, *shape) with the rows of each final observation."""
+    finals = np.cumsum(np.array(lengths) + 1) - 1
+    found = {}
+    for name, (array, dtype) in described.items():
+        steps = nodes.array_at(file, f"{INFOS}/{array}".split("/"))
+        last, missing = (
+            nodes.array_at(file, f"{OWN}/{group}/{array}".split("/"))
+            for group in (_FINALS, MISSING)
+        )
+        if len(steps) != sum(lengths) or len(last) != len(finals):
+            raise LogError(f"{file.filename}: {INFOS}/{array} has {len(steps)} rows")
+        steps = steps.astype(np.result_type(steps, last))
+        rows = np.insert(steps, finals - np.arange(len(finals)), last, axis=0)
+        found[name] = masked(rows, missing.astype(bool), dtype)
+    return found
+
+
+def _put_info(file: Any, name: str, info: StoredInfo, dataset: Dataset) -> None:
+    """Write an info: a row for each step as D4RL has it, and the rows of final observations."""
+    finals = np.cumsum(dataset.episode_lengths + 1) - 1
+    is_text = info.values.dtype.kind == "U"
+    values = info.values.astype(object) if is_text else info.values
+    dtype = import_extra("h5py", nodes.EXTRA).string_dtype() if is_text else values.dtype
+    file.create_dataset(f"{INFOS}/{name}", data=values[dataset.frame_of_step], dtype=dtype)
+    file.create_dataset(f"{OWN}/{_FINALS}/{name}", data=values[finals], dtype=dtype)
+    file[f"{OWN}/{MISSING}/{name}"] = info.is_missing
 
 
 def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: bool) -> None:

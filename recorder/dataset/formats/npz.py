@@ -7,6 +7,7 @@ Our own archive has these arrays, for E episodes with N transitions:
     actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
     episode_lengths           (E,)
     log_time_ns               (N + E,)
+    infos/NAME                (N + E, *shape); `missing_infos/NAME` has the rows without it
     mcaprl                    JSON text: metadata, summaries and the names of the observations
 
 Other archives have the arrays of `flat.NAMES`. Nothing is unpickled.
@@ -25,17 +26,26 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
 from mcaprl.recorder.dataset.formats.flat import flat_dataset
+from mcaprl.recorder.dataset.formats.infos import (
+    StoredInfo,
+    info_type,
+    infos_of,
+    masked,
+    stored_infos,
+)
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, leaves_of, nest
 
 OWN = "mcaprl"
 SUMMARY = ("reason", "policy", "epsilon", "seed", "options")
 _OBSERVATIONS, _FINALS = "observations", "final_observations"
+INFOS, MISSING = "infos", "missing_infos"
+_PLAIN = re.compile(r"[A-Za-z0-9_.-]+")
 _BLOCK_ROWS = 1024
 
 
@@ -45,13 +55,22 @@ def matches(path: Path) -> bool:
 
 
 def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
-    """Write a dataset; nothing is lost.
+    """Write a dataset.
 
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Has no effect.
+        lossy: Whether infos that are neither numbers nor texts are left out.
+
+    Returns:
+        One sentence for each info that was left out.
+
+    Raises:
+        SpaceError: An info cannot be stored, and `lossy` is not set.
     """
+    infos, lost = stored_infos(infos_of(dataset))
+    if lost and not lossy:
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the others")
     leaves = leaves_of(dataset.observation_space)
     names = [array_name(leaf) for leaf in leaves]
     slices = episode_slices(dataset)
@@ -69,10 +88,15 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
             ("behavior_probs", dataset.behavior_probs),
             ("episode_lengths", dataset.episode_lengths),
             ("log_time_ns", np.concatenate([e.log_time_ns for e in dataset.episodes])),
-            (OWN, np.array(description_text(dataset, names))),
+            (OWN, np.array(description_text(dataset, names, arrays_of(infos)))),
         ):
             _put_rows(archive, name, values.dtype, values.shape, [values])
-    return []
+        for number, (name, info) in enumerate(infos.items()):
+            array = _info_name(name, number)
+            _put_rows(archive, INFOS + array, info.values.dtype, info.values.shape, [info.values])
+            missing = info.is_missing
+            _put_rows(archive, MISSING + array, missing.dtype, missing.shape, [missing])
+    return lost
 
 
 def read(path: Path) -> Dataset:
@@ -103,18 +127,39 @@ def array_name(leaf: Leaf) -> str:
 
     Keys with other characters than letters, digits, `.`, `_` and `-` are named as in the log.
     """
-    if all(re.fullmatch(r"[A-Za-z0-9_.-]+", key) for key in leaf.path):
+    if all(_PLAIN.fullmatch(key) for key in leaf.path):
         return "".join(f"/{key}" for key in leaf.path)
     return f":{leaf.name}"
 
 
-def description_text(dataset: Dataset, names: Iterable[str]) -> str:
-    """Return the metadata, the summaries and the names of the observations as JSON."""
+def arrays_of(infos: Mapping[str, StoredInfo]) -> dict[str, list[str]]:
+    """Return what follows `infos` in the name of each info's array, and its dtype."""
+    return {
+        name: [_info_name(name, number), info.dtype.str]
+        for number, (name, info) in enumerate(infos.items())
+    }
+
+
+def description_text(
+    dataset: Dataset, names: Iterable[str], infos: Mapping[str, Iterable[str]] | None = None
+) -> str:
+    """Return the metadata and the summaries as JSON, with what names the arrays.
+
+    Args:
+        dataset: Dataset to describe.
+        names: What follows `observations` in the name of each leaf's array.
+        infos: What follows `infos` in the name of each info's array, and its dtype; default: none.
+    """
     summaries = [
         {name: getattr(episode.summary, name) for name in SUMMARY} for episode in dataset.episodes
     ]
     return json.dumps(
-        {"metadata": dataset.metadata, "episodes": summaries, _OBSERVATIONS: list(names)}
+        {
+            "metadata": dataset.metadata,
+            "episodes": summaries,
+            _OBSERVATIONS: list(names),
+            INFOS: {name: list(found) for name, found in (infos or {}).items()},
+        }
     )
 
 
@@ -133,12 +178,30 @@ def parse_description(text: str, where: object) -> tuple[LogMetadata, list[dict[
         raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
 
 
+def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]]:
+    """Parse what follows `infos` in the name of each info's array, and its dtype.
+
+    Raises:
+        LogError: The text is damaged.
+    """
+    try:
+        found = parse_json(text).get(INFOS, {})
+        return {name: (str(array), info_type(str(dtype))) for name, (array, dtype) in found.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
+
+
 def _own(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
     metadata, summaries, names = parse_description(str(arrays[OWN]), path)
+    described = parse_infos(str(arrays[OWN]), path)
     leaves = leaves_of(metadata.observation_space)
     try:
         lengths = arrays["episode_lengths"].tolist()
         columns = [(arrays[_OBSERVATIONS + name], arrays[_FINALS + name]) for name in names]
+        infos = {
+            name: masked(arrays[INFOS + array], arrays[MISSING + array].astype(bool), dtype)
+            for name, (array, dtype) in described.items()
+        }
         episodes, first = [], 0
         for index, (length, summary) in enumerate(zip(lengths, summaries, strict=True)):
             steps, frames = (
@@ -156,6 +219,7 @@ def _own(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
                 truncated=bool(arrays["truncations"][steps][-1]),
                 behavior_probs=arrays["behavior_probs"][steps],
                 times_ns=arrays["log_time_ns"][frames],
+                infos={name: values[frames] for name, values in infos.items()},
                 summary=summary,
             )
             episodes.append(episode)
@@ -163,6 +227,10 @@ def _own(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise LogError(f"{path}: an array is missing or too short: {error}") from error
     return dataset_of(episodes, metadata, path)
+
+
+def _info_name(name: str, number: int) -> str:
+    return f"/{name}" if _PLAIN.fullmatch(name) else f":{number}"
 
 
 def _nested(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

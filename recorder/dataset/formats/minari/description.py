@@ -28,6 +28,8 @@ from mcaprl.recorder.format.spaces import action_leaf, leaves_of
 DATA, FILE, MAIN = "data", "metadata.json", "main_data.hdf5"
 OWN = "mcaprl"
 """Key of what Minari has no place for, in the metadata and in each episode."""
+MISSING = "missing_infos"
+"""Group of an episode with the rows without an info, in the group `OWN`."""
 # The first version that reads images without JPEG. Minari refuses versions that are newer than it.
 _MINARI_VERSION = "0.5.4"
 _NAMESPACE_FILE = "namespace_metadata.json"

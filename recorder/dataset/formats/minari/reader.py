@@ -23,9 +23,11 @@ from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as hdf5
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.infos import info_type, masked
 from mcaprl.recorder.dataset.formats.minari import arrow_nodes as arrow
 from mcaprl.recorder.dataset.formats.minari.description import (
     MAIN,
+    MISSING,
     OWN,
     Description,
     data_folder,
@@ -33,6 +35,7 @@ from mcaprl.recorder.dataset.formats.minari.description import (
 )
 from mcaprl.recorder.dataset.formats.minari.spaces import may_be_jpeg
 from mcaprl.recorder.format.messages import MAX_SEED
+from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of, nest
 
 _FLAGS = ("terminations", "truncations")
@@ -49,6 +52,7 @@ class _Stored:
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
         own: Arrays that only our writer stores: `behavior_probs` and `log_time_ns`.
+        missing: Rows (T + 1,) without an info and the info's dtype, by its dotted name.
     """
 
     observations: Sequence[Any]
@@ -56,6 +60,7 @@ class _Stored:
     infos: Mapping[str, NDArray[Any]]
     attributes: Mapping[str, Any]
     own: Mapping[str, Any] = field(default_factory=dict)
+    missing: Mapping[str, tuple[NDArray[np.bool_], np.dtype[Any]]] = field(default_factory=dict)
 
 
 def read(path: Path) -> Dataset:
@@ -69,6 +74,12 @@ def read(path: Path) -> Dataset:
         SpaceError: A log cannot store a space.
         MissingExtraError: h5py, PyArrow or Pillow is not installed.
     """
+    metadata, episodes = read_episodes(path)
+    return dataset_of(episodes, metadata, path)
+
+
+def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
+    """Read the metadata and the episodes of a dataset; see `read`."""
     description = read_description(path)
     forms = {"hdf5": _in_hdf5, "arrow": _in_arrow, "parquet": _in_arrow}
     if description.form not in forms:
@@ -78,7 +89,7 @@ def read(path: Path) -> Dataset:
     with closing(forms[description.form](data_folder(path), description)) as stored:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
     reader.warn()
-    return dataset_of(episodes, description.metadata, path)
+    return description.metadata, episodes
 
 
 class _Reader:
@@ -121,7 +132,7 @@ class _Reader:
             truncated=ends[1],
             behavior_probs=stored.own.get("behavior_probs"),
             times_ns=stored.own.get("log_time_ns"),
-            infos=self._infos(stored.infos, count),
+            infos=self._infos(stored, count),
             summary=_summary(stored.attributes, where),
         )
 
@@ -147,18 +158,22 @@ class _Reader:
                 stacklevel=4,
             )
 
-    def _infos(self, infos: Mapping[str, NDArray[Any]], count: int) -> dict[str, Any]:
+    def _infos(self, stored: _Stored, count: int) -> dict[str, Any]:
         """Return the infos with T + 1 rows; those with T rows have none of the reset."""
         found: dict[str, Any] = {}
-        for name, values in infos.items():
+        for name, values in stored.infos.items():
             if values.ndim == 0 or values.dtype == object or len(values) not in (count, count + 1):
                 self._odd_infos.add(name)
                 continue
-            missing = count + 1 - len(values)
-            rows = np.concatenate([np.zeros((missing, *values.shape[1:]), values.dtype), values])
-            mask = np.zeros(rows.shape, bool)
-            mask[:missing] = True
-            found[name] = np.ma.MaskedArray(rows, mask)
+            first = count + 1 - len(values)
+            rows = np.concatenate([np.zeros((first, *values.shape[1:]), values.dtype), values])
+            is_missing, dtype = stored.missing.get(name, (np.arange(count + 1) < first, rows.dtype))
+            if len(is_missing) == len(rows):
+                # The length of a text is that of the longest.
+                dtype = rows.dtype if rows.dtype.kind == "U" else dtype
+                found[name] = masked(rows, is_missing.astype(bool), dtype)
+            else:
+                self._odd_infos.add(name)
         return found
 
     def _images(self, leaf: Leaf, values: Any, where: str) -> NDArray[np.uint8]:
@@ -219,8 +234,24 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
                 },
                 infos={} if infos is None else dict(hdf5.arrays_below(infos)),
                 attributes=hdf5.attributes_of(group),
-                own={} if own is None else {name: hdf5.array_in(own, name) for name in own},
+                own={}
+                if own is None
+                else {name: hdf5.array_in(own, name) for name in own if name != MISSING},
+                missing=_missing(own),
             )
+
+
+def _missing(own: Any) -> dict[str, tuple[NDArray[np.bool_], np.dtype[Any]]]:
+    if own is None or not hdf5.has(own, MISSING):
+        return {}
+    group = hdf5.group_in(own, MISSING)
+    try:
+        return {
+            name: (rows, info_type(str(group[name.replace(".", "/")].attrs.get("dtype"))))
+            for name, rows in hdf5.arrays_below(group)
+        }
+    except ValueError as error:
+        raise LogError(f"{own.file.filename}: {own.name}/{MISSING} is damaged: {error}") from error
 
 
 def _in_arrow(folder: Path, description: Description) -> Generator[_Stored]:

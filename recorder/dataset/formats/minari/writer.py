@@ -20,10 +20,17 @@ from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import episode_slices
 from mcaprl.recorder.dataset.formats.hdf5_nodes import EXTRA, with_names_for_hdf5
+from mcaprl.recorder.dataset.formats.infos import (
+    StoredInfo,
+    infos_of,
+    nested_names,
+    stored_infos,
+)
 from mcaprl.recorder.dataset.formats.minari.description import (
     DATA,
     FILE,
     MAIN,
+    MISSING,
     OWN,
     description_text,
 )
@@ -55,7 +62,9 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     metadata = LogMetadata.from_strings(dataset.metadata)
     space, renamed = with_names_for_hdf5(dataset.observation_space)
     lost = [f"the key '{key}' is renamed, because HDF5 cannot hold its name" for key in renamed]
-    lost += _lost_options(dataset)
+    infos, lost_infos = stored_infos(infos_of(dataset))
+    info_names, lost_names = nested_names(infos)
+    lost += [*_lost_options(dataset), *lost_infos, *lost_names]
     if lost and not lossy:
         raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write it")
     leaves = observation_leaves(dataset.observation_space)
@@ -77,6 +86,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             _put(group, "terminations", dataset.terminated[steps])
             _put(group, "truncations", dataset.truncated[steps])
             group.create_group("infos")
+            for name, parts in info_names.items():
+                _put_info(group, "/".join(parts), infos[name].rows(frames))
             _put(group, f"{OWN}/behavior_probs", dataset.behavior_probs[steps])
             _put(group, f"{OWN}/log_time_ns", episode.log_time_ns)
     counts = {
@@ -98,6 +109,25 @@ def _put(group: Any, name: str, values: NDArray[Any], compression: str | None = 
         maxshape=(None, *values.shape[1:]),
         compression=compression,
     )
+
+
+def _put_info(group: Any, name: str, info: StoredInfo) -> None:
+    """Write an info, and which rows are missing; an episode without it has neither."""
+    if info.is_missing.all():
+        return
+    is_text = info.values.dtype.kind == "U"
+    values = info.values.astype(object) if is_text else info.values
+    group.create_dataset(
+        f"infos/{name}",
+        data=values,
+        dtype=import_extra("h5py", EXTRA).string_dtype() if is_text else None,
+        chunks=True if values.size else None,
+        maxshape=(None, *values.shape[1:]) if values.size else None,
+    )
+    # An info that is missing in another episode is stored as floats in all.
+    if info.is_missing.any() or info.values.dtype != info.dtype:
+        _put(group, f"{OWN}/{MISSING}/{name}", info.is_missing)
+        group[f"{OWN}/{MISSING}/{name}"].attrs["dtype"] = info.dtype.str
 
 
 def _put_attributes(group: Any, index: int, summary: EpisodeSummary) -> None:
