@@ -22,7 +22,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, MissingExtraError, SpaceError, import_extra
+from mcaprl.errors import LogError, MissingExtraError, SpaceError, UsageError, import_extra
 from mcaprl.recorder.dataset.arrays import action_space_of, box_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
@@ -94,7 +94,12 @@ def from_buffer(buffer: Any) -> Dataset:
     Raises:
         SpaceError: A log cannot hold a space or dtype of the data.
         LogError: There are no transitions.
+        UsageError: It is not a replay buffer.
     """
+    if not (hasattr(buffer, "episodes") and hasattr(buffer, "dataset_info")):
+        raise UsageError(
+            f"expected a replay buffer of d3rlpy, but this is a {type(buffer).__name__}"
+        )
     info = buffer.dataset_info
     discrete = spaces.Discrete(int(info.action_size))
     episodes = [{name: getattr(e, name) for name in _KEYS} for e in buffer.episodes]

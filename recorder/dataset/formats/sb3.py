@@ -27,6 +27,7 @@ from mcaprl.recorder.format.spaces import (
 )
 
 Order = tuple[int, int, int]
+_MODULE = "stable_baselines3.common.buffers"
 
 
 def to_buffer(
@@ -46,10 +47,10 @@ def to_buffer(
 
     Raises:
         SpaceError: SB3 does not support a space, or a number is too large for float32.
-        UsageError: `buffer_size` is too small, or `n_envs` is not 1.
+        UsageError: `buffer_size` is too small, `n_envs` is not 1, or the buffer refuses an option.
         MissingExtraError: Stable-Baselines3 is not installed.
     """
-    buffers = import_extra("stable_baselines3.common.buffers", "online")
+    buffers = import_extra(_MODULE, "online")
     observation_space, action_space = dataset.observation_space, dataset.action_space
     _check_spaces(observation_space, action_space)
     if options.pop("n_envs", 1) != 1:
@@ -64,7 +65,11 @@ def to_buffer(
         is_dict = isinstance(observation_space, spaces.Dict)
         buffer_class = buffers.DictReplayBuffer if is_dict else buffers.ReplayBuffer
     stored_space = _converted(observation_space, _sb3_order)
-    buffer = buffer_class(size, stored_space, action_space, device=device, **options)
+    try:
+        buffer = buffer_class(size, stored_space, action_space, device=device, **options)
+    # SB3 raises these if the options exclude each other, or do not exist.
+    except (AssertionError, NotImplementedError, TypeError, ValueError) as error:
+        raise UsageError(f"{buffer_class.__name__}: {error}") from error
     _fill_observations(buffer, dataset)
     actions = _scaled(action_space, dataset.actions).reshape(count, -1)
     buffer.actions[:count, 0] = _rounded("action", actions, buffer.actions.dtype)
@@ -99,7 +104,10 @@ def from_buffer(
     Raises:
         SpaceError: A log cannot hold a space or dtype of the data.
         LogError: The buffer is empty, or has lost information and `lossy` is not set.
+        UsageError: It is not a replay buffer.
     """
+    if not isinstance(buffer, import_extra(_MODULE, "online").ReplayBuffer):
+        raise UsageError(f"expected a ReplayBuffer of SB3, but this is a {type(buffer).__name__}")
     rows = _rows_in_order(buffer)
     if not lossy and not buffer.handle_timeout_termination and buffer.dones[rows].any():
         raise LogError(
@@ -122,11 +130,10 @@ def _fill_observations(buffer: Any, dataset: Dataset) -> None:
     count = len(dataset)
     for leaf, part in _parts(dataset.observation_space):
         stored, order = leaf.of(buffer.observations), _sb3_order(part)
-        here, following = (
-            _reordered(np.asarray(leaf.of(values)), order).reshape(count, *stored.shape[2:])
-            for values in (dataset.observations, dataset.next_observations)
-        )
-        stored[:count, 0] = here
+        frames = _reordered(np.asarray(leaf.of(dataset.frames)), order)
+        frames = frames.reshape(len(frames), *stored.shape[2:])
+        stored[:count, 0] = frames[dataset.frame_of_step]
+        following = frames[dataset.frame_of_step + 1]
         if buffer.optimize_memory_usage:
             stored[count % len(stored), 0] = following[-1]
         else:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import mcaprl
 from mcaprl import Dataset
-from mcaprl.errors import LogError, MissingExtraError, SpaceError
+from mcaprl.errors import LogError, MissingExtraError, SpaceError, UsageError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
@@ -230,6 +230,11 @@ def test_a_buffer_of_episodes_is_copied() -> None:
     assert found.frames[:, 0].tolist() == [0, 1, 1, 5, 6]
     assert found.rewards.tolist() == [1, 2, 1]
     assert found.truncated.tolist() == [False, False, True]
+
+
+def test_something_else_than_a_buffer_is_refused() -> None:
+    with pytest.raises(UsageError, match="expected a replay buffer of d3rlpy, but this is a list"):
+        Dataset.from_d3rlpy([])
 
 
 def test_a_missing_d3rlpy_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def _recorded() -> Dataset:
         truncated=False,
         behavior_probs=np.array([0.25, np.nan, 1], np.float32),
         times_ns=np.array([5, 6, 7, 9]),
-        summary={"reason": "goal", "seed": 3, "policy": "random", "epsilon": 0.5},
+        summary={"reason": "goal", "seed": 2**64 - 2, "policy": "random", "epsilon": 0.5},
     )
     second = EpisodeArrays(
         observations=_observations(10, 3),
@@ -101,7 +101,7 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     ]
     found = mcaprl.open(tmp_path / "out")
     _same(dataset, found)
-    assert [e.summary.seed for e in found.episodes] == [3, None]
+    assert [e.summary.seed for e in found.episodes] == [2**64 - 2, None]
     assert [e.summary.reason for e in found.episodes] == ["goal", "time"]
     np.testing.assert_array_equal(found.episodes[1].next_observations["state"][-1], [12, 3])
 

@@ -339,6 +339,12 @@ def test_wrong_arguments_and_empty_buffers() -> None:
         _steps().to_sb3(buffer_size=1)
     with pytest.raises(UsageError, match="n_envs must be 1"):
         _steps().to_sb3(n_envs=2)
+    with pytest.raises(UsageError, match="ReplayBuffer does not support optimize_memory_usage"):
+        _steps().to_sb3(optimize_memory_usage=True)
+    with pytest.raises(UsageError, match="unexpected keyword argument 'gama'"):
+        _steps().to_sb3(gama=0.9)
+    with pytest.raises(UsageError, match="expected a ReplayBuffer of SB3, but this is a list"):
+        Dataset.from_sb3([])
     empty = buffers.ReplayBuffer(3, _VECTOR, spaces.Discrete(2), "cpu")
     with pytest.raises(LogError, match="has no transitions"):
         Dataset.from_sb3(empty)
