@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mcaprl.api.estimate import LogEstimates
     from mcaprl.api.evaluate import Evaluation
 
-_OF_DATA = ("gamma", "epsilon", "updates", "threads", "mapping", "trust_code")
+_OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapping", "trust_code")
 
 
 @click.command()
@@ -47,6 +47,12 @@ _OF_DATA = ("gamma", "epsilon", "updates", "threads", "mapping", "trust_code")
     "--updates",
     type=click.IntRange(1),
     help="With --data: number of gradient steps of the model.  [default: 10000]",
+)
+@click.option(
+    "--estimate-behavior",
+    is_flag=True,
+    default=None,
+    help="With --data: estimate behavior_prob from the actions, for logs without it.",
 )
 @click.option(
     "--threads",
@@ -158,6 +164,8 @@ def _print_estimates(found: LogEstimates) -> None:
     )
     coverage = ", ".join(f"{share:.0%} by {name}" for name, share in found.coverage.items())
     echo(f"logged actions that the policies would take: {coverage}")
+    if found.behavior_estimate is not None:
+        echo(f"estimated behavior_prob: {found.behavior_estimate}")
     if found.behavior_calibration is not None:
         echo(f"behavior_prob of the logs implies {found.behavior_calibration}")
     if (order := found.ranking) is not None:

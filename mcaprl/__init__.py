@@ -24,6 +24,7 @@ from mcaprl.sims import make_sim
 if TYPE_CHECKING:
     from mcaprl import torch
     from mcaprl.api.annotate import annotate
+    from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
@@ -46,6 +47,7 @@ __all__ = [
     "check",
     "convert",
     "estimate",
+    "estimate_behavior",
     "evaluate",
     "export",
     "info",
@@ -69,6 +71,7 @@ __getattr__ = lazy_attributes(
     __name__,
     {f"mcaprl.api.{name}": [name] for name in ("annotate", "estimate", "evaluate", "record")}
     | {
+        "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
         "mcaprl.api.logs": ["check", "info", "layout", "recover"],
         "mcaprl.api.policies": ["export", "load_policy"],

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from mcaprl.api.behavior import estimate_behavior as estimate_of_behavior
 from mcaprl.api.data import Data, MappingFile, named, opened
 from mcaprl.api.policies import Names, as_names, policy_names, trained_policies
 from mcaprl.api.ranges import check_fraction, check_least
@@ -15,6 +16,7 @@ from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.texts import counted
 
 if TYPE_CHECKING:
+    from mcaprl.offline.estimate.behavior import BehaviorEstimate
     from mcaprl.offline.estimate.off_policy import Estimate, PolicyEstimates, StochasticPolicy
     from mcaprl.recorder.dataset.dataset import Dataset
 
@@ -31,6 +33,8 @@ class LogEstimates:
         behavior_return: Mean discounted return of the logged episodes.
         behavior_interval: 95 % interval of that mean.
         behavior_calibration: Number of actions that `behavior_prob` implies; None if unknown.
+        behavior_estimate: Quality of the estimated `behavior_prob`; None if it was not estimated
+            for this evaluation.
         coverage: Mean probability of the logged actions under each policy.
         estimates: Estimate of each policy by each estimator.
         ranking: Order of the policies, best first; None for one policy.
@@ -43,18 +47,20 @@ class LogEstimates:
     behavior_return: float
     behavior_interval: tuple[float, float]
     behavior_calibration: Calibration | None
+    behavior_estimate: BehaviorEstimate | None
     coverage: dict[str, float]
     estimates: tuple[Estimate, ...]
     ranking: dict[str, Any] | None
 
     def to_json(self) -> dict[str, Any]:
         """Return what `evaluate --data --json` prints."""
-        calibrated = self.behavior_calibration
+        calibrated, estimated = self.behavior_calibration, self.behavior_estimate
         return {
             **vars(self),
             "behavior_interval": list(self.behavior_interval),
             "behavior_calibration": calibrated
             and {**calibrated.to_json(), "text": str(calibrated)},
+            "behavior_estimate": estimated and {**estimated.to_json(), "text": str(estimated)},
             "estimates": [estimate.to_json() for estimate in self.estimates],
         }
 
@@ -66,6 +72,7 @@ def estimate(
     gamma: float = 0.97,
     epsilon: float = 0.0,
     updates: int = 10_000,
+    estimate_behavior: bool = False,
     seed: int = 1_000_000,
     threads: int = 1,
     mapping: MappingFile | None = None,
@@ -80,7 +87,10 @@ def estimate(
         data: Dataset, file, folder or glob of logs, or several of them.
         gamma: Discount of the returns.
         epsilon: Probability of a random action instead of the policy's.
-        updates: Number of gradient steps of the model that FQE, DR and WDR use.
+        updates: Number of gradient steps of the model that FQE, DR and WDR use, and upper limit of
+            those for the behavior probabilities.
+        estimate_behavior: Whether the behavior probabilities are estimated from the actions, as by
+            `mcaprl.estimate_behavior`, instead of taken from the logs.
         seed: Seed of the model and of the resampling.
         threads: Number of threads of PyTorch and of the reader.
         mapping: Mapping of another robot's bag; see `open`.
@@ -101,6 +111,13 @@ def estimate(
     check_least(0, seed=seed)
     dataset = opened(data, mapping=mapping, trust_code=trust_code, threads=threads)
     found = _policies(as_names(policies), dataset)
+    behavior = None
+    if estimate_behavior:
+        steps = min(updates, 2_000)
+        behavior = estimate_of_behavior(
+            dataset, updates=steps, seed=seed, threads=threads, progress=progress
+        )
+        dataset = behavior.dataset
     config = replace(FQEConfig(), gamma=gamma, updates=updates)
     evaluator = OffPolicyEvaluator(dataset, config, seed)
     results: list[PolicyEstimates] = []
@@ -121,6 +138,7 @@ def estimate(
         evaluator.behavior_return,
         evaluator.behavior_interval,
         calibration(dataset.behavior_probs, dataset.action_space),
+        behavior,
         {result.policy: result.coverage for result in results},
         tuple(estimates),
         ranking(estimates) if len(found) > 1 else None,

@@ -49,6 +49,7 @@ class LogInfo:
         actions: Action space.
         action_counts: Number of times each action was taken, by its name.
         behavior_prob: Number of actions that `behavior_prob` implies; None if unknown.
+        behavior_estimated: Whether `behavior_prob` was estimated, not logged by the policy.
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
         size_bytes: Size of all files.
@@ -70,6 +71,7 @@ class LogInfo:
     actions: str
     action_counts: dict[str, int]
     behavior_prob: Calibration | None
+    behavior_estimated: bool
     policies: list[str]
     ends: dict[str, int]
     size_bytes: int
@@ -98,7 +100,7 @@ class LogInfo:
     def rows(self) -> list[tuple[str, str]]:
         """Return the names and texts of the facts."""
         low, high = self.return_range
-        found = self.behavior_prob
+        found, origin = self.behavior_prob, "estimated, " if self.behavior_estimated else ""
         return [
             ("environment", self.env_id or "unknown"),
             ("files", f"{len(self.sources)}, {size(self.size_bytes)}"),
@@ -110,7 +112,7 @@ class LogInfo:
             ("storage", self.storage),
             ("actions", _short(self.actions)),
             ("action counts", _counts(self.action_counts) or "-"),
-            ("behavior_prob", "unknown" if found is None else f"implies {found}"),
+            ("behavior_prob", "unknown" if found is None else f"{origin}implies {found}"),
             ("policies", ", ".join(self.policies) or "unknown"),
             ("ends", _counts(self.ends)),
         ]
@@ -181,6 +183,7 @@ def _describe(
             for action, count in statistics.action_counts.items()
         },
         behavior_prob=calibration(dataset.behavior_probs, dataset.action_space),
+        behavior_estimated=dataset.has_estimated_probs,
         policies=sorted({episode.policy for episode in dataset.episodes if episode.policy}),
         ends=dict(statistics.ends),
         size_bytes=sum(size_of(path) for path in paths),

@@ -7,7 +7,7 @@ rewards missing after a truncation; the others do not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -37,6 +37,8 @@ LARGEST_WEIGHT: Final = 1e100
 RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
+BY_ESTIMATES: Final = "; behavior_prob is estimated"
+"""End of the verdicts that rest on estimated behavior probabilities."""
 PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS")
 """Estimators for rankings, from the most to the least reliable."""
 _ROWS_AT_ONCE = 4096
@@ -62,6 +64,7 @@ class Estimate:
         interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
         effective_sample_size: Number of the policy's own episodes that would be as informative.
         verdict: `ok`, or `refused: ` or `no interval: ` and the reason. FQE is never `ok`.
+            A verdict that rests on estimated behavior probabilities ends with `BY_ESTIMATES`.
     """
 
     policy: str
@@ -74,7 +77,7 @@ class Estimate:
     @property
     def trusted(self) -> bool:
         """Whether the estimate may be used to choose a policy."""
-        return self.verdict == TRUSTED
+        return self.verdict.removesuffix(BY_ESTIMATES) == TRUSTED
 
     def to_json(self) -> dict[str, Any]:
         """Return the attributes, as `mcaprl evaluate --data --json` prints them."""
@@ -176,8 +179,10 @@ class OffPolicyEvaluator:
             found = [self._estimate(name, each, table) for each in ESTIMATORS]
         else:
             found = [Estimate(name, each, None, None, 0.0, refused) for each in ESTIMATORS]
-        fqe = self._fqe_estimate(name, v, weights)
-        return PolicyEstimates(name, float(own.mean()), (fqe, *found))
+        every = (self._fqe_estimate(name, v, weights), *found)
+        if self._dataset.has_estimated_probs:
+            every = tuple(replace(one, verdict=f"{one.verdict}{BY_ESTIMATES}") for one in every)
+        return PolicyEstimates(name, float(own.mean()), every)
 
     @property
     def updates_of_model(self) -> int:
@@ -322,7 +327,7 @@ def _unusable(behavior: Floats) -> str | None:
     """Return a refusal if logged probabilities are missing or impossible, else None."""
     for wrong, what in (
         (is_impossible(behavior), "not in (0, 1]"),
-        (np.isnan(behavior), "unknown"),
+        (np.isnan(behavior), "unknown; --estimate-behavior estimates it"),
     ):
         if wrong.any():
             return f"refused: behavior_prob of {wrong.sum()} of {len(wrong)} steps is {what}"

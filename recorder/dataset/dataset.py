@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -18,7 +19,7 @@ from mcaprl.recorder.dataset.episode import Episode, shapes
 from mcaprl.recorder.dataset.mapped import MappedImages, rows_of
 from mcaprl.recorder.dataset.statistics import Statistics, describe_columns
 from mcaprl.recorder.dataset.transitions import STEP_COLUMNS, TransitionBatch, Transitions
-from mcaprl.recorder.format.metadata import LogMetadata
+from mcaprl.recorder.format.metadata import ESTIMATED, LogMetadata
 from mcaprl.recorder.format.spaces import leaves_of, nest, space_to_json
 
 if TYPE_CHECKING:
@@ -190,6 +191,11 @@ class Dataset(Conversions):
         return self._transitions.behavior_probs
 
     @property
+    def has_estimated_probs(self) -> bool:
+        """Whether `behavior_probs` were estimated from the actions, not logged by the policy."""
+        return bool(self._description.behavior_prob)
+
+    @property
     def env_id(self) -> str:
         """Gymnasium id of the environment; empty if unknown."""
         return self._description.env_id
@@ -263,6 +269,27 @@ class Dataset(Conversions):
     def filter(self, keep: Callable[[Episode], bool]) -> Dataset:
         """Return a copy with only the episodes for which `keep` returns true."""
         return self._take([episode.index for episode in self.episodes if keep(episode)])
+
+    def with_behavior_probs(self, probs: NDArray[Any], *, estimated: bool = False) -> Dataset:
+        """Return the same transitions with other behavior probabilities.
+
+        Args:
+            probs: (N,) probability of each action under the behavior policy; NaN if unknown.
+            estimated: Whether they are estimates. Saving the dataset keeps this mark, and
+                estimates that use the probabilities say it.
+
+        Raises:
+            SpaceError: The number of probabilities is not that of the transitions.
+        """
+        column = np.asarray(probs, np.float32)
+        if column.shape != (len(self),):
+            raise SpaceError(f"probs has shape {column.shape}, expected {(len(self),)}")
+        mark = ESTIMATED if estimated else ""
+        return Dataset(
+            dataclasses.replace(self._transitions, behavior_probs=column),
+            dataclasses.replace(self._description, behavior_prob=mark),
+            sources=self.sources,
+        )
 
     def batch(self, steps: NDArray[np.integer[Any]]) -> TransitionBatch:
         """Copy the transitions with indexes (B,), reading images from disk if needed.

@@ -182,7 +182,14 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             f"behavior_prob is unknown in {unknown} of {_count(len(dataset), 'step')}",
             _places(dataset, lambda episode: np.isnan(episode.behavior_probs)),
-            "off-policy evaluation by importance sampling is not possible",
+            "off-policy evaluation by importance sampling is not possible without"
+            " --estimate-behavior",
+        )
+    elif dataset.has_estimated_probs:
+        yield _note(
+            "behavior_prob is estimated",
+            "all steps",
+            "off-policy estimates have an error that their intervals do not contain",
         )
 
 

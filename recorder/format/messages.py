@@ -87,7 +87,7 @@ def decode(data: bytes, type_name: str) -> Any:
         return typestore().deserialize_cdr(data, type_name)
     # The library raises errors of many types when the bytes do not fit the type.
     except Exception as error:
-        raise CorruptLogError(f"{len(data)} bytes are not a {type_name}: {error}") from error
+        raise CorruptLogError(f"cannot decode {len(data)} bytes as {type_name}: {error}") from error
 
 
 def episode_message(

@@ -18,6 +18,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     step_duration_ns    simulated time between two records
     policy, epsilon, seed   values at the start of the recording; empty if unknown
     versions            JSON object: package -> version
+    behavior_prob       "estimated" if the probabilities of the actions were not logged but
+                        estimated afterwards; otherwise absent
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ from mcaprl.recorder.format.spaces import action_leaf, leaves_of, space_from_jso
 from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
+ESTIMATED = "estimated"
 # A plot of more actions than this is not readable if their names are only numbers.
 MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
@@ -90,6 +93,8 @@ class LogMetadata:
         epsilon: Probability of a random action, as text; empty if unknown.
         seed: Seed of the recording, as text; empty if unknown.
         versions: Versions of the packages that the recording ran with.
+        behavior_prob: `ESTIMATED` if the probabilities of the actions were estimated; otherwise
+            empty.
     """
 
     observation_space: spaces.Space[Any]
@@ -105,6 +110,7 @@ class LogMetadata:
     epsilon: str = ""
     seed: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
+    behavior_prob: str = ""
 
     def action_names(self) -> dict[int, str]:
         """Return the names of the discrete actions by value; empty for other action spaces.
@@ -151,6 +157,7 @@ class LogMetadata:
             "epsilon": self.epsilon,
             "seed": self.seed,
             "versions": json.dumps(dict(self.versions)),
+            **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
         }
 
     @classmethod
@@ -185,6 +192,7 @@ class LogMetadata:
                 epsilon=strings.get("epsilon", ""),
                 seed=strings.get("seed", ""),
                 versions=_object(strings, "versions"),
+                behavior_prob=strings.get("behavior_prob", ""),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(
@@ -193,7 +201,10 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Keep the fields that are equal in all parts. The spaces of all parts must be equal."""
+        """Keep the fields that are equal in all parts. The spaces of all parts must be equal.
+
+        If the probabilities of a part are estimated, those of the result count as estimated.
+        """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)
         differing = {
@@ -201,7 +212,8 @@ class LogMetadata:
             for field_ in fields(cls)
             if any(getattr(other, field_.name) != getattr(first, field_.name) for other in others)
         }
-        return replace(first, **differing)
+        estimated = any(part.behavior_prob for part in parts)
+        return replace(first, **{**differing, "behavior_prob": ESTIMATED if estimated else ""})
 
     @classmethod
     def of_env(

@@ -105,7 +105,9 @@ def _calibration_section(dataset: Dataset) -> list[Section]:
         for one in found.ranges
     ]
     table = Table(("behavior_prob", "share of steps", "actions per state"), rows)
-    return [Section("Behavior probabilities", f"behavior_prob implies {found}.", table=table)]
+    origin = "The probabilities are estimated. " if dataset.has_estimated_probs else ""
+    text = f"{origin}behavior_prob implies {found}."
+    return [Section("Behavior probabilities", text, table=table)]
 
 
 def _figures(dataset: Dataset, tracks: Sequence[Positions]) -> list[Figure]:

@@ -1,0 +1,60 @@
+"""Estimates of the probabilities with which the actions of a log were chosen."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mcaprl.api.data import Data, MappingFile, opened
+from mcaprl.api.ranges import check_least
+from mcaprl.api.train import torch_threads
+from mcaprl.progress import ProgressBar, no_progress
+
+if TYPE_CHECKING:
+    from mcaprl.offline.estimate.behavior import BehaviorEstimate
+
+
+def estimate_behavior(
+    data: Data,
+    *,
+    folds: int = 5,
+    updates: int = 2_000,
+    seed: int = 0,
+    threads: int = 1,
+    mapping: MappingFile | None = None,
+    trust_code: bool = False,
+    progress: ProgressBar = no_progress,
+) -> BehaviorEstimate:
+    """Estimate the probability of each logged action under the policy that took it.
+
+    Most robots do not log these probabilities, but the estimators by importance weights need them.
+    A classifier of the actions is fitted to all other parts of the episodes, and calibrated on
+    episodes that it was not trained on.
+
+    Args:
+        data: Dataset, file, folder or glob of logs, or several of them; actions are discrete.
+        folds: Number of parts of the episodes; each part is predicted from the others.
+        updates: Number of gradient steps for each fold.
+        seed: Seed of the folds and of the networks.
+        threads: Number of threads of PyTorch and of the reader.
+        mapping: Mapping of another robot's bag; see `open`.
+        trust_code: Whether the mapping may name a Python function.
+        progress: Function that opens a progress bar.
+
+    Returns:
+        The dataset with the estimates, which are marked as such, and their calibration.
+
+    Raises:
+        SpaceError: The actions are not discrete.
+        UsageError: There are too few episodes.
+        LogError: The logs cannot be read.
+    """
+    from mcaprl.offline.estimate import behavior
+
+    check_least(1, updates=updates, threads=threads)
+    check_least(2, folds=folds)
+    dataset = opened(data, mapping=mapping, trust_code=trust_code, threads=threads)
+    text = f"estimating behavior_prob in {folds} folds"
+    with torch_threads(threads), progress(text, folds * updates) as advance:
+        return behavior.estimate_behavior(
+            dataset, folds=folds, updates=updates, seed=seed, on_update=lambda: advance(1)
+        )

@@ -1,0 +1,273 @@
+"""Estimation of the probabilities with which an unknown policy chose the actions of a log.
+
+A classifier of the actions (behavior cloning) is fitted to a part of the episodes and predicts the
+others, so no episode's probabilities come from a network that was trained on it (cross-fitting).
+The predictions are calibrated on episodes that the network was not trained on: the temperature
+follows Guo et al., "On Calibration of Modern Neural Networks", https://arxiv.org/abs/1706.04599.
+A share of the uniform distribution is added, because many behavior policies choose some actions at
+random.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mcaprl.errors import UsageError
+from mcaprl.offline.algorithms.bc import BC, BCConfig
+from mcaprl.offline.algorithms.models import outputs_of_buffer
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.recorder.dataset.calibration import EDGES
+from mcaprl.recorder.dataset.dataset import Dataset
+
+Floats = NDArray[np.float64]
+
+FOLDS: Final = 5
+UPDATES: Final = 2_000
+_VALIDATED: Final = 0.15
+"""Share of a fold's training episodes on which the predictions are calibrated."""
+_CHECKS = 20
+"""Number of times that the network is scored during its training; the best weights are used."""
+_TEMPERATURES = np.geomspace(0.25, 4.0, 17)
+_UNIFORM_SHARES = np.array([0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0])
+_SMALLEST = 1e-6
+
+
+@dataclass(frozen=True)
+class FoldScore:
+    """Quality of the predictions for one fold.
+
+    Attributes:
+        episodes: Number of episodes that were predicted.
+        log_likelihood: Mean log probability of the actions taken.
+        marginal: The same, if every action had its frequency in the training episodes.
+        uniform: The same, if all actions were equally probable.
+        temperature: Divisor of the network's logits.
+        uniform_share: Share of the uniform distribution in the prediction.
+    """
+
+    episodes: int
+    log_likelihood: float
+    marginal: float
+    uniform: float
+    temperature: float
+    uniform_share: float
+
+
+@dataclass(frozen=True)
+class ReliabilityRange:
+    """The predictions, one for each step and action, in a range of probabilities.
+
+    Attributes:
+        low, high: Range (low, high].
+        predictions: Number of predictions.
+        predicted: Mean predicted probability.
+        observed: Share of the predictions whose action was taken.
+    """
+
+    low: float
+    high: float
+    predictions: int
+    predicted: float
+    observed: float
+
+
+@dataclass(frozen=True)
+class BehaviorEstimate:
+    """Estimated behavior probabilities, with their quality.
+
+    Attributes:
+        dataset: The dataset with the estimates in `behavior_probs`, marked as estimated.
+        folds: Quality for each fold.
+        reliability: Predicted and observed frequencies, by range of the predicted probability.
+        calibration_error: Mean distance of predicted and observed frequency, weighted by the number
+            of predictions.
+        log_likelihood: Mean log probability of the actions taken.
+    """
+
+    dataset: Dataset = field(repr=False)
+    folds: tuple[FoldScore, ...]
+    reliability: tuple[ReliabilityRange, ...]
+    calibration_error: float
+    log_likelihood: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything but the dataset, as JSON types."""
+        return {
+            "folds": [vars(fold) for fold in self.folds],
+            "reliability": [vars(one) for one in self.reliability],
+            "calibration_error": self.calibration_error,
+            "log_likelihood": self.log_likelihood,
+        }
+
+    def __str__(self) -> str:
+        """Return a one-line summary."""
+        uniform = float(np.mean([fold.uniform for fold in self.folds]))
+        marginal = float(np.mean([fold.marginal for fold in self.folds]))
+        return (
+            f"mean log probability {self.log_likelihood:.3f} (frequencies {marginal:.3f}, uniform"
+            f" {uniform:.3f}), calibration error {self.calibration_error:.3f}, {len(self.folds)}"
+            " folds"
+        )
+
+
+def estimate_behavior(
+    dataset: Dataset,
+    *,
+    folds: int = FOLDS,
+    updates: int = UPDATES,
+    seed: int = 0,
+    on_update: Callable[[], None] = lambda: None,
+) -> BehaviorEstimate:
+    """Estimate the probability of each action under the policy that took it.
+
+    Args:
+        dataset: Dataset with discrete actions; its `behavior_probs` are ignored.
+        folds: Number of parts of the episodes; each part is predicted from the others.
+        updates: Number of gradient steps for each fold.
+        seed: Seed of the folds and of the networks.
+        on_update: Callback for each gradient step.
+
+    Raises:
+        SpaceError: The actions are not discrete.
+        TrainingError: There are no transitions, or a number is not finite.
+        UsageError: There are fewer than two folds, or too few episodes for them.
+    """
+    count = len(dataset.episode_lengths)
+    if folds < 2 or updates < 1:
+        raise UsageError(f"folds is {folds} and updates {updates}: expected 2 and 1, or more")
+    if count < max(folds, 3):
+        raise UsageError(
+            f"estimating behavior_prob in {folds} folds needs {max(folds, 3)} episodes or more;"
+            f" there are {count}"
+        )
+    config = BCConfig(updates=updates, normalize=True)
+    buffer = TransitionBuffer.from_dataset(dataset, config.packing)
+    allowed = _allowed(buffer)
+    random = np.random.default_rng(seed)
+    fold_of = random.permutation(count) % folds
+    predicted = np.empty((len(buffer), int(buffer.action_space.n)))
+    scores = []
+    for fold in range(folds):
+        held_out = fold_of == fold
+        validated = _validation(~held_out, random)
+        mine = np.repeat(held_out, dataset.episode_lengths)
+        checked = np.repeat(validated, dataset.episode_lengths)
+        learner = BC(config, buffer.with_weights((~mine & ~checked).astype(float)), [seed + fold])
+        found, score = _fitted(learner, allowed, mine, checked, on_update)
+        predicted[mine] = found[mine]
+        scores.append(dataclasses.replace(score, episodes=int(held_out.sum())))
+    actions = buffer.actions.numpy()
+    taken = predicted[np.arange(len(actions)), actions].astype(np.float32)
+    ranges = reliability(predicted, actions)
+    pairs = sum(one.predictions for one in ranges)
+    error = sum(one.predictions * abs(one.predicted - one.observed) for one in ranges) / pairs
+    return BehaviorEstimate(
+        dataset=dataset.with_behavior_probs(taken, estimated=True),
+        folds=tuple(scores),
+        reliability=ranges,
+        calibration_error=float(error),
+        log_likelihood=float(np.log(taken).mean()),
+    )
+
+
+def reliability(predicted: Floats, actions: NDArray[np.int64]) -> tuple[ReliabilityRange, ...]:
+    """Compare predicted probabilities (N, A) with the frequencies of the actions (N,)."""
+    taken = np.zeros(predicted.shape, bool)
+    taken[np.arange(len(actions)), actions] = True
+    place = np.searchsorted(EDGES, predicted.ravel())
+    found = []
+    for k in np.unique(place).tolist():
+        here = place == k
+        found.append(
+            ReliabilityRange(
+                low=EDGES[k - 1] if k else 0.0,
+                high=EDGES[min(k, len(EDGES) - 1)],
+                predictions=int(here.sum()),
+                predicted=float(predicted.ravel()[here].mean()),
+                observed=float(taken.ravel()[here].mean()),
+            )
+        )
+    return tuple(found)
+
+
+def _validation(training: NDArray[np.bool_], random: np.random.Generator) -> NDArray[np.bool_]:
+    """Choose some of the training episodes (E,), at least one and not all."""
+    chosen = np.zeros(len(training), bool)
+    episodes = random.permutation(np.flatnonzero(training))
+    chosen[episodes[: max(round(_VALIDATED * len(episodes)), 1)]] = True
+    return chosen
+
+
+def _allowed(buffer: TransitionBuffer) -> NDArray[np.bool_]:
+    """Return the allowed actions (N, A) of each step."""
+    mask = buffer.observe(buffer.places[0]).mask
+    if mask is None:
+        return np.ones((len(buffer), int(buffer.action_space.n)), bool)
+    return mask.numpy().astype(bool)
+
+
+def _fitted(
+    learner: BC,
+    allowed: NDArray[np.bool_],
+    held_out: NDArray[np.bool_],
+    validated: NDArray[np.bool_],
+    on_update: Callable[[], None],
+) -> tuple[Floats, FoldScore]:
+    """Train a network; return the probabilities (N, A) of its best weights, and their score."""
+    buffer, updates = learner.buffer, learner.config.updates
+    actions = buffer.actions.numpy()
+    checks = set(np.linspace(0, updates, _CHECKS + 1).round().astype(int).tolist())
+    best: Floats = np.empty((0, 0))
+    best_score, best_fit = -np.inf, (1.0, 0.0)
+    for number in range(1, updates + 1):
+        learner.update()
+        on_update()
+        if number in checks:
+            with torch.no_grad():
+                logits = outputs_of_buffer(learner.models["logits"], buffer, next_states=False)
+            raw = np.where(allowed, logits.numpy().astype(np.float64), -np.inf)
+            score, *fit = _calibrated(raw[validated], actions[validated])
+            if score > best_score:
+                best, best_score, best_fit = raw, score, (fit[0], fit[1])
+    probabilities = _probabilities(best, *best_fit)
+    trained = ~held_out & ~validated
+    frequencies = np.bincount(actions[trained | validated], minlength=best.shape[1]) + 1.0
+    marginal = np.log(frequencies / frequencies.sum())[actions[held_out]]
+    own = probabilities[held_out, actions[held_out]]
+    return probabilities, FoldScore(
+        episodes=0,
+        log_likelihood=float(np.log(own).mean()),
+        marginal=float(marginal.mean()),
+        uniform=float(-np.log(allowed[held_out].sum(axis=1)).mean()),
+        temperature=best_fit[0],
+        uniform_share=best_fit[1],
+    )
+
+
+def _calibrated(logits: Floats, actions: NDArray[np.int64]) -> tuple[float, float, float]:
+    """Return the best mean log probability, with its temperature and share of the uniform."""
+    candidates = []
+    for temperature in _TEMPERATURES.tolist():
+        own = _probabilities(logits, temperature, 0.0)[np.arange(len(actions)), actions]
+        uniform = _UNIFORM_SHARES / np.isfinite(logits).sum(axis=1)[:, None]
+        mixed = (1 - _UNIFORM_SHARES) * own[:, None] + uniform
+        means = np.log(np.maximum(mixed, _SMALLEST)).mean(axis=0)
+        share = int(means.argmax())
+        candidates.append((float(means[share]), temperature, float(_UNIFORM_SHARES[share])))
+    return max(candidates)
+
+
+def _probabilities(logits: Floats, temperature: float, uniform_share: float) -> Floats:
+    """Return the softmax (N, A) of scaled logits, mixed with the uniform distribution."""
+    own = torch.softmax(torch.from_numpy(logits / temperature), dim=1).numpy()
+    allowed = np.isfinite(logits)
+    uniform = allowed / allowed.sum(axis=1, keepdims=True)
+    mixed: Floats = (1 - uniform_share) * own + uniform_share * uniform
+    return np.clip(mixed, np.where(allowed, _SMALLEST, 0.0), 1.0)
