@@ -137,7 +137,9 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
                 several = isinstance(values, list)
                 for number, array in enumerate(values if several else [values]):
                     place = f"{name}_{index}_{number}" if several else f"{name}_{index}"
-                    file[place] = array
+                    is_image = isinstance(array, np.ndarray) and array.ndim == 4
+                    compression = "lzf" if is_image else None
+                    file.create_dataset(place, data=array, compression=compression)
         file["columns"] = list(_KEYS)
         file["num_episodes"] = len(dataset.episode_lengths)
         file["version"] = VERSION
