@@ -210,7 +210,8 @@ def _put_info(file: Any, name: str, info: StoredInfo, dataset: Dataset) -> None:
 def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: bool) -> None:
     """Write rows of a column block by block, because images on disk need not fit into memory."""
     shape = (len(rows), *column.shape[1:])
-    stored = file.create_dataset(name, shape, column.dtype, compression="lzf" if is_image else None)
+    settings = nodes.image_settings(column) if is_image else {}
+    stored = file.create_dataset(name, shape, column.dtype, **settings)
     for start in range(0, len(rows), _BLOCK_ROWS):
         block = slice(start, start + _BLOCK_ROWS)
         stored[block] = np.asarray(column[rows[block]])

@@ -5,6 +5,7 @@ The files may be of others: sizes are checked, and links to other files are not 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,13 +16,15 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError, import_extra
+from mcaprl.errors import LogError, McaprlError, import_extra
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
 # The filters of HDF5 compress at most to 1/1032. A larger dataset was declared, but never written.
 _MAX_RATIO = 2_000
 _SMALL_BYTES = 1 << 20
+_CHUNK_BYTES = 1 << 18
+_ELSEWHERE = "is stored in another file: copy it into one file"
 
 
 def is_hdf5(path: Path) -> bool:
@@ -45,14 +48,23 @@ def opened(path: Path) -> Iterator[Any]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    # h5py raises RuntimeError for some damaged structures.
-    except (OSError, RuntimeError) as error:
+    except McaprlError:
+        raise
+    # h5py raises errors of many types for damaged structures.
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
         raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
+
+
+def image_settings(column: Any) -> dict[str, Any]:
+    """Return the arguments of `create_dataset` for images (N, *shape): whole images in a chunk."""
+    frame_bytes = math.prod(column.shape[1:]) * column.dtype.itemsize
+    rows = max(1, min(len(column), _CHUNK_BYTES // frame_bytes))
+    return {"chunks": (rows, *column.shape[1:]), "compression": "lzf"}
 
 
 def has(group: Any, name: str) -> bool:
     """Return whether a group has a member with this name."""
-    return group.get(name, getlink=True) is not None
+    return bool(group.id.links.exists(name.encode()))
 
 
 def group_in(parent: Any, name: str) -> Any:
@@ -61,10 +73,10 @@ def group_in(parent: Any, name: str) -> Any:
     Raises:
         LogError: There is no such group.
     """
-    found = _member(parent, name)
-    if not hasattr(found, "keys"):
+    h5py, found = import_extra("h5py", EXTRA), _identifier(parent, name)
+    if not isinstance(found, h5py.h5g.GroupID):
         raise LogError(f"{_place(parent, name)} is not a group")
-    return found
+    return h5py.Group(found)
 
 
 def array_in(parent: Any, name: str) -> NDArray[Any]:
@@ -74,20 +86,25 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
         LogError: There is no such array, or it is not stored in this file.
     """
     h5py = import_extra("h5py", EXTRA)
-    found, place = _member(parent, name), _place(parent, name)
-    if not isinstance(found, h5py.Dataset) or found.shape is None:
-        raise LogError(f"{place} is not an array")
-    if found.is_virtual or found.external:
-        raise LogError(f"{place} is stored in another file: copy it into one file")
-    stored = found.id.get_storage_size()
-    if found.size * found.dtype.itemsize > _MAX_RATIO * stored + _SMALL_BYTES:
-        raise LogError(f"{place} has shape {found.shape}, but only {stored} bytes are stored")
-    if h5py.check_string_dtype(found.dtype) is None:
-        return np.asarray(found[()])
-    try:
-        return np.asarray(found.asstr()[()]).astype(np.str_)
-    except UnicodeDecodeError as error:
-        raise LogError(f"{place} is not UTF-8 text") from error
+    # h5py's lower level is used, because it is several times as fast for small arrays.
+    found = _identifier(parent, name)
+    space = found.get_space() if isinstance(found, h5py.h5d.DatasetID) else None
+    if space is None or space.get_simple_extent_type() == h5py.h5s.NULL:
+        raise LogError(f"{_place(parent, name)} is not an array")
+    dtype, shape, settings = found.dtype, found.shape, found.get_create_plist()
+    if settings.get_layout() == h5py.h5d.VIRTUAL or settings.get_external_count():
+        raise LogError(f"{_place(parent, name)} {_ELSEWHERE}")
+    stored = found.get_storage_size()
+    if math.prod(shape) * dtype.itemsize > _MAX_RATIO * stored + _SMALL_BYTES:
+        raise LogError(
+            f"{_place(parent, name)} has shape {shape}, but only {stored} bytes are stored"
+        )
+    if dtype.kind == "O":
+        return _objects(h5py.Dataset(found), _place(parent, name))
+    values = np.empty(shape, dtype)
+    if values.size:
+        found.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    return values
 
 
 def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
@@ -166,18 +183,28 @@ def is_group(parent: Any, name: str) -> bool:
     Raises:
         LogError: There is no such member.
     """
-    return hasattr(_member(parent, name), "keys")
+    return isinstance(_identifier(parent, name), import_extra("h5py", EXTRA).h5g.GroupID)
 
 
-def _member(parent: Any, name: str) -> Any:
-    h5py = import_extra("h5py", EXTRA)
-    link = parent.get(name, getlink=True)
-    if isinstance(link, h5py.ExternalLink):
-        raise LogError(f"{_place(parent, name)} is stored in another file: copy it into one file")
-    found = None if link is None else parent.get(name)
-    if found is None:
-        raise LogError(f"{_place(parent, name)} is missing")
-    return found
+def _identifier(parent: Any, name: str) -> Any:
+    """Return h5py's lower-level object of a member."""
+    h5py, path = import_extra("h5py", EXTRA), name.encode()
+    try:
+        if parent.id.links.get_info(path).type != h5py.h5l.TYPE_EXTERNAL:
+            return h5py.h5o.open(parent.id, path)
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise LogError(f"{_place(parent, name)} is missing") from error
+    raise LogError(f"{_place(parent, name)} {_ELSEWHERE}")
+
+
+def _objects(array: Any, place: str) -> NDArray[Any]:
+    """Return texts, or arrays of different lengths."""
+    if import_extra("h5py", EXTRA).check_string_dtype(array.dtype) is None:
+        return np.asarray(array[()])
+    try:
+        return np.asarray(array.asstr()[()]).astype(np.str_)
+    except UnicodeDecodeError as error:
+        raise LogError(f"{place} is not UTF-8 text") from error
 
 
 def _place(parent: Any, name: str) -> str:

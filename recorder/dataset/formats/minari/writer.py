@@ -19,7 +19,7 @@ from mcaprl.errors import SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.columns import episode_slices
-from mcaprl.recorder.dataset.formats.hdf5_nodes import EXTRA, with_names_for_hdf5
+from mcaprl.recorder.dataset.formats.hdf5_nodes import EXTRA, image_settings, with_names_for_hdf5
 from mcaprl.recorder.dataset.formats.infos import (
     StoredInfo,
     infos_of,
@@ -80,7 +80,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             for leaf, key, column in zip(leaves, keys, columns, strict=True):
                 values = np.asarray(column[frames])
                 name = "/".join(("observations", *key))
-                _put(group, name, values, compression="lzf" if leaf.encoding else None)
+                _put(group, name, values, **(image_settings(values) if leaf.encoding else {}))
             _put(group, "actions", dataset.actions[steps])
             _put(group, "rewards", dataset.rewards[steps])
             _put(group, "terminations", dataset.terminated[steps])
@@ -88,8 +88,10 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             group.create_group("infos")
             for name, parts in info_names.items():
                 _put_info(group, "/".join(parts), infos[name].rows(frames))
-            _put(group, f"{OWN}/behavior_probs", dataset.behavior_probs[steps])
-            _put(group, f"{OWN}/log_time_ns", episode.log_time_ns)
+            own = group.require_group(OWN)
+            own["log_time_ns"] = episode.log_time_ns
+            if not np.isnan(episode.behavior_probs).all():
+                own["behavior_probs"] = episode.behavior_probs
     counts = {
         "total_episodes": len(dataset.episode_lengths),
         "total_steps": len(dataset),
@@ -100,14 +102,13 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     return lost
 
 
-def _put(group: Any, name: str, values: NDArray[Any], compression: str | None = None) -> None:
+def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
     # Minari appends to arrays that can grow.
     group.create_dataset(
         name,
         data=values,
-        chunks=True,
         maxshape=(None, *values.shape[1:]),
-        compression=compression,
+        **{"chunks": True, **settings},
     )
 
 
