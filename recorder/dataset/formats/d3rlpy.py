@@ -13,7 +13,6 @@ file has a group `mcaprl` with what d3rlpy has no place for; d3rlpy does not rea
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,20 +26,18 @@ from mcaprl.recorder.dataset.arrays import action_space_of, box_of
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats import hdf5_nodes as nodes
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of, episode_slices
-from mcaprl.recorder.dataset.formats.npz import OWN, description_text, parse_description
+from mcaprl.recorder.dataset.formats.d3rlpy_own import read_own, stored_rows, write_own
+from mcaprl.recorder.dataset.formats.infos import infos_of, stored_infos
+from mcaprl.recorder.dataset.formats.npz import OWN
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 from mcaprl.recorder.format.spaces import (
     MIN_IMAGE_EDGE,
-    Leaf,
     action_leaf,
-    leaves_of,
-    nest,
     observation_leaves,
 )
 
 VERSION = "2.1"
 _KEYS = ("observations", "actions", "rewards", "terminated")
-_DESCRIPTION = "description"
 
 
 def matches(path: Path) -> bool:
@@ -113,18 +110,21 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether MultiDiscrete and MultiBinary actions are written; d3rlpy takes them for
-            continuous ones.
+        lossy: Whether actions that d3rlpy takes for something else are written, and infos that
+            cannot be stored are left out.
 
     Returns:
-        One sentence for each thing that d3rlpy takes for something else.
+        One sentence for each of these.
 
     Raises:
-        SpaceError: d3rlpy does not support the action space, and `lossy` is not set.
+        SpaceError: d3rlpy does not support the action space, or an info cannot be stored, and
+            `lossy` is not set.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", nodes.EXTRA)
-    lost = []
+    infos, lost = stored_infos(infos_of(dataset))
+    if lost and not lossy:
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the others")
     try:
         _check_action_space(dataset.action_space)
     except SpaceError as error:
@@ -143,7 +143,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
         file["columns"] = list(_KEYS)
         file["num_episodes"] = len(dataset.episode_lengths)
         file["version"] = VERSION
-        _write_own(file.create_group(OWN), dataset)
+        write_own(file.create_group(OWN), dataset, infos)
     return lost
 
 
@@ -170,7 +170,7 @@ def read(path: Path) -> Dataset:
         ]
         for index, episode in enumerate(episodes):
             _check_arrays(episode, f"{path}: episode {index}")
-        own = _read_own(file, episodes, path) if nodes.has(file, OWN) else None
+        own = read_own(file, episodes, path) if nodes.has(file, OWN) else None
     return own or _dataset_of(episodes, None, path)
 
 
@@ -189,7 +189,7 @@ def _episodes_of(dataset: Dataset) -> Iterator[dict[str, Any]]:
         terminated = bool(dataset.terminated[steps.stop - 1])
         rows = slice(frames.start, frames.stop - terminated)
         more = ((0, 0 if terminated else 1), (0, 0))
-        found = [_stored(leaf, np.asarray(leaf.of(dataset.frames)[rows])) for leaf in leaves]
+        found = [stored_rows(leaf, np.asarray(leaf.of(dataset.frames)[rows])) for leaf in leaves]
         yield {
             "observations": found[0] if len(found) == 1 else found,
             "actions": np.pad(actions[steps], more),
@@ -209,26 +209,6 @@ def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.
     flags = np.zeros((2, len(episode["rewards"])), np.float32)
     flags[0 if episode["terminated"] else 1, -1] = 1
     return flags[0], flags[1]
-
-
-def _stored(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
-    """Return rows (N, *shape) as d3rlpy stores them: images (N, C, H, W), or vectors (N, size)."""
-    if leaf.dtype == np.uint8 and len(leaf.shape) == 3 and sorted(leaf.shape)[1] >= MIN_IMAGE_EDGE:
-        is_first = leaf.shape[0] == min(leaf.shape)
-        return values if is_first else np.moveaxis(values, -1, 1)
-    if leaf.encoding is not None:
-        return values[:, None]
-    return values.reshape(len(values), leaf.size)
-
-
-def _restored(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
-    """Return rows (N, *shape) for those that `_stored` returned."""
-    empty = np.empty((1, *leaf.shape), leaf.dtype)
-    if values.shape[1:] != _stored(leaf, empty).shape[1:]:
-        raise LogError(f"{leaf.name} has rows of shape {values.shape[1:]}")
-    is_moved = values.ndim == 4 and values.shape[1:] != leaf.shape and len(leaf.shape) == 3
-    ordered = np.moveaxis(values, 1, -1) if is_moved else values
-    return ordered.reshape(len(values), *leaf.shape)
 
 
 def _dataset_of(
@@ -312,63 +292,3 @@ def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
         raise LogError(f"{where} has arrays that are not numbers")
     if not parts[-1].size or parts[-1].shape[1] != 1 or episode["terminated"].ndim:
         raise LogError(f"{where} has no rewards, or more than one for each step")
-
-
-def _write_own(group: Any, dataset: Dataset) -> None:
-    """Store what d3rlpy has no place for."""
-    lasts = np.cumsum(dataset.episode_lengths) - 1
-    ends = dataset.frame_of_step[lasts[dataset.terminated[lasts]]] + 1
-    names = []
-    for number, leaf in enumerate(observation_leaves(dataset.observation_space)):
-        names.append(f"final_observations_{number}")
-        group[names[-1]] = _stored(leaf, np.asarray(leaf.of(dataset.frames)[ends]))
-    group[_DESCRIPTION] = description_text(dataset, names)
-    group["truncated"] = dataset.truncated[lasts]
-    group["behavior_probs"] = dataset.behavior_probs
-    group["log_time_ns"] = np.concatenate([e.log_time_ns for e in dataset.episodes])
-
-
-def _read_own(file: Any, episodes: Sequence[Mapping[str, Any]], path: Path) -> Dataset | None:
-    """Return the dataset that was written; None if the episodes have changed since."""
-    group = nodes.group_in(file, OWN)
-    text = str(nodes.array_in(group, _DESCRIPTION))
-    metadata, summaries, names = parse_description(text, path)
-    leaves, action = leaves_of(metadata.observation_space), action_leaf(metadata.action_space)
-    finals = [nodes.array_in(group, name) for name in names]
-    truncated, probabilities, times = (
-        nodes.array_in(group, name) for name in ("truncated", "behavior_probs", "log_time_ns")
-    )
-    lengths = [len(e["rewards"]) - (not e["terminated"]) for e in episodes]
-    terminated = sum(bool(e["terminated"]) for e in episodes)
-    same = len(episodes) == len(summaries) == len(truncated) and len(finals) == len(leaves)
-    same &= sum(lengths) == len(probabilities) == len(times) - len(episodes)
-    if not same or any(len(final) != terminated for final in finals):
-        warnings.warn(
-            f"{path}: {OWN} is ignored, because the episodes were changed after it was written",
-            stacklevel=4,
-        )
-        return None
-    found, step, end = [], 0, 0
-    for index, (episode, length) in enumerate(zip(episodes, lengths, strict=True)):
-        stored = episode["observations"]
-        rows = stored if isinstance(stored, list) else [stored]
-        if episode["terminated"]:
-            rows = [
-                np.concatenate([part, final[end : end + 1]])
-                for part, final in zip(rows, finals, strict=True)
-            ]
-            end += 1
-        frames = [_restored(leaf, part) for leaf, part in zip(leaves, rows, strict=True)]
-        arrays = EpisodeArrays(
-            observations=nest(leaves, frames),
-            actions=episode["actions"][:length].reshape(-1, *action.shape),
-            rewards=episode["rewards"][:length, 0],
-            terminated=bool(episode["terminated"]),
-            truncated=bool(truncated[index]),
-            behavior_probs=probabilities[step : step + length],
-            times_ns=times[step + index : step + index + length + 1],
-            summary=summaries[index],
-        )
-        found.append(arrays)
-        step += length
-    return dataset_of(found, metadata, path)
