@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,6 +67,7 @@ class _Request:
     sim_options: Mapping[str, Any]
     scene: bool
     camera: bool
+    infos: bool | Sequence[str]
     compression: str
     overwrite: bool
     append: bool
@@ -89,6 +90,7 @@ def record(
     sim_options: Mapping[str, Any] | None = None,
     scene: bool = True,
     camera: bool = False,
+    infos: bool | Sequence[str] = False,
     compression: str = "zstd",
     overwrite: bool = False,
     append: bool = False,
@@ -112,6 +114,7 @@ def record(
         sim_options: Other arguments of the environment.
         scene: Whether topics that only viewers use are recorded.
         camera: Whether metric depth images are recorded.
+        infos: Whether the infos of the environment are recorded, or the names of those that are.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
@@ -135,6 +138,7 @@ def record(
         sim_options=all_options(observation, rules, sim_options),
         scene=scene,
         camera=camera,
+        infos=infos,
         compression=compression,
         overwrite=overwrite,
         append=append,
@@ -227,6 +231,7 @@ def _recorder(request: _Request, env: gym.Env[Any, Any], behavior: EpsilonGreedy
         max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
         scene=request.scene,
         camera=request.camera,
+        infos=request.infos,
     )
 
 

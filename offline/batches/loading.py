@@ -180,6 +180,7 @@ class _Shared(NamedTuple):
         columns = Transitions(
             frames=tuple(leaf.numpy() for leaf in self.frames),
             episodes=self.episodes,
+            infos={},
             **{name: column.numpy() for name, column in self.columns.items()},
         )
         return Dataset(columns, self.description, sources=self.sources)

@@ -87,7 +87,7 @@ def columns_of_arrays(
         summaries.append(summary)
     times = np.empty(steps + len(summaries), np.int64)
     transitions = Transitions(
-        frames=frames, log_time_ns=times, episodes=tuple(summaries), **columns
+        frames=frames, log_time_ns=times, episodes=tuple(summaries), infos={}, **columns
     )
     return with_fresh_times(transitions, 0, description.step_duration_ns)
 

@@ -191,6 +191,15 @@ class Dataset(Conversions):
         return self._transitions.behavior_probs
 
     @property
+    def infos(self) -> dict[str, np.ma.MaskedArray[Any, Any]]:
+        """(F, *shape) masked array of each info by its dotted name, such as `episode.r`.
+
+        Row k is what the environment returned with row k of `frames`, masked where it returned
+        none. Empty if no infos were recorded.
+        """
+        return dict(self._transitions.infos)
+
+    @property
     def has_estimated_probs(self) -> bool:
         """Whether `behavior_probs` were estimated from the actions, not logged by the policy."""
         return bool(self._description.behavior_prob)
@@ -244,6 +253,7 @@ class Dataset(Conversions):
                 next_observations=self._frames(slice(frame + 1, last + 1)),
                 log_time_ns=columns.log_time_ns[frame : last + 1],
                 summary=summary,
+                infos={name: info[frame : last + 1] for name, info in columns.infos.items()},
                 **columns.at(slice(step, step + summary.length)),
             )
             found.append(episode)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.infos import Masked
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -26,6 +28,7 @@ class Episode:
         behavior_probs: (T,) float32; NaN where unknown.
         log_time_ns: (T + 1,) log_time of each observation, nanoseconds.
         summary: The log's summary of the episode: seed, end reason, policy, ...
+        infos: (T + 1, *shape) masked array of each info by its dotted name; see `Dataset.infos`.
     """
 
     index: int
@@ -38,6 +41,7 @@ class Episode:
     behavior_probs: NDArray[np.float32]
     log_time_ns: NDArray[np.int64]
     summary: EpisodeSummary
+    infos: Mapping[str, Masked] = field(default_factory=dict)
 
     @property
     def length(self) -> int:

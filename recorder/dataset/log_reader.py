@@ -26,6 +26,7 @@ from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.format.infos import read_infos
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
 from mcaprl.recorder.format.schema import is_intact, stored_dtype
@@ -183,6 +184,7 @@ class LogReader:
             terminated=_without(_flags(columns["terminated"]), finals),
             truncated=_without(_flags(columns["truncated"]), finals),
             behavior_probs=_without(probs.astype(np.float32, copy=False), finals),
+            infos=read_infos(self._reader, columns[LOG_TIME]),
         )
         if self._selection.columns is not None:
             metadata = replace(

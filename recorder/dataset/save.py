@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from mcaprl.errors import LogError
+from mcaprl.errors import LogError, SpaceError
 from mcaprl.files import replacing
 from mcaprl.recorder.dataset.arrays import with_fresh_times
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.info_topics import InfoTopics, info_array
 from mcaprl.recorder.format.log_writer import LogWriter
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, observation_leaves
+from mcaprl.recorder.format.topics import STEPS_PER_CHUNK
 
 
 def save_log(
@@ -46,6 +48,7 @@ def save_log(
         log = LogWriter(unfinished, metadata, compression=compression)
         try:
             _write_images(log, columns)
+            _write_infos(path, log, columns)
             log.write_episodes([e._replace(episode=k) for k, e in enumerate(columns.episodes)])
             _write_steps(log, columns)
             log.close()
@@ -58,6 +61,26 @@ def _write_images(log: LogWriter, columns: Transitions) -> None:
         if leaf.encoding is not None:
             rows = log.image_rows(leaf.topic, leaf.shape, leaf.encoding)
             rows.write_columns(columns.log_time_ns, {"data": frames})
+
+
+def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:
+    """Write the infos in parts, each of which is one chunk.
+
+    Raises:
+        SpaceError: A log cannot store an info.
+    """
+    topics = InfoTopics(log)
+    for first in range(0, len(columns.log_time_ns) if columns.infos else 0, STEPS_PER_CHUNK):
+        rows = slice(first, first + STEPS_PER_CHUNK)
+        part = {}
+        for name, info in columns.infos.items():
+            present = ~np.ma.getmaskarray(info[rows]).reshape(len(info[rows]), -1).any(axis=1)
+            values = info_array(np.ma.getdata(info[rows])[present])
+            if values is None:
+                raise SpaceError(f"{path}: a log cannot store the info '{name}' of {info.dtype}")
+            if len(values):
+                part[name] = (columns.log_time_ns[rows][present].tolist(), values)
+        topics.write(part)
 
 
 def _write_steps(log: LogWriter, columns: Transitions) -> None:

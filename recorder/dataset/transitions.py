@@ -7,15 +7,17 @@ stored twice.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.infos import Masked
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior_probs")
 """The columns with one row per transition."""
@@ -34,6 +36,8 @@ class Transitions:
         truncated: (N,) bool.
         behavior_probs: (N,) float32; NaN where unknown.
         episodes: Summaries of the episodes, in order. Their lengths divide the rows into episodes.
+        infos: (F, *shape) masked array of each info by its dotted name: what the environment
+            returned with the observation, masked where it returned none.
     """
 
     frames: tuple[Frames, ...]
@@ -44,13 +48,14 @@ class Transitions:
     truncated: NDArray[np.bool_]
     behavior_probs: NDArray[np.float32]
     episodes: tuple[EpisodeSummary, ...]
+    infos: Mapping[str, Masked] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that the columns' lengths agree."""
         steps = sum(episode.length for episode in self.episodes)
         for name in STEP_COLUMNS:
             assert len(getattr(self, name)) == steps, f"{name} does not have {steps} rows"
-        for frames in (*self.frames, self.log_time_ns):
+        for frames in (*self.frames, self.log_time_ns, *self.infos.values()):
             assert len(frames) == steps + len(self.episodes), "frames and episodes do not agree"
 
     @property
@@ -86,6 +91,7 @@ class Transitions:
             frames=tuple(rows_of(leaf, frames) for leaf in self.frames),
             log_time_ns=self.log_time_ns[frames],
             episodes=tuple(self.episodes[k] for k in chosen),
+            infos={name: info[frames] for name, info in self.infos.items()},
             **self.at(steps),
         )
 
@@ -99,6 +105,7 @@ class Transitions:
         return cls(
             frames=tuple(joined([part.frames[leaf] for part in parts]) for leaf in leaves),
             episodes=tuple(episode for part in parts for episode in part.episodes),
+            infos=joined_infos([(part.infos, len(part.log_time_ns)) for part in parts]),
             **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
         )
 
@@ -124,6 +131,35 @@ class TransitionBatch:
     truncated: NDArray[np.bool_]
     next_observations: Any
     behavior_probs: NDArray[np.float32]
+
+
+def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str, Masked]:
+    """Concatenate infos; one that a part lacks is masked there.
+
+    Args:
+        parts: Infos by name, and the number of their rows.
+
+    Raises:
+        SpaceError: An info has different shapes, or is text and number.
+    """
+    found: dict[str, Masked] = {}
+    for name in dict.fromkeys(name for infos, _ in parts for name in infos):
+        present = [infos[name] for infos, _ in parts if name in infos]
+        shape, kinds = present[0].shape[1:], {one.dtype.kind == "U" for one in present}
+        if len(kinds) > 1 or any(one.shape[1:] != shape for one in present):
+            raise SpaceError(f"the info '{name}' differs between the parts in shape or kind")
+        dtype = np.result_type(*(one.dtype for one in present))
+        every = [
+            infos[name].astype(dtype) if name in infos else _nothing(count, shape, dtype)
+            for infos, count in parts
+        ]
+        found[name] = np.ma.concatenate(every)  # type: ignore[no-untyped-call]
+    return found
+
+
+def _nothing(count: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Masked:
+    values = np.zeros((count, *shape), dtype)
+    return np.ma.MaskedArray(values, np.ones(values.shape, bool))
 
 
 def ranges(starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -12,6 +12,8 @@ schemas have the encoding `ros2msg`.
     /rl/phase              std_msgs/msg/String       start and end of an episode: `running`, then
                                                      the reason of the end
     /rl/learner            mcaprl_msgs/msg/Learner   transition, if the policy version is known
+    /rl/info/<name>        std_msgs/msg/Float64...   observation whose info has this name; see
+                                                     `infos`; only if infos are recorded
     all others                                       display topics, see `record/display.py`
 
 Episodes. An episode of T transitions has T + 1 consecutive records of `/rl/step`. Record k < T

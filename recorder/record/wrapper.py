@@ -9,6 +9,7 @@ chunk is written. Values are copied, so the environment may reuse its buffers.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -20,6 +21,7 @@ from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import SMALLEST, check_probability
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
+from mcaprl.recorder.record.infos import EpisodeInfos
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import (
     ImageColumn,
@@ -59,6 +61,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         max_file_bytes: int | None = None,
         scene: bool = True,
         camera: bool = False,
+        infos: bool | Sequence[str] = False,
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
@@ -81,6 +84,9 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             scene: Whether to record shapes, frames and telemetry for viewers, if the environment
                 provides them.
             camera: Whether to record the environment's metric depth image.
+            infos: Whether to record the infos that the environment returns, or the names of those
+                to record; `episode` includes `episode.r`. A value that is no number, flag, text or
+                array is not recorded, with a warning.
             step_duration_s: Simulated seconds between two observations; default: the environment's
                 `step_duration_s`, else 1 / `render_fps`, else 0.1.
             start_time_ns: log_time of the first message, since the Unix epoch; default: now.
@@ -113,6 +119,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             start_time_ns=start_time_ns,
         )
         log = self._recording.log
+        self._infos = EpisodeInfos(log, infos) if infos else None
         self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
         self._columns = columns = StepColumns(log)
         self._shows_steps = self._display.shows_steps
@@ -145,6 +152,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(seed=seed, options=options)
         with HoldSignals():
             self._begin(OpenEpisode(self.policy, self.epsilon, seed, options), observation)
+        if self._infos is not None:
+            self._infos.begin(info)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -182,6 +191,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
             self._store_observation(observation)
+            if self._infos is not None:
+                self._infos.add(step, info)
             try:
                 self._store_reward(reward)
                 number = reward
@@ -269,6 +280,9 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         for image in self._images:
             image.flush(episode.steps + 1)
         self._display.end(summary)
+        if self._infos is not None:
+            recording = self._recording
+            self._infos.end(episode.steps, recording.next_start_ns, recording.step_ns)
         self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
         self._recording.advance(summary)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.arrays import exactly, with_fresh_times
 from mcaprl.recorder.dataset.dataset import Dataset
-from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.dataset.transitions import Transitions, joined_infos
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, observation_leaves
@@ -83,6 +83,7 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
             truncated=_last_rows(lengths, [e.truncated for e in kept]),
             behavior_probs=np.concatenate([_probabilities(e) for e in kept]),
             episodes=tuple(_summary(k, e) for k, e in enumerate(kept)),
+            infos=joined_infos([(e.infos, len(e.rewards) + 1) for e in kept]),
         )
     except SpaceError as error:
         raise SpaceError(f"{where}: {error}") from error

@@ -40,7 +40,7 @@ class StoredInfo(NamedTuple):
 
 def infos_of(dataset: Dataset) -> Mapping[str, Any]:
     """Return masked arrays (F, *shape) by dotted name, one row for each observation."""
-    return {}
+    return dataset.infos
 
 
 def stored_infos(infos: Mapping[str, Any]) -> tuple[dict[str, StoredInfo], list[str]]:

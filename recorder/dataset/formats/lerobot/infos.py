@@ -34,7 +34,7 @@ Infos = Mapping[str, Any]
 
 def infos_of(dataset: Dataset) -> Infos:
     """Return the infos of a dataset."""
-    return {}
+    return dataset.infos
 
 
 def info_features(infos: Infos, frames: NDArray[np.int64]) -> dict[str, Feature]:

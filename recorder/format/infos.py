@@ -1,0 +1,69 @@
+"""Infos of an environment: one topic `/rl/info/<name>` for each, with messages where it is present.
+
+The messages have the log_time of the observation that the info came with. Scalars are messages of
+std_msgs; an array is `mcaprl_msgs/msg/Info...` with the field `data`, flat. The channel's metadata
+contain the name and the shape of the info.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import CorruptLogError
+from mcaprl.recorder.format.reading import McapReader, Topic
+
+INFO_TOPICS = "/rl/info/"
+"""Begin of the names of the topics."""
+Masked = np.ma.MaskedArray[Any, Any]
+
+
+def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Masked]:
+    """Read the infos of a log.
+
+    Args:
+        reader: Reader of the log.
+        times_ns: (F,) log_time of each observation.
+
+    Returns:
+        (F, *shape) array of each info by dotted name, masked where the info is missing.
+
+    Raises:
+        CorruptLogError: A topic is damaged.
+    """
+    channels = [one for one in reader.channels.values() if one.topic.startswith(INFO_TOPICS)]
+    found: dict[str, Masked] = {}
+    if not channels:
+        return found
+    order = np.argsort(times_ns, kind="stable")
+    for topic in sorted({channel.topic for channel in channels}):
+        metadata = next(one.metadata for one in channels if one.topic == topic)
+        name = metadata.get("info", topic.removeprefix(INFO_TOPICS).replace("/", "."))
+        found[name] = _read(Topic(reader, topic), metadata.get("shape", "[]"), times_ns, order)
+    return found
+
+
+def _read(
+    topic: Topic, shape_text: str, times_ns: NDArray[np.int64], order: NDArray[np.int64]
+) -> Masked:
+    shape = tuple(json.loads(shape_text))
+    values = topic.read(("data",))["data"]
+    if topic.fields["data"].kind == "O":
+        values = values.astype(str)
+    elif topic.kinds.get("data", "").startswith("bool"):
+        values = values.view(np.bool_)
+    try:
+        values = values.reshape(len(values), *shape)
+    except ValueError as error:
+        raise CorruptLogError(f"{topic.name}: messages do not have shape {shape}") from error
+    places = np.searchsorted(times_ns, topic.times, sorter=order)
+    frames = order[np.minimum(places, len(order) - 1)]
+    # Unfinished episodes have infos without observations.
+    known = times_ns[frames] == topic.times
+    every = np.zeros((len(times_ns), *shape), values.dtype)
+    is_missing = np.ones(every.shape, bool)
+    every[frames[known]], is_missing[frames[known]] = values[known], False
+    return np.ma.MaskedArray(every, is_missing)

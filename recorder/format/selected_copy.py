@@ -1,0 +1,361 @@
+"""Copies of selected messages of one or more finished MCAP files into a new one.
+
+A chunk whose messages are all kept unchanged is copied without decompressing it. A chunk with kept
+and other messages is written again with the kept ones.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError
+from mcaprl.recorder.columns.append import TopLevelRecord
+from mcaprl.recorder.columns.chunks import Scratch
+from mcaprl.recorder.columns.message_rows import (
+    INDEX_ENTRY,
+    MESSAGE_HEADER,
+    RECORD_HEADER_BYTES,
+    message_index,
+)
+from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.records import RECORD_HEADER, contents_of
+from mcaprl.recorder.columns.valid_copy import writer_like
+from mcaprl.recorder.columns.writer import McapWriter
+
+Times = NDArray[np.int64]
+Change = Callable[[Channel, int, memoryview], None]
+"""Function that changes a message in place, given its channel, log_time and payload."""
+# Channel ids are 16-bit numbers.
+_MAX_CHANNEL_ID = 2**16 - 1
+_NO_TIMES: Times = np.empty(0, np.int64)
+ALL_TIMES: Times = np.array([[0, np.iinfo(np.int64).max]], np.int64)
+"""Span of all log_times."""
+# A Message record up to its payload; see `MESSAGE_HEADER`.
+_HEADER = struct.Struct("<BQHIQQ")
+
+
+@dataclass
+class Source:
+    """File from which messages are copied. Times are log_times in nanoseconds.
+
+    Attributes:
+        reader: Reader of the file.
+        ids: Id in the new file of each channel, by its id in this file.
+        spans: (S, 2) first and last time of each series of kept messages, increasing.
+        also: Times of more kept messages, by channel id.
+        without: Times of messages in the spans that are not kept, by channel id.
+        changed: First and last time of the messages that `change` changes, by channel id.
+        change: Function that changes a message.
+        delay_ns: Number that is added to the log_time and publish_time of each message.
+    """
+
+    reader: McapReader
+    ids: Mapping[int, int]
+    spans: Times = field(default_factory=lambda: ALL_TIMES)
+    also: Mapping[int, Times] = field(default_factory=dict)
+    without: Mapping[int, Times] = field(default_factory=dict)
+    changed: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    change: Change | None = None
+    delay_ns: int = 0
+
+    def keeps(self, channel_id: int, times: Times) -> NDArray[np.bool_]:
+        """Return which messages of a channel are kept, given their times."""
+        kept = within(self.spans, times)
+        if channel_id in self.also:
+            kept |= np.isin(times, self.also[channel_id])
+        if channel_id in self.without:
+            kept &= ~np.isin(times, self.without[channel_id])
+        return kept
+
+    def changes(self, channel_id: int, start: int, end: int) -> bool:
+        """Return whether messages of a channel in a span of time may be changed."""
+        if self.delay_ns or self.ids[channel_id] != channel_id:
+            return True
+        first, last = self.changed.get(channel_id, (1, 0))
+        return max(first, start) <= min(last, end)
+
+
+@dataclass
+class Copied:
+    """Numbers of chunks and messages of a copy.
+
+    Attributes:
+        whole: Number of chunks that were copied without decompressing them.
+        rewritten: Number of chunks of which messages were copied.
+        messages: Number of messages.
+    """
+
+    whole: int = 0
+    rewritten: int = 0
+    messages: int = 0
+
+
+class NewTopics:
+    """Schemas and channels of the new file.
+
+    Attributes:
+        schemas: Schemas by id.
+        channels: Channels by id.
+    """
+
+    def __init__(self) -> None:
+        """Start without topics."""
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+
+    def add(
+        self, reader: McapReader, metadata: Mapping[str, dict[str, str]] | None = None
+    ) -> dict[int, int]:
+        """Add the channels of a file; return the new id of each channel by its id in the file.
+
+        A channel that equals one of an earlier file gets its id. Otherwise, it keeps its id if that
+        is free.
+
+        Args:
+            reader: Reader of the file.
+            metadata: Metadata of channels that replaces that in the file, by topic.
+
+        Raises:
+            LogError: There are more channels than a file can have.
+        """
+        found: dict[int, int] = {}
+        earlier = dict(self.channels)
+        for channel in reader.channels.values():
+            schema = reader.schemas.get(channel.schema_id)
+            schema_id = 0 if schema is None else self._schema_id(schema)
+            strings = (metadata or {}).get(channel.topic, channel.metadata)
+            wanted = (channel.topic, channel.message_encoding, strings, schema_id)
+            equal = [
+                id_
+                for id_, one in earlier.items()
+                if (one.topic, one.message_encoding, one.metadata, one.schema_id) == wanted
+                and id_ not in found.values()
+            ]
+            new = equal[0] if equal else _free_id(channel.id, self.channels, "channel")
+            self.channels.setdefault(new, Channel(new, *wanted))
+            found[channel.id] = new
+        return found
+
+    def records(self) -> list[TopLevelRecord]:
+        """Return the records to write at the start of the file."""
+        return [*self.schemas.values(), *self.channels.values()]
+
+    def _schema_id(self, schema: Schema) -> int:
+        wanted = (schema.encoding, schema.name, schema.data)
+        for id_, one in self.schemas.items():
+            if (one.encoding, one.name, one.data) == wanted:
+                return id_
+        new = _free_id(schema.id, self.schemas, "schema")
+        self.schemas[new] = Schema(new, schema.data, schema.encoding, schema.name)
+        return new
+
+
+def _free_id(wanted: int, taken: Mapping[int, object], kind: str) -> int:
+    new = wanted if wanted not in taken else max(taken) + 1
+    if new > _MAX_CHANNEL_ID:
+        new = next((id_ for id_ in range(1, _MAX_CHANNEL_ID + 1) if id_ not in taken), 0)
+    if not new:
+        raise LogError(f"the files have more than {_MAX_CHANNEL_ID} {kind}s: join fewer files")
+    return new
+
+
+def copy_selected(
+    sources: Sequence[Source],
+    target: Path,
+    top_level: Sequence[TopLevelRecord],
+    more: Sequence[tuple[int, int, bytes]] = (),
+) -> Copied:
+    """Write the selected messages of files to a new file.
+
+    The chunks of each file keep their order. Chunks of several files are ordered by their times.
+
+    Args:
+        sources: Files with the same compression; the new one has the compression of the first.
+        target: Path of the new file; an existing one is replaced.
+        top_level: Records at the start of the new file, with all its channels.
+        more: More messages: channel id, log_time in nanoseconds, and data.
+
+    Raises:
+        LogError: A file is damaged, or the new file cannot be written.
+    """
+    first = sources[0].reader
+    with writer_like(first.view, first.records(len(MCAP0_MAGIC)), target) as writer:
+        for record in top_level:
+            writer.announce(record)
+        copy = _Copy(writer)
+        for source, chunk in _in_time_order(sources):
+            copy.take(source, chunk)
+        writer.write_messages(more)
+        for source in sources:
+            source.reader.check_unchanged()
+        copy.copied.messages += len(more)
+    return copy.copied
+
+
+def within(spans: Times, times: Times) -> NDArray[np.bool_]:
+    """Return which times are in one of the spans, given as (S, 2) first and last times."""
+    if not len(spans):
+        return np.zeros(len(times), np.bool_)
+    span = np.searchsorted(spans[:, 0], times, side="right") - 1
+    found: NDArray[np.bool_] = (span >= 0) & (times <= spans[np.maximum(span, 0), 1])
+    return found
+
+
+def times_of(reader: McapReader, channel: Channel) -> Times:
+    """Return the log_times of the messages of a channel, in file order."""
+    parts = [part.index["log_time"].astype(np.int64) for part in reader.message_ranges(channel)]
+    return np.concatenate([_NO_TIMES, *parts])
+
+
+def _in_time_order(sources: Sequence[Source]) -> Iterator[tuple[Source, ChunkIndex]]:
+    """Merge the chunks of files by their start times; each file keeps its order."""
+
+    def chunks_of(source: Source) -> Iterator[tuple[Source, ChunkIndex]]:
+        return ((source, chunk) for chunk in source.reader.chunks)
+
+    return heapq.merge(
+        *map(chunks_of, sources), key=lambda pair: pair[1].message_start_time + pair[0].delay_ns
+    )
+
+
+class _Copy:
+    """Writer of the kept messages of chunks."""
+
+    def __init__(self, writer: McapWriter) -> None:
+        self.copied = Copied()
+        self._writer = writer
+        # Chunks of another reader may not be taken for those of this one: one memory each.
+        self._scratches: dict[int, Scratch] = {}
+        self._embedding: dict[int, bool] = {}
+
+    def take(self, source: Source, chunk: ChunkIndex) -> None:
+        """Write the kept messages of a chunk."""
+        start, end = chunk.message_start_time, chunk.message_end_time
+        ids = chunk.message_index_offsets
+        if not ids:
+            self._rewrite(source, chunk, self._indexes(source, chunk))
+            return
+        kept_whole = self._is_inside(source, start, end) and not any(
+            id_ in source.without for id_ in ids
+        )
+        if not kept_whole and self._is_outside(source, start, end, list(ids)):
+            return
+        indexes = {
+            id_: message_index(source.reader.view, offset, id_) for id_, offset in ids.items()
+        }
+        masks = {} if kept_whole else {i: _kept(source, i, index) for i, index in indexes.items()}
+        if not kept_whole and not any(mask.any() for mask in masks.values()):
+            return
+        is_whole = all(mask.all() for mask in masks.values())
+        is_changed = any(source.changes(id_, start, end) for id_ in ids)
+        if is_whole and not is_changed and not self._embeds_topics(source):
+            counts = {source.ids[id_]: len(index) for id_, index in indexes.items()}
+            self._writer.copy_chunk(source.reader.view, chunk, counts)
+            self.copied.whole += 1
+            self.copied.messages += sum(counts.values())
+        else:
+            self._rewrite(source, chunk, indexes)
+
+    def _is_inside(self, source: Source, start: int, end: int) -> bool:
+        spans = source.spans
+        span = int(np.searchsorted(spans[:, 0], start, side="right")) - 1
+        return span >= 0 and end <= int(spans[span, 1])
+
+    def _is_outside(self, source: Source, start: int, end: int, ids: Sequence[int]) -> bool:
+        """Return whether no message of the chunk is kept, as its times show."""
+        spans = source.spans
+        following = int(np.searchsorted(spans[:, 1], start))
+        if following < len(spans) and int(spans[following, 0]) <= end:
+            return False
+        also = [source.also[id_] for id_ in ids if id_ in source.also]
+        return not any(((start <= times) & (times <= end)).any() for times in also)
+
+    def _indexes(self, source: Source, chunk: ChunkIndex) -> dict[int, NDArray[Any]]:
+        return contents_of(source.reader.chunk_records(chunk)).indexes
+
+    def _embeds_topics(self, source: Source) -> bool:
+        """Return whether chunks contain channels whose ids differ in the new file.
+
+        Most other writers store each channel in the chunk of its first message.
+        """
+        reader = source.reader
+        key = id(reader)
+        if key not in self._embedding:
+            renumbered = any(old != new for old, new in source.ids.items())
+            self._embedding[key] = renumbered and not _top_level_ids(reader) >= set(source.ids)
+        return self._embedding[key]
+
+    def _rewrite(
+        self, source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArray[Any]]
+    ) -> None:
+        scratch = self._scratches.setdefault(id(source.reader), Scratch())
+        records = source.reader.chunk_records(chunk, scratch)
+        kept = {id_: index[_kept(source, id_, index)] for id_, index in indexes.items()}
+        count = sum(map(len, kept.values()))
+        if not count:
+            return
+        written, found = _taken(source, records, kept)
+        self._writer.write_records(written, found)
+        self.copied.rewritten += 1
+        self.copied.messages += count
+
+
+def _kept(source: Source, channel_id: int, index: NDArray[Any]) -> NDArray[np.bool_]:
+    return source.keeps(channel_id, index["log_time"].astype(np.int64))
+
+
+def _top_level_ids(reader: McapReader) -> set[int]:
+    """Return the ids of the channels that are stored outside of chunks and summary."""
+    found = set()
+    for _, opcode, content in reader.records(len(MCAP0_MAGIC)):
+        if opcode == Opcode.CHANNEL:
+            found.add(int.from_bytes(content[:2], "little"))
+        elif opcode == Opcode.DATA_END:
+            break
+    return found
+
+
+def _taken(
+    source: Source, records: memoryview, indexes: Mapping[int, NDArray[Any]]
+) -> tuple[memoryview, dict[int, NDArray[Any]]]:
+    """Copy messages in the order of the chunk, with new ids and times; return their indexes."""
+    wanted = sorted(
+        (offset, channel_id, time_ns)
+        for channel_id, index in indexes.items()
+        for time_ns, offset in index.tolist()
+    )
+    taken, entries = bytearray(), dict[int, list[tuple[int, int]]]()
+    places = []
+    for offset, channel_id, time_ns in wanted:
+        _, length = RECORD_HEADER.unpack_from(records, offset)
+        places.append((len(taken), channel_id, time_ns))
+        entries.setdefault(source.ids[channel_id], []).append(
+            (time_ns + source.delay_ns, len(taken))
+        )
+        taken += records[offset : offset + RECORD_HEADER_BYTES + length]
+    view = memoryview(taken)
+    for place, channel_id, time_ns in places:
+        _renew(source, view, place, channel_id, time_ns)
+    return view, {id_: np.array(pairs, INDEX_ENTRY) for id_, pairs in entries.items()}
+
+
+def _renew(source: Source, view: memoryview, place: int, channel_id: int, time_ns: int) -> None:
+    """Change the message at a place as the source asks for."""
+    if source.change is not None and source.changes(channel_id, time_ns, time_ns):
+        _, length = RECORD_HEADER.unpack_from(view, place)
+        payload = view[place + MESSAGE_HEADER.itemsize : place + RECORD_HEADER_BYTES + length]
+        source.change(source.reader.channels[channel_id], time_ns, payload)
+    opcode, length, _, sequence, log_time, publish_time = _HEADER.unpack_from(view, place)
+    times = (log_time + source.delay_ns, publish_time + source.delay_ns)
+    _HEADER.pack_into(view, place, opcode, length, source.ids[channel_id], sequence, *times)

@@ -1,0 +1,195 @@
+"""Recorded infos: round trips, keys that come late, appending, rotation, and refused values."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import mcaprl
+from mcaprl.errors import SpaceError
+
+
+class Infos(gym.Env[Any, Any]):
+    """Environment that returns the given infos, one for each observation of an episode."""
+
+    observation_space = spaces.Box(0, 100, (1,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, *infos: dict[str, Any]) -> None:
+        self.infos, self.step_number = infos, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.step_number = 0
+        return np.zeros(1, np.float32), self.infos[0]
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.step_number += 1
+        is_last = self.step_number == len(self.infos) - 1
+        observation = np.full(1, self.step_number, np.float32)
+        return observation, 1.0, is_last, False, self.infos[self.step_number]
+
+
+def record(path: Path, *infos: dict[str, Any], episodes: int = 1, **options: Any) -> mcaprl.Dataset:
+    env = mcaprl.RecordMcap(Infos(*infos), path, **{"infos": True, **options})
+    for _ in range(episodes):
+        env.reset()
+        for _ in infos[1:]:
+            env.step(0)
+    env.close()
+    return mcaprl.open(path if path.exists() else path.parent)
+
+
+def test_infos_come_back(log_path: Path) -> None:
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    first = {"speed": 1.5, "lane": "left", "ok": True, "count": 3, "pose": {"xy": array}}
+    second = {"speed": -0.0, "lane": "ü", "ok": False, "count": 2**60, "pose": {"xy": array + 1}}
+    found = record(log_path, first, second).infos
+    assert sorted(found) == ["count", "lane", "ok", "pose.xy", "speed"]
+    assert found["speed"].tolist() == [1.5, -0.0]
+    assert found["lane"].tolist() == ["left", "ü"]
+    assert found["ok"].tolist() == [True, False]
+    assert found["ok"].dtype == bool
+    assert found["count"].tolist() == [3, 2**60]
+    assert found["pose.xy"].shape == (2, 2, 3)
+    assert found["pose.xy"].dtype == np.float32
+    assert (found["pose.xy"][1] == array + 1).all()
+    assert not mcaprl.check(log_path).problems
+
+
+def test_statistics_of_episodes_are_present_at_ends_only(log_path: Path) -> None:
+    env = gym.wrappers.RecordEpisodeStatistics(gym.make("CartPole-v1", max_episode_steps=5))
+    recorded = mcaprl.RecordMcap(env, log_path, infos=["episode"])
+    expected = []
+    for seed in range(3):
+        recorded.reset(seed=seed)
+        done = False
+        while not done:
+            *_, terminated, truncated, info = recorded.step(0)
+            done = terminated or truncated
+        expected.append(info["episode"])
+    recorded.close()
+    data = mcaprl.open(log_path)
+    assert sorted(data.infos) == ["episode.l", "episode.r", "episode.t"]
+    for name in ("r", "l", "t"):
+        column = data.infos[f"episode.{name}"]
+        assert column.compressed().tolist() == [one[name] for one in expected]
+        ends = np.cumsum(data.episode_lengths + 1) - 1
+        assert np.flatnonzero(~np.ma.getmaskarray(column)).tolist() == ends.tolist()
+    assert data.episodes[1].infos["episode.r"][-1] == expected[1]["r"]
+
+
+def test_ros_decoders_read_the_topics(log_path: Path) -> None:
+    record(log_path, {"speed": 1.5, "at": np.array([1, 2], np.int16)}, {"lane": "left"})
+    with log_path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = {
+            channel.topic: (schema.name, message.data)
+            for schema, channel, _, message in reader.iter_decoded_messages()
+            if schema is not None and channel.topic.startswith("/rl/info/")
+        }
+    assert found["/rl/info/speed"] == ("std_msgs/msg/Float64", 1.5)
+    assert found["/rl/info/lane"] == ("std_msgs/msg/String", "left")
+    name, values = found["/rl/info/at"]
+    assert (name, list(values)) == ("mcaprl_msgs/msg/InfoInt16x2", [1, 2])
+
+
+def test_infos_are_off_unless_wanted(tmp_path: Path) -> None:
+    assert record(tmp_path / "off.mcap", {"a": 1}, {"a": 2}, infos=False).infos == {}
+    some = record(tmp_path / "some.mcap", {"a": 1, "ab": 2}, {"b": {"c": 3}}, infos=["a", "b"])
+    assert sorted(some.infos) == ["a", "b.c"]
+
+
+def test_values_that_a_log_cannot_store_are_named_once(log_path: Path) -> None:
+    infos: tuple[dict[str, Any], ...] = ({"set": {1}, "n": 1}, {"set": {2}, "n": "text"})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        data = record(log_path, *infos, episodes=2)
+    assert data.infos == {}
+    assert [str(one.message).split(":")[0] for one in caught] == [
+        "the info 'set' is not recorded",
+        "the info 'n' is not recorded",
+    ]
+
+
+def test_a_value_of_another_type_is_left_out(log_path: Path) -> None:
+    env = Infos({"n": 1}, {"n": 2})
+    recorded = mcaprl.RecordMcap(env, log_path, infos=True)
+    recorded.reset()
+    recorded.step(0)
+    env.infos = ({"n": "text"}, {"n": "text"})
+    recorded.reset()
+    with pytest.warns(UserWarning, match=r"info 'n' is not recorded: it became"):
+        recorded.step(0)
+    recorded.close()
+    assert mcaprl.open(log_path).infos["n"].tolist() == [1, 2, None, None]
+
+
+def test_appended_and_rotated_recordings_have_their_infos(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    record(path, {"a": 1}, {"a": 2})
+    data = record(path, {"b": 0.5}, {"a": 3, "b": 1.5}, append=True)
+    assert data.infos["a"].tolist() == [1, 2, None, 3]
+    assert data.infos["b"].tolist() == [None, None, 0.5, 1.5]
+    (tmp_path / "parts").mkdir()
+    parts = record(
+        tmp_path / "parts" / "log.mcap", {"a": 1}, {"a": 2}, episodes=20, max_file_bytes=4_000
+    )
+    assert len(list((tmp_path / "parts").glob("*.mcap"))) > 1
+    assert parts.infos["a"].tolist() == [1, 2] * 20
+
+
+def test_an_interrupted_episode_keeps_the_infos_of_its_steps(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(Infos({"a": 0}, {"a": 1}, {"a": 2}, {"a": 3}), log_path, infos=True)
+    env.reset()
+    env.step(0)
+    env.reset()
+    env.step(1)
+    env.step(1)
+    env.close()
+    assert mcaprl.open(log_path).infos["a"].tolist() == [0, 1, 0, 1, 2]
+
+
+@given(rows=st.lists(st.one_of(st.none(), st.floats(allow_nan=False)), min_size=2, max_size=9))
+def test_saved_infos_are_equal(rows: list[float | None], tmp_path_factory: Any) -> None:
+    path = tmp_path_factory.mktemp("infos") / "log.mcap"
+    data = record(path, *({} if row is None else {"x": row} for row in rows))
+    again_path = path.with_name("again.mcap")
+    data.save(again_path)
+    for each in (data, mcaprl.open(again_path)):
+        if any(row is not None for row in rows):
+            assert each.infos["x"].tolist() == rows
+        else:
+            assert each.infos == {}
+
+
+def test_datasets_keep_infos_when_divided_and_joined(tmp_path: Path) -> None:
+    first = record(tmp_path / "a.mcap", {"a": 1}, {"a": 2}, episodes=3)
+    second = record(tmp_path / "b.mcap", {"b": "x"}, {"b": "yy"})
+    both = mcaprl.Dataset.concatenate([first, second])
+    assert both.infos["a"].tolist() == [1, 2, 1, 2, 1, 2, None, None]
+    assert both.infos["b"].tolist() == [None] * 6 + ["x", "yy"]
+    kept = both.filter(lambda episode: episode.index in (0, 3))
+    assert kept.infos["b"].tolist() == [None, None, "x", "yy"]
+    odd = record(tmp_path / "c.mcap", {"a": "text"}, {"a": "text"})
+    with pytest.raises(SpaceError, match="the info 'a' differs"):
+        mcaprl.Dataset.concatenate([first, odd])
+
+
+def test_the_record_function_records_infos(log_path: Path) -> None:
+    mcaprl.record("lane", log_path, episodes=2, seed=1, infos=True)
+    data = mcaprl.open(log_path)
+    assert {"lateral_offset_m", "speed_m_s", "progress_m"} <= set(data.infos)
+    # Where an end is recorded, so is its reason; other steps have none.
+    assert data.infos["reason"].compressed().tolist() == [one.reason for one in data.episodes]
+    speed = data.observation_names.index("speed")
+    assert np.abs(data.infos["speed_m_s"] - 30 * data.frames[:, speed]).max() < 1e-5
