@@ -186,7 +186,7 @@ def test_datasets_keep_infos_when_divided_and_joined(tmp_path: Path) -> None:
 
 
 def test_the_record_function_records_infos(log_path: Path) -> None:
-    mcaprl.record("lane", log_path, episodes=2, seed=1, infos=True)
+    mcaprl.record("lane", log_path, policy="random", episodes=2, seed=1, infos=True)
     data = mcaprl.open(log_path)
     assert {"lateral_offset_m", "speed_m_s", "progress_m"} <= set(data.infos)
     # Where an end is recorded, so is its reason; other steps have none.
