@@ -120,7 +120,7 @@ def read(path: Path) -> Dataset:
             if found is not None:
                 return found
         known = [name for names in NAMES.values() for name in names]
-        arrays = {name: nodes.tree_in(file, name) for name in file if name in known}
+        arrays = {name: nodes.tree_in(file, name) for name in nodes.names_in(file) if name in known}
         has_infos = nodes.has(file, INFOS) and nodes.is_group(file, INFOS)
         infos = dict(nodes.arrays_below(nodes.group_in(file, INFOS))) if has_infos else {}
         return flat_dataset(arrays, path, infos)

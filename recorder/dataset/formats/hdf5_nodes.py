@@ -67,6 +67,18 @@ def has(group: Any, name: str) -> bool:
     return bool(group.id.links.exists(name.encode()))
 
 
+def names_in(group: Any) -> list[str]:
+    """Return the names of a group's members.
+
+    Raises:
+        LogError: A name is not UTF-8.
+    """
+    names = list(group)
+    if not all(isinstance(name, str) for name in names):
+        raise LogError(f"{group.file.filename}: {group.name} has a name that is not UTF-8")
+    return names
+
+
 def group_in(parent: Any, name: str) -> Any:
     """Return a group.
 
@@ -99,6 +111,8 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
         raise LogError(
             f"{_place(parent, name)} has shape {shape}, but only {stored} bytes are stored"
         )
+    if dtype.kind == "V":
+        raise LogError(f"{_place(parent, name)} has fields, not numbers")
     if dtype.kind == "O":
         return _objects(h5py.Dataset(found), _place(parent, name))
     values = np.empty(shape, dtype)
@@ -128,12 +142,12 @@ def tree_in(parent: Any, name: str) -> Any:
     if not is_group(parent, name):
         return array_in(parent, name)
     group = group_in(parent, name)
-    return {key: tree_in(group, key) for key in group}
+    return {key: tree_in(group, key) for key in names_in(group)}
 
 
 def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yield all arrays of a group and its groups by their dotted names."""
-    for name in group:
+    for name in names_in(group):
         if is_group(group, name):
             yield from arrays_below(group_in(group, name), (*path, name))
         else:
@@ -152,6 +166,8 @@ def attributes_of(group: Any) -> dict[str, Any]:
         inner = found
         for key in groups:
             inner = inner.setdefault(key, {})
+            if not isinstance(inner, dict):
+                raise LogError(f"{group.file.filename}: {group.name} has both {key} and {path}")
         inner[name] = value.tolist() if isinstance(value, np.generic | np.ndarray) else value
     return found
 

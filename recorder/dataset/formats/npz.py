@@ -38,6 +38,7 @@ from mcaprl.recorder.dataset.formats.infos import (
     masked,
     stored_infos,
 )
+from mcaprl.recorder.format.messages import MAX_SEED
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, leaves_of, nest
 
@@ -172,10 +173,23 @@ def parse_description(text: str, where: object) -> tuple[LogMetadata, list[dict[
     try:
         found = parse_json(text)
         metadata = LogMetadata.from_strings(found["metadata"])
-        summaries = [{name: part[name] for name in SUMMARY} for part in found["episodes"]]
+        summaries = [_summary(part) for part in found["episodes"]]
         return metadata, summaries, list(map(str, found[_OBSERVATIONS]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise LogError(f"{where}: the array {OWN} is damaged: {error}") from error
+
+
+def _summary(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a summary.
+
+    Raises:
+        ValueError: A value cannot be stored in a log.
+    """
+    seed = None if part["seed"] is None else int(part["seed"])
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"seed {seed}")
+    texts = {name: str(part[name]) for name in ("reason", "policy", "options")}
+    return {**texts, "epsilon": float(part["epsilon"]), "seed": seed}
 
 
 def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]]:

@@ -33,7 +33,7 @@ def read_demos(file: Any, path: Path) -> Dataset:
         SpaceError: A log cannot store a dtype.
     """
     data = nodes.group_in(file, "data")
-    names = sorted((name for name in data if name.startswith("demo_")), key=_number)
+    names = sorted((name for name in nodes.names_in(data) if name.startswith("demo_")), key=_number)
     if not names:
         raise LogError(f"{path}: the group data has no demo_0, demo_1, ...: unknown form of HDF5")
     notes: dict[str, None] = {}

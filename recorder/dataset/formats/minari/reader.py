@@ -11,7 +11,7 @@ import math
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,7 @@ def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
     # The file is closed if an episode is refused, too.
     with closing(forms[description.form](data_folder(path), description)) as stored:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
+    episodes = reader.with_equal_infos(episodes)
     reader.warn()
     return description.metadata, episodes
 
@@ -136,6 +137,26 @@ class _Reader:
             summary=_summary(stored.attributes, where),
         )
 
+    def with_equal_infos(self, episodes: Sequence[EpisodeArrays]) -> list[EpisodeArrays]:
+        """Leave out the infos whose rows differ in shape or kind between the episodes."""
+        found: dict[str, set[Any]] = {}
+        for episode in episodes:
+            for name, values in episode.infos.items():
+                kind = (values.shape[1:], values.dtype.kind == "U")
+                found.setdefault(name, set()).add(kind)
+        self._odd_infos |= {name for name, kinds in found.items() if len(kinds) > 1}
+        return [
+            replace(
+                episode,
+                infos={
+                    name: values
+                    for name, values in episode.infos.items()
+                    if name not in self._odd_infos
+                },
+            )
+            for episode in episodes
+        ]
+
     def warn(self) -> None:
         """Warn of what was changed or left out."""
         images = [leaf.name for leaf, jpeg in zip(self._leaves, self._is_jpeg, strict=True) if jpeg]
@@ -153,7 +174,7 @@ class _Reader:
             )
         if self._odd_infos:
             warnings.warn(
-                f"{self._path}: infos without a row for each step are left out:"
+                f"{self._path}: infos whose rows differ or are not one for each step are left out:"
                 f" {', '.join(sorted(self._odd_infos))}",
                 stacklevel=4,
             )
@@ -162,7 +183,8 @@ class _Reader:
         """Return the infos with T + 1 rows; those with T rows have none of the reset."""
         found: dict[str, Any] = {}
         for name, values in stored.infos.items():
-            if values.ndim == 0 or values.dtype == object or len(values) not in (count, count + 1):
+            is_plain = values.ndim > 0 and values.dtype.kind in "biufU"
+            if not is_plain or len(values) not in (count, count + 1):
                 self._odd_infos.add(name)
                 continue
             first = count + 1 - len(values)
@@ -236,7 +258,9 @@ def _in_hdf5(folder: Path, description: Description) -> Generator[_Stored]:
                 attributes=hdf5.attributes_of(group),
                 own={}
                 if own is None
-                else {name: hdf5.array_in(own, name) for name in own if name != MISSING},
+                else {
+                    name: hdf5.array_in(own, name) for name in hdf5.names_in(own) if name != MISSING
+                },
                 missing=_missing(own),
             )
 

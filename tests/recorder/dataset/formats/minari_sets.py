@@ -92,7 +92,7 @@ def collect(
     """
     import minari
 
-    recorded = env if log is None else mcaprl.RecordMcap(env, log)
+    recorded = env if log is None else mcaprl.RecordMcap(env, log, infos=infos)
     collector = minari.DataCollector(
         recorded, data_format=data_format, jpeg_encoding=jpeg, record_infos=infos
     )

@@ -10,19 +10,16 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
-from mcaprl.recorder.dataset.formats.minari.reader import read_episodes
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras, collect
 
 h5py = pytest.importorskip("h5py", reason="needs the extra interop")
 
-_ROOM = "mcaprl.recorder.dataset.formats"
-_WRITERS = {"minari": f"{_ROOM}.minari.writer", "hdf5": f"{_ROOM}.hdf5", "npz": f"{_ROOM}.npz"}
-_READERS = {**_WRITERS, "minari": f"{_ROOM}.minari.reader"}
 _MISSING = np.array([True, False, True, True, False])
 # Rows of two episodes with two and one steps.
 _INFOS: dict[str, Any] = {
@@ -37,7 +34,7 @@ _INFOS: dict[str, Any] = {
 }
 
 
-def _two_episodes() -> Dataset:
+def _two_episodes(infos: dict[str, Any]) -> Dataset:
     metadata = LogMetadata(spaces.Box(-9, 9, (1,), np.float32), spaces.Discrete(2))
     episodes = [
         EpisodeArrays(
@@ -46,8 +43,9 @@ def _two_episodes() -> Dataset:
             rewards=np.ones(count),
             terminated=True,
             truncated=False,
+            infos={name: values[rows] for name, values in infos.items()},
         )
-        for count in (2, 1)
+        for count, rows in ((2, slice(0, 3)), (1, slice(3, 5)))
     ]
     return dataset_of(episodes, metadata, "test")
 
@@ -59,44 +57,23 @@ def _same(found: Any, expected: Any) -> None:
     assert expected.dtype.kind == "U" or found.dtype == expected.dtype
 
 
-def _written(
-    form: str, path: Path, monkeypatch: pytest.MonkeyPatch, infos: Any, **options: Any
-) -> list[str]:
-    monkeypatch.setattr(f"{_WRITERS[form]}.infos_of", lambda dataset: infos)
-    lost: list[str] = getattr(_two_episodes(), f"to_{form}")(path, **options)
-    return lost
-
-
 @pytest.mark.parametrize(
     ("form", "name"), [("minari", "toy-v0"), ("hdf5", "toy.hdf5"), ("npz", "toy.npz")]
 )
-def test_infos_come_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, name: str
-) -> None:
-    assert _written(form, tmp_path / name, monkeypatch, _INFOS) == []
-    read: list[EpisodeArrays] = []
-
-    def spy(episodes: list[EpisodeArrays], *more: Any) -> Dataset:
-        read.extend(episodes)
-        return dataset_of(episodes, *more)
-
-    monkeypatch.setattr(f"{_READERS[form]}.dataset_of", spy)
-    getattr(Dataset, f"from_{form}")(tmp_path / name)
-    for episode, rows in zip(read, (slice(0, 3), slice(3, 5)), strict=True):
-        for key, values in _INFOS.items():
-            if key in episode.infos:
-                _same(episode.infos[key], values[rows])
-            else:
-                assert np.ma.getmaskarray(values[rows]).all()
+def test_infos_come_back(tmp_path: Path, form: str, name: str) -> None:
+    data = _two_episodes(_INFOS)
+    assert getattr(data, f"to_{form}")(tmp_path / name) == []
+    found = mcaprl.open(tmp_path / name)
+    assert set(found.infos) == set(_INFOS)
+    for key, values in _INFOS.items():
+        _same(found.infos[key], values)
 
 
-def test_minari_loads_infos_with_nan_where_there_was_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_minari_loads_infos_with_nan_where_there_was_none(tmp_path: Path) -> None:
     need(importlib.util.find_spec("minari") is not None, "minari")
     from minari import MinariDataset
 
-    _written("minari", tmp_path / "toy-v0", monkeypatch, _INFOS)
+    _two_episodes(_INFOS).to_minari(tmp_path / "toy-v0")
     first, second = MinariDataset(tmp_path / "toy-v0/data")
     np.testing.assert_array_equal(first.infos["episode"]["l"], [np.nan, 3, np.nan])
     np.testing.assert_array_equal(second.infos["episode"]["r"], [np.nan, np.nan])
@@ -107,22 +84,40 @@ def test_minari_loads_infos_with_nan_where_there_was_none(
 
 
 @pytest.mark.parametrize("form", ["hdf5", "arrow", "parquet"])
-def test_infos_that_minari_collects_are_those_of_the_environment(
+def test_infos_that_minari_collects_are_those_of_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
 ) -> None:
     need(importlib.util.find_spec("jax") is not None, "minari[create]")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    collect(Cameras(), "infos-v0", data_format=form, infos=True)
-    _, episodes = read_episodes(tmp_path / "infos-v0")
-    assert [len(episode.rewards) for episode in episodes] == [5, 3, 4]
-    for episode in episodes:
-        steps = np.arange(len(episode.rewards) + 1)
-        assert set(episode.infos) == {"battery", "pose.xy", "late"}
-        assert episode.infos["battery"].tolist() == (1 - steps / 8).tolist()
-        assert episode.infos["pose.xy"].tolist() == np.stack([steps, -steps], 1).tolist()
-        assert episode.infos["pose.xy"].dtype == np.float32
-        assert episode.infos["late"].tolist() == (steps > 2).tolist()
-        assert not any(np.ma.getmaskarray(values).any() for values in episode.infos.values())
+    collect(Cameras(), "infos-v0", log=tmp_path / "log.mcap", data_format=form, infos=True)
+    log, found = mcaprl.open(tmp_path / "log.mcap"), mcaprl.open("minari:infos-v0")
+    steps = np.concatenate([np.arange(count + 1) for count in (5, 3, 4)])
+    expected: dict[str, Any] = {
+        "battery": 1 - steps / 8,
+        "pose.xy": np.stack([steps, -steps], 1).astype(np.float32),
+        "late": steps > 2,
+    }
+    for data in (found, log):
+        assert set(data.infos) == set(expected)
+        for name, values in expected.items():
+            _same(data.infos[name], np.ma.MaskedArray(values))
+    # What is written from the log is what Minari collected.
+    log.to_minari("minari:again-v0")
+    for name, values in mcaprl.open("minari:again-v0").infos.items():
+        _same(values, found.infos[name])
+
+
+def test_infos_that_differ_between_episodes_are_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "toy-v0"
+    _two_episodes(_INFOS).to_minari(path)
+    with h5py.File(path / "data/main_data.hdf5", "a") as file:
+        del file["episode_1/infos/pose/xy"]
+        file["episode_1/infos/pose/xy"] = np.zeros((2, 3), np.float32)
+        del file["episode_0/infos/speed"]
+        file["episode_0/infos/speed"] = np.zeros(7)
+    with pytest.warns(UserWarning, match=r"left out: pose.xy, speed$"):
+        found = mcaprl.open(path)
+    assert set(found.infos) == set(_INFOS) - {"pose.xy", "speed"}
 
 
 @pytest.mark.parametrize(
@@ -137,21 +132,36 @@ def test_infos_that_minari_collects_are_those_of_the_environment(
     ],
 )
 def test_other_infos_are_refused_or_left_out(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    form: str,
-    name: str,
-    infos: Any,
-    message: str,
+    tmp_path: Path, form: str, name: str, infos: Any, message: str
 ) -> None:
+    write = getattr(_two_episodes(infos), f"to_{form}")
     with pytest.raises(SpaceError, match=message):
-        _written(form, tmp_path / name, monkeypatch, infos)
-    (sentence,) = _written(form, tmp_path / name, monkeypatch, infos, lossy=True)
+        write(tmp_path / name)
+    (sentence,) = write(tmp_path / name, lossy=True)
     assert message in sentence
 
 
-def test_infos_of_d4rl_belong_to_the_observations(tmp_path: Path) -> None:
-    from mcaprl.recorder.dataset.formats import flat
-
-    found = flat._info_rows({"qpos": np.arange(8.0).reshape(4, 2)}, 1, 3, 3)
-    assert found["qpos"].tolist() == [[2, 3], [4, 5], [None, None]]
+@pytest.mark.parametrize("with_next", [True, False])
+def test_infos_of_d4rl_belong_to_the_observations(tmp_path: Path, with_next: bool) -> None:
+    with h5py.File(tmp_path / "their.hdf5", "w") as file:
+        file["observations"] = np.arange(4.0)[:, None]
+        if with_next:
+            file["next_observations"] = np.arange(1, 5.0)[:, None]
+        file["actions"] = np.zeros((4, 1))
+        file["rewards"] = np.zeros(4)
+        file["terminals"] = np.array([0, 1, 0, 0], bool)
+        file["timeouts"] = np.array([0, 0, 0, 1], bool)
+        file["infos/sim/qpos"] = np.arange(8).reshape(4, 2)
+        file["infos/goal"] = np.zeros(3)
+    rows: list[Any]
+    if with_next:
+        found = mcaprl.open(tmp_path / "their.hdf5")
+        rows = [[0, 1], [2, 3], None, [4, 5], [6, 7], None]
+    else:
+        with pytest.warns(UserWarning, match="no next_observations"):
+            found = mcaprl.open(tmp_path / "their.hdf5")
+        rows = [[0, 1], [2, 3], None, [4, 5], [6, 7]]
+    assert set(found.infos) == {"sim.qpos"}
+    assert found.infos["sim.qpos"].tolist() == [
+        [None, None] if row is None else row for row in rows
+    ]
