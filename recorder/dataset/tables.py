@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaprl.errors import import_extra
+from mcaprl.errors import SpaceError, import_extra
 from mcaprl.recorder.dataset.transitions import Transitions
+from mcaprl.recorder.format.infos import Masked
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf
 
@@ -38,12 +39,15 @@ def transition_table(
 ) -> Any:
     """Return a table with one row per transition, which contains both of its observations.
 
+    Infos are columns `info.<name>`, those of the next observation; null where there was none.
+
     With `tensors="lists"`, columns share their memory with the dataset where Arrow stores the
     values in the same way: actions, rewards and probabilities always, observations if they take
     16 KiB or more per episode on average. Their columns then have one chunk per episode. Flags,
     images on disk and times are copied.
     """
     arrow = import_extra("pyarrow", "tables")
+    import_extra("pyarrow.compute", "tables")
     found = [(name, arrow.array(array)) for name, array in _step_columns(columns).items()]
     if tensors == "lists":
         found += _tensor_lists(arrow, columns, leaves)
@@ -51,6 +55,9 @@ def transition_table(
         found += _tensor_columns(arrow, columns, leaves, description)
     shapes = _shapes(columns, leaves) if tensors == "lists" else {}
     fields = [field_of(arrow, name, array, shapes.get(name, ())) for name, array in found]
+    for info in info_columns(arrow, columns.infos, columns.frame_of_step() + 1, "info"):
+        found.append((info[0].name, info[1]))
+        fields.append(info[0])
     schema = arrow.schema(fields, metadata=described(description))
     return arrow.Table.from_arrays([array for _, array in found], schema=schema)
 
@@ -108,6 +115,45 @@ def fixed_lists(arrow: Any, values: NDArray[Any]) -> Any:
     element = arrow.field("element", flat.type, nullable=False)
     kind = arrow.list_(element, math.prod(values.shape[1:]))
     return arrow.FixedSizeListArray.from_arrays(flat, type=kind)
+
+
+def info_problem(name: str, info: Masked) -> str:
+    """Return why a table cannot hold an info; empty if it can."""
+    if info.dtype.kind not in "biufU" or not math.prod(info.shape[1:]):
+        kind = f"{info.dtype} of shape {info.shape[1:]}"
+        return f"the info '{name}' has {kind}; a table holds numbers, flags and texts"
+    if info.dtype.kind == "U":
+        try:
+            "".join(np.ma.getdata(info).ravel()).encode()
+        except UnicodeEncodeError:
+            return f"the info '{name}' has a text that is not UTF-8"
+    return ""
+
+
+def info_columns(
+    arrow: Any, infos: Mapping[str, Masked], rows: NDArray[np.int64], prefix: str
+) -> Iterator[tuple[Any, Any]]:
+    """Yield the field and the column of each info, `PREFIX.<name>`, with these rows.
+
+    The metadata of a field has the NumPy dtype and the shape of a row.
+
+    Raises:
+        SpaceError: Arrow cannot hold an info.
+    """
+    for name, info in infos.items():
+        values, mask = np.ma.getdata(info)[rows], np.ma.getmaskarray(info)[rows]
+        is_missing = mask.any(axis=tuple(range(1, mask.ndim)))
+        if problem := info_problem(name, info):
+            raise SpaceError(problem)
+        metadata = {"dtype": values.dtype.str, "shape": json.dumps(values.shape[1:])}
+        array = arrow.array(np.ascontiguousarray(values).reshape(-1))
+        if values.ndim > 1:
+            kind = arrow.list_(array.type, math.prod(values.shape[1:]))
+            missing = arrow.array(is_missing)
+            array = arrow.FixedSizeListArray.from_arrays(array, type=kind, mask=missing)
+        elif is_missing.any():
+            array = arrow.compute.if_else(arrow.array(~is_missing), array, None)
+        yield arrow.field(f"{prefix}.{name}", array.type, metadata=metadata), array
 
 
 def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int, ...]]:

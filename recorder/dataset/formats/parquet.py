@@ -9,10 +9,14 @@ spaces, as `tables.described` writes them.
 `episodes.parquet` has a row for each episode: the fields of `EpisodeSummary`, `final_log_time_ns`
 and the last observation, `final_observation`. The columns `next_observation` are for other tools:
 they are not read.
+
+The columns `info.<name>` have the infos of each step, and `reset_info.<name>` those of each reset;
+null means that there was none.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,15 +28,19 @@ from mcaprl.errors import LogError, SpaceError, import_extra
 from mcaprl.files import parse_json
 from mcaprl.recorder.dataset.arrays import exactly
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.infos import info_type, masked
 from mcaprl.recorder.dataset.tables import (
     episode_table,
     field_of,
     fixed_lists,
+    info_columns,
+    info_problem,
     observation_names,
     transition_table,
 )
 from mcaprl.recorder.dataset.transitions import Transitions
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
+from mcaprl.recorder.format.infos import Masked
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.spaces import Leaf, action_leaf, leaves_of
 
@@ -54,17 +62,21 @@ def write(
     Args:
         dataset: Episodes to write.
         path: Empty folder.
-        lossy: Ignored, because the files hold everything.
+        lossy: Whether infos that are neither numbers, flags nor text are left out.
         next_observations: Whether the rows have next observations, for other tools.
 
     Returns:
-        An empty list.
+        One sentence for each info that was left out.
 
     Raises:
+        SpaceError: An info is neither numbers, flags nor text, and `lossy` is not set.
         MissingExtraError: PyArrow is not installed.
     """
     arrow, parquet = _pyarrow()
-    leaves, columns = leaves_of(dataset.observation_space), dataset._transitions
+    leaves = leaves_of(dataset.observation_space)
+    columns, lost = _without_some_infos(dataset._transitions)
+    if lost and not lossy:
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to leave it out")
     metadata = LogMetadata.from_strings(dataset.metadata)
     unwanted = [] if next_observations else [f"next_{name}" for name in observation_names(leaves)]
     writer = None
@@ -83,7 +95,7 @@ def write(
             writer.close()
     episodes = _episodes_with_ends(arrow, columns, leaves)
     parquet.write_table(episodes, path / EPISODES, **_settings(arrow, episodes))
-    return []
+    return lost
 
 
 def read(path: Path) -> Dataset:
@@ -128,6 +140,10 @@ def read(path: Path) -> Dataset:
         truncated=steps.values("truncated", (), _FLAG),
         behavior_probs=steps.values("behavior_prob", (), np.dtype(np.float32)),
         episodes=episodes.summaries(),
+        infos={
+            name: _info(steps.info("info", name), episodes.info("reset_info", name), lengths)
+            for name in steps.info_names()
+        },
     )
     return Dataset(columns, metadata)
 
@@ -193,6 +209,37 @@ class _Table:
             parts.append(found if found.dtype == dtype else exactly(where, found, dtype))
         return np.concatenate(parts)
 
+    def info_names(self) -> list[str]:
+        """Return the names of the infos of the steps."""
+        names = self._table.column_names
+        return [name.removeprefix("info.") for name in names if name.startswith("info.")]
+
+    def info(self, prefix: str, name: str) -> Masked:
+        """Return an info (N, *shape) by the prefix and the name of its column.
+
+        Raises:
+            LogError: There is no such column, or its field does not describe it.
+        """
+        column = f"{prefix}.{name}"
+        if column not in self._table.column_names:
+            raise LogError(f"{self._path} has no column '{column}'")
+        arrow, _ = _pyarrow()
+        array, field = self._table[column].combine_chunks(), self._table.schema.field(column)
+        is_missing = np.asarray(array.is_null())
+        try:
+            described = {key.decode(): value for key, value in field.metadata.items()}
+            dtype = info_type(described["dtype"].decode())
+            shape = [int(size) for size in parse_json(described["shape"])]
+            if shape:
+                # The values of a null are there, unlike in `array.flatten()`.
+                size = array.type.list_size
+                array = array.values[array.offset * size : (array.offset + len(array)) * size]
+            filled = array.fill_null("" if dtype.kind == "U" else False if dtype.kind == "b" else 0)
+            values = filled.to_numpy(zero_copy_only=False).reshape(-1, *shape).astype(dtype)
+        except (AttributeError, KeyError, TypeError, ValueError, arrow.ArrowException) as error:
+            raise LogError(f"{self._path}: {column} is damaged: {error}") from error
+        return masked(values, is_missing, dtype)
+
     def summaries(self) -> tuple[EpisodeSummary, ...]:
         """Return the rows of the table of episodes.
 
@@ -208,6 +255,13 @@ class _Table:
 
 def _pyarrow() -> tuple[Any, Any]:
     return import_extra("pyarrow", "tables"), import_extra("pyarrow.parquet", "tables")
+
+
+def _without_some_infos(columns: Transitions) -> tuple[Transitions, list[str]]:
+    """Return the columns without the infos that a table cannot hold, and why it cannot."""
+    problems = {name: info_problem(name, info) for name, info in columns.infos.items()}
+    kept = {name: info for name, info in columns.infos.items() if not problems[name]}
+    return dataclasses.replace(columns, infos=kept), list(filter(None, problems.values()))
 
 
 def _is_list(arrow: Any, kind: Any) -> bool:
@@ -252,7 +306,20 @@ def _episodes_with_ends(arrow: Any, columns: Transitions, leaves: Sequence[Leaf]
         array = fixed_lists(arrow, np.asarray(frames[finals]))
         field = field_of(arrow, f"final_{name}", array, frames.shape[1:])
         table = table.append_column(field, array)
+    for field, array in info_columns(arrow, columns.infos, columns.first_frames, "reset_info"):
+        table = table.append_column(field, array)
     return table
+
+
+def _info(steps: Masked, resets: Masked, lengths: NDArray[np.int64]) -> Masked:
+    """Return an info (F, *shape): that of the reset, then those of the episode's steps."""
+    frames: Masked = np.ma.concatenate([steps, resets])  # type: ignore[no-untyped-call]
+    firsts = np.cumsum(lengths + 1) - lengths - 1
+    order = np.empty(len(frames), np.int64)
+    is_step = np.ones(len(frames), bool)
+    is_step[firsts] = False
+    order[is_step], order[firsts] = np.arange(len(steps)), len(steps) + np.arange(len(resets))
+    return frames[order]
 
 
 def _with_finals(

@@ -20,6 +20,7 @@ import mcaprl
 from mcaprl import Dataset
 from mcaprl.errors import LogError, MissingExtraError, SpaceError, UsageError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
+from mcaprl.recorder.dataset.formats.registry import FORMATS, write_format
 from mcaprl.recorder.format.metadata import LogMetadata
 from tests.conftest import need
 from tests.support.strategies import transitions
@@ -49,6 +50,11 @@ def _vectors() -> Dataset:
         truncated=False,
         behavior_probs=np.array([0.25, np.nan, 1], np.float32),
         times_ns=np.array([5, 6, 7, 9]),
+        infos={
+            "speed": np.ma.MaskedArray([0, 1.5, 2, 0], [True, False, False, True]),
+            "lap": np.ma.MaskedArray([7, 8, 9, 9]),
+            "why": np.ma.MaskedArray(["", "", "", "wall"], [True, True, True, False]),
+        },
         summary={"reason": "goal", "seed": 3},
     )
     second = EpisodeArrays(
@@ -106,6 +112,16 @@ def test_everything_comes_back(tmp_path: Path, make: Any) -> None:
     log = _saved(make(), tmp_path / "log.mcap")
     mcaprl.convert(log, tmp_path / "out.h5", to="d3rlpy")
     _same(mcaprl.open(log), mcaprl.open(tmp_path / "out.h5"))
+
+
+def test_infos_come_back(tmp_path: Path) -> None:
+    dataset = _vectors()
+    assert write_format(dataset, tmp_path / "out.h5", FORMATS["d3rlpy"]) == []
+    found = mcaprl.open(tmp_path / "out.h5").infos
+    assert found["speed"].tolist() == [None, 1.5, 2, None, None, None, None]
+    assert found["lap"].tolist() == [7, 8, 9, 9, None, None, None]
+    assert found["lap"].dtype == np.int64
+    assert found["why"].tolist() == [None, None, None, "wall", None, None, None]
 
 
 @settings(max_examples=40)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -68,20 +69,43 @@ def _recorded() -> Dataset:
     return dataset_of([first, second], metadata, "test")
 
 
-def _vectors(episodes: int = 2, length: int = 3) -> Dataset:
-    """Return episodes of a vector and an integer: observation k of all is (k, -k)."""
-    steps, every = episodes * length, np.arange(episodes * (length + 1))
-    frames = np.stack([every, -every], axis=1).astype(np.float32)
-    here = np.arange(steps) + np.repeat(np.arange(episodes), length)
-    return Dataset.from_arrays(
-        observations=frames[here],
-        next_observations=frames[here + 1],
-        actions=np.arange(steps) % 3,
-        rewards=np.arange(steps) / 2,
-        terminated=np.arange(steps) % length == length - 1,
-        truncated=np.zeros(steps, bool),
-        behavior_probs=np.full(steps, 0.5),
-    )
+def _vectors(
+    episodes: int = 2, length: int = 3, infos: list[dict[str, Any]] | None = None
+) -> Dataset:
+    """Return episodes of a vector and an integer: observation k of all is (k, -k).
+
+    Args:
+        episodes: Number of episodes.
+        length: Number of transitions of an episode.
+        infos: Infos of the episodes, in place of `episodes` and `length`; None is missing.
+    """
+    parts: list[EpisodeArrays] = []
+    first = 0
+    for info in infos or [{}] * episodes:
+        count = len(next(iter(info.values()))) if info else length + 1
+        frames, steps = np.arange(first, first + count), np.arange(count - 1)
+        episode = EpisodeArrays(
+            observations=np.stack([frames, -frames], axis=1).astype(np.float32),
+            actions=(steps + first) % 3,
+            rewards=(steps + first - len(parts)) / 2,
+            terminated=True,
+            truncated=False,
+            behavior_probs=np.full(count - 1, 0.5, np.float32),
+            infos={name: _masked(values) for name, values in info.items()},
+        )
+        parts.append(episode)
+        first += count
+    metadata = LogMetadata(spaces.Box(-np.inf, np.inf, (2,), np.float32), spaces.Discrete(3))
+    return dataset_of(parts, metadata, "test")
+
+
+def _masked(values: list[Any]) -> Any:
+    present = [value for value in values if value is not None]
+    zero = np.zeros_like(np.asarray(present))[0] if present else False
+    every = np.array([zero if value is None else value for value in values])
+    is_missing = np.array([value is None for value in values])
+    mask = np.broadcast_to(is_missing.reshape(-1, *[1] * (every.ndim - 1)), every.shape)
+    return np.ma.MaskedArray(every, mask)
 
 
 def _same(first: Dataset, second: Dataset) -> None:
@@ -113,6 +137,45 @@ def test_all_spaces_and_bits_come_back(arguments: dict[str, Any]) -> None:
     with TemporaryDirectory() as folder:
         dataset.to_parquet(Path(folder) / "out")
         _same(dataset, Dataset.from_parquet(Path(folder) / "out"))
+
+
+def test_infos_of_steps_and_resets_come_back(tmp_path: Path) -> None:
+    infos: list[dict[str, Any]] = [
+        {"speed": [1.5, None, -2, 0], "lap": [None, 1, 2, None], "near": [True, None, False, True]},
+        {"speed": [None, 0.5], "place": [[1, 2], None], "why": [None, "ß"], "near": [None, None]},
+    ]
+    dataset = _vectors(infos=infos)
+    dataset.to_parquet(tmp_path / "out")
+    found = mcaprl.open(tmp_path / "out")
+    _same(dataset, found)
+    assert list(found.infos) == ["speed", "lap", "near", "place", "why"]
+    for name, info in dataset.infos.items():
+        assert found.infos[name].dtype == info.dtype
+        assert found.infos[name].tolist() == info.tolist()
+    assert found.infos["lap"].tolist() == [None, 1, 2, None, None, None]
+    steps = pq.read_table(tmp_path / "out/transitions.parquet")
+    assert steps["info.speed"].to_pylist() == [None, -2, 0, 0.5]
+    assert steps["info.place"].to_pylist() == [None] * 4
+    resets = pq.read_table(tmp_path / "out/episodes.parquet")
+    assert resets["reset_info.place"].to_pylist() == [None, [1, 2]]
+    assert resets["reset_info.near"].to_pylist() == [True, None]
+    assert dataset.to_arrow()["info.why"].to_pylist() == [None, None, None, "ß"]
+
+
+def test_infos_that_a_table_cannot_hold_are_refused(tmp_path: Path) -> None:
+    for value, message in (
+        (1j, "the info 'x' has complex128"),
+        ("\ud800", "a text that is not UTF-8"),
+    ):
+        dataset = _vectors(infos=[{"x": [value, value], "y": [1, None]}])
+        with pytest.raises(SpaceError, match=message):
+            dataset.to_arrow()
+        with pytest.raises(SpaceError, match=rf"{message}.*pass --lossy"):
+            dataset.to_parquet(tmp_path / "out")
+        (lost,) = dataset.to_parquet(tmp_path / "out", lossy=True, overwrite=True)
+        assert lost.startswith("the info 'x' has")
+        assert mcaprl.open(tmp_path / "out").infos["y"].tolist() == [1, None]
+        shutil.rmtree(tmp_path / "out")
 
 
 def test_blocks_of_episodes_and_rows_are_one_table(
