@@ -18,6 +18,7 @@ import click
 
 from mcaprl._version import __version__
 from mcaprl.cli.convert import convert
+from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
 from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
@@ -43,6 +44,10 @@ _COMMANDS = (
     export,
     replay,
     convert,
+    merge,
+    split,
+    filter_,
+    slice_,
     info,
     check,
     recover,

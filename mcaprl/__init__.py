@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
+    from mcaprl.api.edit import filter, merge, slice, split
     from mcaprl.api.estimate import estimate
     from mcaprl.api.evaluate import evaluate
     from mcaprl.api.logs import check, info, layout, recover
@@ -50,15 +51,19 @@ __all__ = [
     "estimate_behavior",
     "evaluate",
     "export",
+    "filter",
     "info",
     "layout",
     "load_policy",
     "make_sim",
+    "merge",
     "open",
     "record",
     "recover",
     "render",
     "replay",
+    "slice",
+    "split",
     "suggest_mapping",
     "torch",
     "train",
@@ -73,6 +78,7 @@ __getattr__ = lazy_attributes(
     | {
         "mcaprl.api.behavior": ["estimate_behavior"],
         "mcaprl.api.convert": ["convert", "suggest_mapping"],
+        "mcaprl.api.edit": ["filter", "merge", "slice", "split"],
         "mcaprl.api.logs": ["check", "info", "layout", "recover"],
         "mcaprl.api.policies": ["export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],

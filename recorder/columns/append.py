@@ -46,31 +46,39 @@ def written_state(path: Path) -> WrittenState:
         LogError: The file is damaged or not finished, or has messages outside of chunks.
     """
     try:
-        reader = McapReader(path)
-        end = reader.summary_start - _DATA_END.size
-        if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
-            raise CorruptLogError("the file is not finished")
-        (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
-        summary = Summary(chunks=list(reader.chunks))
-        top_level: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
-        for topic in top_level:
-            summary.add(topic, 0, 0)
-        for channel in reader.channels.values():
-            ranges = reader.message_ranges(channel)
-            if any(messages.chunk is None for messages in ranges):
-                raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
-            summary.counts[channel.id] = sum(map(len, ranges))
-        for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
-            if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
-                record: TopLevelRecord = parse_record(opcode, content)
-                summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
-                top_level.append(record)
-            elif opcode == Opcode.DATA_END:
-                break
+        return finished_state(McapReader(path))
     except CorruptLogError as error:
         what = str(error).removeprefix(f"{path}: ")
         raise LogError(
             f"{path} cannot be appended to: {what}; run `mcaprl recover {path} OUT` and"
             " append to OUT"
         ) from error
+
+
+def finished_state(reader: McapReader) -> WrittenState:
+    """Return the state in which the writer of a finished file left it.
+
+    Raises:
+        CorruptLogError: The file is damaged or not finished, or has messages outside of chunks.
+    """
+    end = reader.summary_start - _DATA_END.size
+    if end <= 0 or _DATA_END.unpack_from(reader.view, end)[:2] != (Opcode.DATA_END, 4):
+        raise CorruptLogError("the file is not finished")
+    (_, _, crc) = _DATA_END.unpack_from(reader.view, end)
+    summary = Summary(chunks=list(reader.chunks))
+    top_level: list[TopLevelRecord] = [*reader.schemas.values(), *reader.channels.values()]
+    for topic in top_level:
+        summary.add(topic, 0, 0)
+    for channel in reader.channels.values():
+        ranges = reader.message_ranges(channel)
+        if any(messages.chunk is None for messages in ranges):
+            raise CorruptLogError(f"{channel.topic} has messages outside of chunks")
+        summary.counts[channel.id] = sum(map(len, ranges))
+    for offset, opcode, content in reader.records(len(MCAP0_MAGIC)):
+        if opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            record: TopLevelRecord = parse_record(opcode, content)
+            summary.add(record, offset, RECORD_HEADER_BYTES + len(content))
+            top_level.append(record)
+        elif opcode == Opcode.DATA_END:
+            break
     return WrittenState(summary, end, crc or crc32(reader.view[:end]), top_level)

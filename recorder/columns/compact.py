@@ -167,19 +167,6 @@ class _CompactedFile(OutputFile):
             )
         self._write(view[part])
 
-    def _copy_chunk(self, view: memoryview, chunk: ChunkIndex) -> None:
-        """Copy the bytes of a chunk and its indexes."""
-        shift = self.position - chunk.chunk_start_offset
-        self._write(view[chunk.chunk_start_offset : end_of(chunk)])
-        offsets = {id_: offset + shift for id_, offset in chunk.message_index_offsets.items()}
-        self._summary.chunks.append(
-            replace(
-                chunk,
-                chunk_start_offset=chunk.chunk_start_offset + shift,
-                message_index_offsets=offsets,
-            )
-        )
-
     def _merge(
         self, view: memoryview, group: list[ChunkIndex], compressors: Compressors, scratch: Scratch
     ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
+from dataclasses import replace
 from io import FileIO
 from pathlib import Path
 from typing import NoReturn
@@ -89,6 +90,21 @@ class OutputFile:
                     message_end_time=times[1],
                     message_index_offsets=index_offsets,
                     message_index_length=index_bytes,
+                )
+            )
+
+    def _copy_chunk(self, view: memoryview, chunk: ChunkIndex) -> None:
+        """Copy the bytes of a chunk and its message indexes from another file."""
+        shift = self.position - chunk.chunk_start_offset
+        offsets = {id_: offset + shift for id_, offset in chunk.message_index_offsets.items()}
+        stop = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        with HoldSignals():
+            self._write(view[chunk.chunk_start_offset : stop])
+            self._summary.chunks.append(
+                replace(
+                    chunk,
+                    chunk_start_offset=chunk.chunk_start_offset + shift,
+                    message_index_offsets=offsets,
                 )
             )
 

@@ -48,7 +48,7 @@ def recover_file(
     """
     view = map_file(source)
     records = list(valid_records(view, damages))
-    with _writer_like(view, records, target) as writer:
+    with writer_like(view, records, target) as writer:
         topics = _Topics(view, records, damages)
         for metadata in restore(topics.metadata, topics.channels.values()):
             writer.announce(metadata)
@@ -81,7 +81,7 @@ def copy_messages(
     Yields:
         The writer, for more messages.
     """
-    with _writer_like(reader.view, reader.records(len(MCAP0_MAGIC)), target) as writer:
+    with writer_like(reader.view, reader.records(len(MCAP0_MAGIC)), target) as writer:
         top_level = written_state(reader.path).top_level
         for record in sorted(top_level, key=lambda record: not isinstance(record, Metadata)):
             writer.announce(record)
@@ -107,7 +107,7 @@ def copy_messages(
 
 
 @contextmanager
-def _writer_like(
+def writer_like(
     view: memoryview, records: Iterable[ValidRecord], target: Path
 ) -> Iterator[McapWriter]:
     """Open a writer with the profile of a file and the compression of its first chunk."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
@@ -224,6 +224,18 @@ class McapWriter(OutputFile):
             (min(starts), max(ends)),
             self._compressors.of(records, sum(map(len, indexes.values()))),
         )
+
+    def copy_chunk(self, view: memoryview, chunk: ChunkIndex, counts: Mapping[int, int]) -> None:
+        """Copy a chunk and its message indexes from another file without decompressing it.
+
+        Args:
+            view: Bytes of the other file.
+            chunk: Index of the chunk. This file has all its channels, with equal ids.
+            counts: Number of messages of the chunk by channel id.
+        """
+        self._copy_chunk(view, chunk)
+        for channel_id, count in counts.items():
+            self._summary.counts[channel_id] += count
 
     def close(self) -> None:
         """Write the summary, merge small chunks, and close the file; do nothing if it is closed."""

@@ -78,6 +78,15 @@ class LogReader:
         self._check_fields(COUNTERS)
         return self._finished(episode_lengths(self._steps.read(COUNTERS, self._order), self.path))
 
+    def record_times(self) -> NDArray[np.int64]:
+        """Return the log_time of each record of the finished episodes, episode by episode.
+
+        Raises:
+            LogError: As for `lengths`.
+        """
+        times, frames = self._steps.times, int(self.lengths.sum()) + len(self.lengths)
+        return (times if self._order is None else times[self._order])[:frames]
+
     def read(self, episodes: NDArray[np.int64] | None = None) -> Dataset:
         """Read whole episodes.
 

@@ -55,7 +55,8 @@ class Source:
         spans: (S, 2) first and last time of each series of kept messages, increasing.
         also: Times of more kept messages, by channel id.
         without: Times of messages in the spans that are not kept, by channel id.
-        changed: First and last time of the messages that `change` changes, by channel id.
+        changed: (S, 2) first and last times of the messages that `change` gets, by channel id; with
+            a delay, it gets all messages.
         change: Function that changes a message.
         delay_ns: Number that is added to the log_time and publish_time of each message.
     """
@@ -65,7 +66,7 @@ class Source:
     spans: Times = field(default_factory=lambda: ALL_TIMES)
     also: Mapping[int, Times] = field(default_factory=dict)
     without: Mapping[int, Times] = field(default_factory=dict)
-    changed: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    changed: Mapping[int, Times] = field(default_factory=dict)
     change: Change | None = None
     delay_ns: int = 0
 
@@ -82,8 +83,8 @@ class Source:
         """Return whether messages of a channel in a span of time may be changed."""
         if self.delay_ns or self.ids[channel_id] != channel_id:
             return True
-        first, last = self.changed.get(channel_id, (1, 0))
-        return max(first, start) <= min(last, end)
+        spans = self.changed.get(channel_id, ALL_TIMES[:0])
+        return bool(((spans[:, 0] <= end) & (start <= spans[:, 1])).any())
 
 
 @dataclass
@@ -357,5 +358,5 @@ def _renew(source: Source, view: memoryview, place: int, channel_id: int, time_n
         payload = view[place + MESSAGE_HEADER.itemsize : place + RECORD_HEADER_BYTES + length]
         source.change(source.reader.channels[channel_id], time_ns, payload)
     opcode, length, _, sequence, log_time, publish_time = _HEADER.unpack_from(view, place)
-    times = (log_time + source.delay_ns, publish_time + source.delay_ns)
+    times = (log_time + source.delay_ns, (publish_time + source.delay_ns) % 2**64)
     _HEADER.pack_into(view, place, opcode, length, source.ids[channel_id], sequence, *times)

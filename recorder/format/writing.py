@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mcaprl.recorder.columns.append import finished_state
 from mcaprl.recorder.columns.cdr import ENCAPSULATION
 from mcaprl.recorder.columns.message_rows import message_rows
 from mcaprl.recorder.columns.signals import HoldSignals
@@ -16,6 +17,7 @@ __all__ = [
     "HoldSignals",
     "McapWriter",
     "copy_messages",
+    "finished_state",
     "message_rows",
     "recover_file",
 ]

@@ -1,6 +1,6 @@
-"""Expressions of a mapping: arithmetic over named columns, and nothing else of Python.
+"""Expressions: arithmetic over named columns, and nothing else of Python.
 
-An expression is parsed by `ast` and evaluated for all steps at once. It may contain numbers,
+An expression is parsed by `ast` and evaluated for all rows at once. It may contain numbers,
 strings for comparison, names, elements such as `pose[0]`, `+ - * / // % **`, comparisons, `and`,
 `or`, `not`, `A if CONDITION else B`, and calls of the functions in `FUNCTIONS`. Attributes, other
 calls, and all other syntax are errors.
@@ -67,6 +67,7 @@ class Expression:
     Attributes:
         text: Text of the expression.
         names: Names of the columns that the expression reads.
+        uses_next: Whether the expression calls `next`.
     """
 
     def __init__(self, text: str) -> None:
@@ -90,6 +91,9 @@ class Expression:
             for node in ast.walk(self._tree)
             if isinstance(node, ast.Name) and node.id not in FUNCTIONS and node.id != NEXT
         )
+        self.uses_next = any(
+            isinstance(node, ast.Name) and node.id == NEXT for node in ast.walk(self._tree)
+        )
 
     def evaluate(self, columns: Mapping[str, Column], following: NDArray[np.int64]) -> Column:
         """Return the value at each step, (N,).
@@ -110,7 +114,7 @@ class Expression:
         except (TypeError, ValueError, IndexError) as error:
             raise UsageError(f"'{self.text}' cannot be evaluated: {error}") from error
         if found.ndim > 1 or found.dtype.kind not in "biuf":
-            raise UsageError(f"'{self.text}' must be one number for each step")
+            raise UsageError(f"'{self.text}' must be one number for each row")
         return np.broadcast_to(found, following.shape)
 
     def _check(self, node: ast.AST, depth: int) -> None:

@@ -162,11 +162,13 @@ class EpisodeCheck:
         for name in _FIELDS[1:]:
             self._columns[name][rows] = found[name]
         assert self._metadata is not None
-        wrong = outside(self._metadata.action_space, found["action"]) & ~found["final"].astype(bool)
+        space = self._metadata.action_space
+        actions = found["action"].reshape(-1, *(space.shape or ()))
+        wrong = outside(space, actions) & ~found["final"].astype(bool)
         for row in np.flatnonzero(wrong)[:LISTED].tolist():
             self._problems.append(
                 Problem(
-                    f"action {found['action'][row]} is outside of {self._metadata.action_space}",
+                    f"action {found['action'][row]} is outside of {space}",
                     f"episode {found['episode'][row]} step {found['step'][row]}",
                     next=IMPOSSIBLE_ACTION,
                 )

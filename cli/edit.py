@@ -1,0 +1,125 @@
+"""`mcaprl merge`, `split`, `filter` and `slice`: logs made of parts of other logs."""
+
+from __future__ import annotations
+
+import math
+
+import click
+
+import mcaprl
+from mcaprl.cli.options import json_option
+from mcaprl.cli.show import echo, print_json
+from mcaprl.errors import UsageError
+from mcaprl.recorder.edit.source import Edited
+from mcaprl.texts import counted
+
+_overwrite_option = click.option("--overwrite", is_flag=True, help="Replace existing output.")
+
+
+@click.command()
+@click.argument("logs", nargs=-1, required=True, metavar="LOG... OUT")
+@click.option("--shift", is_flag=True, help="Move the times of logs that overlap earlier ones.")
+@_overwrite_option
+@json_option
+def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) -> None:
+    """Join LOG... into the new log OUT, with all topics, metadata and attachments."""
+    if len(logs) < 2:
+        raise UsageError("merge needs LOG... and OUT")
+    _show([mcaprl.merge(logs[:-1], logs[-1], shift=shift, overwrite=overwrite)], as_json)
+
+
+@click.command()
+@click.argument("log")
+@click.argument("out")
+@click.option("--episodes", type=int, help="Number of episodes of each part.")
+@click.option("--ratio", metavar="A:B[:C...]", help="Relative sizes of the parts, such as 8:1:1.")
+@click.option("--seed", type=click.IntRange(0), help="Seed; assign episodes to parts at random.")
+@_overwrite_option
+@json_option
+def split(
+    log: str,
+    out: str,
+    episodes: int | None,
+    ratio: str | None,
+    seed: int | None,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Copy the episodes of LOG to several logs in the new folder OUT."""
+    shares = None if ratio is None else [_number("ratio", part) for part in ratio.split(":")]
+    found = mcaprl.split(log, out, episodes=episodes, ratio=shares, seed=seed, overwrite=overwrite)
+    _show(found, as_json)
+
+
+@click.command("filter")
+@click.argument("expression")
+@click.argument("log")
+@click.argument("out")
+@_overwrite_option
+@json_option
+def filter_(expression: str, log: str, out: str, overwrite: bool, as_json: bool) -> None:
+    """Copy the episodes of LOG for which EXPRESSION is true to the new log OUT.
+
+    EXPRESSION is a condition such as "length > 100 and reason == 'crash'" on: episode, length,
+    total_reward, terminated, truncated, reason, policy, epsilon, seed, options, start_s,
+    duration_s.
+    """
+    _show([mcaprl.filter(expression, log, out, overwrite=overwrite)], as_json)
+
+
+@click.command("slice")
+@click.argument("log")
+@click.argument("out")
+@click.option("--steps", metavar="A:B", help="Transitions from A up to, not including, B.")
+@click.option("--time", metavar="A:B", help="Seconds since the first message of LOG.")
+@_overwrite_option
+@json_option
+def slice_(
+    log: str, out: str, steps: str | None, time: str | None, overwrite: bool, as_json: bool
+) -> None:
+    """Copy the part of LOG between two steps or times to the new log OUT.
+
+    Episodes that the part begins or ends within become shorter. A or B may be empty.
+    """
+    found = mcaprl.slice(
+        log,
+        out,
+        steps=None if steps is None else _bounds("steps", steps),
+        time=None if time is None else _bounds("time", time),
+        overwrite=overwrite,
+    )
+    _show([found], as_json)
+
+
+def _show(results: list[Edited], as_json: bool) -> None:
+    if as_json:
+        print_json({"logs": [vars(found) | {"out": str(found.out)} for found in results]})
+        return
+    for found in results:
+        episodes, steps = counted(found.episodes, "episode"), counted(found.steps, "step")
+        chunks = f"{found.whole_chunks} of {found.whole_chunks + found.rewritten_chunks} chunks"
+        messages = counted(found.messages, "message")
+        echo(f"{found.out}: {episodes}, {steps}, {messages}; {chunks} copied unchanged")
+
+
+def _bounds(option: str, text: str) -> tuple[float | None, float | None]:
+    """Parse A:B; an empty bound is None.
+
+    Raises:
+        UsageError: The text has another form.
+    """
+    parts = text.split(":")
+    if len(parts) != 2:
+        raise UsageError(f"--{option} is '{text}', expected A:B, such as 100:200")
+    first, last = (None if not part.strip() else _number(option, part) for part in parts)
+    return first, last
+
+
+def _number(option: str, text: str) -> float:
+    try:
+        number = int(text) if option == "steps" else float(text)
+    except ValueError as error:
+        raise UsageError(f"--{option} has '{text}', which is not a number") from error
+    if not (math.isfinite(number) and number >= 0):
+        raise UsageError(f"--{option} has '{text}', expected a number of 0 or more")
+    return number

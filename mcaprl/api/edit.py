@@ -1,0 +1,122 @@
+"""Logs made of parts of other logs, with all their topics, metadata and attachments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mcaprl.api.data import Paths
+from mcaprl.recorder.edit.cut import filter_log, split_log
+from mcaprl.recorder.edit.join import merge_logs
+from mcaprl.recorder.edit.piece import Bounds, slice_log
+from mcaprl.recorder.edit.source import Edited
+
+
+def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool = False) -> Edited:
+    """Join logs into one log.
+
+    The episodes of the new log are in the order of their times. The logs must be finished, and have
+    the same spaces, environment, names and step duration; other metadata that differ are empty in
+    the new log. A message that several logs have at the same time with the same bytes is written
+    once.
+
+    Args:
+        logs: Two or more logs: files, folders or globs.
+        out: Path of the new log.
+        shift: Whether the times of a log whose episodes overlap with those of an earlier one are
+            moved to after the end of the earlier ones. Times inside of its messages move too.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: There are fewer than two logs.
+        OutputExistsError: `out` exists.
+        SpaceError: The spaces differ.
+        LogError: A log cannot be read, other metadata differ, or episodes of two logs overlap in
+            time and `shift` is not set.
+    """
+    return merge_logs(logs, out, shift=shift, overwrite=overwrite)
+
+
+def split(
+    log: str | Path,
+    out: str | Path,
+    *,
+    episodes: int | None = None,
+    ratio: Sequence[float] | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+) -> list[Edited]:
+    """Copy the episodes of a log to several logs, each episode to one of them.
+
+    A message belongs to the episode during or after which it was logged. Messages that are valid
+    in several parts, such as the static scene, are in each of them.
+
+    Args:
+        log: Path of the log.
+        out: New folder of the logs, which are named `NAME-00000.mcap`, `NAME-00001.mcap` and so on.
+        episodes: Number of episodes of each new log; the last one may have fewer.
+        ratio: Relative number of episodes of each new log, such as (8, 1, 1).
+        seed: Seed of a random assignment of episodes to logs; None to assign them in their order.
+        overwrite: Whether an existing folder is replaced.
+
+    Raises:
+        UsageError: Not exactly one of `episodes` and `ratio` is given, or a log would be empty.
+        OutputExistsError: `out` exists.
+        LogError: The log cannot be read, is not finished, or has no episodes.
+    """
+    return split_log(log, out, episodes=episodes, ratio=ratio, seed=seed, overwrite=overwrite)
+
+
+def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool = False) -> Edited:
+    """Copy the episodes for which an expression is true to a new log.
+
+    The expression is a condition such as `"length > 100 and reason != 'crash'"`. It can use
+    numbers, texts, operators, and these columns of the table of episodes: `episode` (its index,
+    from 0), `length`, `total_reward`, `terminated`, `truncated`, `reason`, `policy`, `epsilon`,
+    `seed` (NaN if there was none), `options`, `start_s` (time since the start of the first
+    episode) and `duration_s`.
+
+    Args:
+        expression: Condition on an episode.
+        log: Path of the log.
+        out: Path of the new log.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: The expression is not a condition, or names an unknown column.
+        OutputExistsError: `out` exists.
+        NoEpisodesError: The expression is true for no episode.
+        LogError: The log cannot be read, or is not finished.
+    """
+    return filter_log(expression, log, out, overwrite=overwrite)
+
+
+def slice(
+    log: str | Path,
+    out: str | Path,
+    *,
+    steps: Bounds | None = None,
+    time: Bounds | None = None,
+    overwrite: bool = False,
+) -> Edited:
+    """Copy the part of a log between two steps or times to a new log.
+
+    An episode that the part begins or ends within becomes a shorter episode. If its beginning is
+    missing, its steps are numbered from 0, and it has no seed. If its end is missing, it is
+    truncated with the reason `interrupted`.
+
+    Args:
+        log: Path of the log; with `time`, of any finished MCAP file.
+        out: Path of the new log.
+        steps: First transition of the part, and the first one after it, counted from 0 over all
+            episodes. None as a bound is the start or end of the log.
+        time: Bounds in seconds since the first message of the log, like `steps`.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        UsageError: Not exactly one of `steps` and `time` is given, or nothing is in the part.
+        OutputExistsError: `out` exists.
+        NoEpisodesError: The part has no whole transition.
+        LogError: The log cannot be read, or is not finished.
+    """
+    return slice_log(log, out, steps=steps, time=time, overwrite=overwrite)

@@ -1,0 +1,1 @@
+"""Logs made of parts of other logs: joined, split, filtered by episodes, and cut by time."""

@@ -1,0 +1,247 @@
+"""Several logs joined into one."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from mcap.records import Attachment, Channel, Metadata
+
+from mcaprl.errors import LogError, SpaceError, UsageError
+from mcaprl.files import replacing
+from mcaprl.recorder.dataset.log_reader import described
+from mcaprl.recorder.dataset.open import find_logs
+from mcaprl.recorder.edit.source import Edited, FinishedLog
+from mcaprl.recorder.edit.stamps import Delay
+from mcaprl.recorder.format.metadata import (
+    DEFAULT_STEP_DURATION_NS,
+    METADATA_NAME,
+    SAME_WHEN_APPENDED,
+    LogMetadata,
+    same_env,
+)
+from mcaprl.recorder.format.reading import McapReader
+from mcaprl.recorder.format.selected_copy import (
+    NewTopics,
+    Source,
+    Times,
+    copy_selected,
+    times_of,
+)
+from mcaprl.recorder.format.topics import STEP_TOPIC
+
+
+def merge_logs(
+    paths: str | Path | Sequence[str | Path],
+    out: str | Path,
+    *,
+    shift: bool = False,
+    overwrite: bool = False,
+) -> Edited:
+    """Join the episodes and all other messages of logs; see `mcaprl.merge`."""
+    logs = [FinishedLog(path) for path in find_logs(paths)]
+    if len(logs) < 2:
+        raise UsageError(f"merge needs two or more logs, not {len(logs)}")
+    metadata = _common_metadata([log for log in logs if log.has_steps])
+    delays = _delays(logs, metadata, shift=shift)
+    topics, sources = NewTopics(), []
+    strings = None if metadata is None else _strings(logs, metadata)
+    replaced = {} if strings is None else {STEP_TOPIC: strings}
+    for log, delay_ns in zip(logs, delays, strict=True):
+        source = Source(log.reader, topics.add(log.reader, replaced), delay_ns=delay_ns)
+        if delay_ns:
+            source.change = Delay(log.reader, log.span_of_messages(), delay_ns)
+        sources.append(source)
+    _leave_out_repeated(logs, sources)
+    records, attachments = _other_records(logs, strings)
+    top_level = [*records, *topics.records(), *attachments]
+    with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
+        copied = copy_selected(sources, unfinished, top_level)
+    episodes = sum(len(log.lengths) for log in logs)
+    steps = sum(int(log.lengths.sum()) for log in logs)
+    return Edited(Path(out), episodes, steps, copied.messages, copied.whole, copied.rewritten)
+
+
+def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
+    """Return the metadata of all logs together; None if they have none.
+
+    Fields that may differ are empty if they do, as in a dataset of several logs.
+
+    Raises:
+        SpaceError: The spaces differ.
+        LogError: Other metadata differ that are equal in all recordings of a log.
+    """
+    found = [described(log.reader) for log in logs]
+    described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
+    if not described_ones:
+        _check_same_types(logs)
+        return None
+    without = [log.path for log, one in zip(logs, found, strict=True) if one is None]
+    if without:
+        raise LogError(f"{without[0]} has no metadata, but {described_ones[0][0].path} has")
+    (first, metadata), *others = described_ones
+    for log, other in others:
+        _check_same(first.path, metadata, log.path, other)
+    common = LogMetadata.common([one for _, one in described_ones])
+    # An older log does not name the module of its environment.
+    return replace(common, env_id=max((one.env_id for _, one in described_ones), key=len))
+
+
+def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, str]:
+    """Return the map to write: that of the logs if it is the same in all of them."""
+    found = [log.reader.metadata.get(METADATA_NAME) for log in logs if log.has_steps]
+    first = found[0]
+    if first is not None and all(one == first for one in found):
+        return first
+    return metadata.to_strings()
+
+
+def _check_same(first: Path, one: LogMetadata, second: Path, other: LogMetadata) -> None:
+    here, there = one.to_strings(), other.to_strings()
+    for name in SAME_WHEN_APPENDED:
+        same = here[name] == there[name]
+        if not (same_env(here[name], there[name]) if name == "env_id" else same):
+            kind = SpaceError if name.endswith("_space") else LogError
+            raise kind(
+                f"{first} and {second} differ in {name}: {here[name]:.200} and"
+                f" {there[name]:.200}; they cannot be one log"
+            )
+
+
+def _check_same_types(logs: Sequence[FinishedLog]) -> None:
+    """Raise LogError if the messages of `/rl/step` have different types."""
+    types = [
+        {
+            (one.name, one.data)
+            for one in map(log.reader.schema_of, log.reader.channels_of(STEP_TOPIC))
+        }
+        for log in logs
+    ]
+    for log, found in zip(logs, types, strict=True):
+        if found != types[0]:
+            raise LogError(
+                f"{logs[0].path} and {log.path} have messages of different types on {STEP_TOPIC}"
+            )
+
+
+def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift: bool) -> list[int]:
+    """Return the number of nanoseconds by which the times of each log are moved.
+
+    Raises:
+        LogError: Episodes of two logs overlap in time, and `shift` is not set.
+    """
+    gap = DEFAULT_STEP_DURATION_NS if metadata is None else metadata.step_duration_ns
+    delays, spans, end = [], np.empty((0, 2), np.int64), -1
+    for number, log in enumerate(logs):
+        delay, (first, last) = 0, log.span_of_messages()
+        if log.has_steps and _overlap(spans, log.spans):
+            if not shift:
+                raise LogError(
+                    f"the episodes of {log.path} overlap in time with those of"
+                    f" {_overlapped(logs[:number], log)}; pass --shift (shift=True in Python) to"
+                    " move the times of the later argument to after those of the others"
+                )
+            delay = end + max(gap, 1) - first
+        if log.has_steps:
+            spans = np.concatenate([spans, log.spans + delay])
+        delays.append(delay)
+        end = max(end, last + delay)
+    return delays
+
+
+def _overlap(spans: Times, others: Times) -> bool:
+    every = np.concatenate([spans, others])
+    every = every[np.argsort(every[:, 0], kind="stable")]
+    return bool((every[1:, 0] <= every[:-1, 1]).any())
+
+
+def _overlapped(logs: Sequence[FinishedLog], log: FinishedLog) -> Path:
+    """Return the path of a log whose episodes overlap, in its own times if there is one."""
+    found = [one.path for one in logs if one.has_steps and _overlap(one.spans, log.spans)]
+    return (found or [one.path for one in logs if one.has_steps])[0]
+
+
+def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) -> None:
+    """Let each source leave out the messages that an earlier one has with equal bytes.
+
+    Parts of one log repeat the messages that are valid in several of them, such as the static
+    scene.
+    """
+    bounds = [log.span_of_messages() for log in logs]
+    starts_ends = [
+        (first + source.delay_ns, last + source.delay_ns)
+        for (first, last), source in zip(bounds, sources, strict=True)
+    ]
+    without: list[dict[int, Times]] = [{} for _ in sources]
+    for early, late in itertools.combinations(range(len(sources)), 2):
+        (first, last), (other_first, other_last) = starts_ends[early], starts_ends[late]
+        if max(first, other_first) > min(last, other_last):
+            continue
+        for channel_id, times in _repeated(sources[early], sources[late]).items():
+            known = without[late].get(channel_id, times)
+            without[late][channel_id] = np.union1d(known, times)
+    for source, found in zip(sources, without, strict=True):
+        source.without = found
+
+
+def _repeated(source: Source, other: Source) -> dict[int, Times]:
+    """Return the times of the messages of `other` that `source` has too, by channel of `other`."""
+    by_new = {new: old for old, new in source.ids.items()}
+    found = {}
+    for old, new in other.ids.items():
+        if new not in by_new:
+            continue
+        here = source.reader.channels[by_new[new]]
+        there = other.reader.channels[old]
+        shared = np.intersect1d(
+            times_of(source.reader, here) + source.delay_ns,
+            times_of(other.reader, there) + other.delay_ns,
+        )
+        if not len(shared):
+            continue
+        one = _payloads(source.reader, here, shared - source.delay_ns)
+        two = _payloads(other.reader, there, shared - other.delay_ns)
+        equal = [
+            time - other.delay_ns
+            for time in shared.tolist()
+            if one[time - source.delay_ns] == two[time - other.delay_ns]
+        ]
+        if equal:
+            found[old] = np.array(equal, np.int64)
+    return found
+
+
+def _payloads(reader: McapReader, channel: Channel, times: Times) -> dict[int, list[bytes]]:
+    """Return the messages of a channel at these times."""
+    found: dict[int, list[bytes]] = {}
+    for part in reader.message_ranges(channel):
+        index = part.index[np.isin(part.index["log_time"].astype(np.int64), times)]
+        if len(index):
+            records = reader.records_of(part)
+            for time_ns, offset in index.tolist():
+                message = reader.message(records, channel, time_ns, offset)
+                found.setdefault(time_ns, []).append(message)
+    return found
+
+
+def _other_records(
+    logs: Sequence[FinishedLog], strings: dict[str, str] | None
+) -> tuple[list[Metadata], list[Attachment]]:
+    """Return the metadata records and attachments of all logs, each different one once."""
+    records: list[Metadata] = []
+    attachments: list[Attachment] = []
+    if strings is not None:
+        records.append(Metadata(METADATA_NAME, strings))
+    for record in (record for log in logs for record in log.top_level):
+        if isinstance(record, Metadata) and record not in records:
+            if strings is None or record.name != METADATA_NAME:
+                records.append(record)
+        elif isinstance(record, Attachment) and not any(
+            (one.name, one.media_type, one.data) == (record.name, record.media_type, record.data)
+            for one in attachments
+        ):
+            attachments.append(record)
+    return records, attachments

@@ -1,0 +1,230 @@
+"""Copy of a part of a log between two steps or times.
+
+An episode that the part begins or ends within becomes a shorter episode: its steps are numbered
+from 0, and its last record becomes its final record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, NoEpisodesError, UsageError
+from mcaprl.files import replacing
+from mcaprl.recorder.dataset.log_reader import LogReader, Selection
+from mcaprl.recorder.edit.source import Edited, FinishedLog
+from mcaprl.recorder.format import messages
+from mcaprl.recorder.format.episode_summary import INTERRUPTED, EpisodeSummary, add_up
+from mcaprl.recorder.format.rows import make_final
+from mcaprl.recorder.format.schema import message_dtype
+from mcaprl.recorder.format.selected_copy import Source, copy_selected
+from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
+
+_NS_PER_S = 10**9
+_LAST_TIME = np.iinfo(np.int64).max
+Bounds = tuple[float | None, float | None]
+"""First value, and the first value after the part; None for no bound."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Part of one episode.
+
+    Attributes:
+        episode: Index of the episode.
+        start: Step of the first record.
+        stop: Step of the last record; the part has the transitions from `start` to `stop` - 1.
+        length: Number of transitions of the whole episode.
+    """
+
+    episode: int
+    start: int
+    stop: int
+    length: int
+
+    @property
+    def is_whole(self) -> bool:
+        return self.start == 0 and self.stop == self.length
+
+
+def slice_log(
+    path: str | Path,
+    out: str | Path,
+    *,
+    steps: Bounds | None = None,
+    time: Bounds | None = None,
+    overwrite: bool = False,
+) -> Edited:
+    """Copy the part of a log between two steps or times; see `mcaprl.slice`."""
+    if (steps is None) == (time is None):
+        raise UsageError("give either steps or time, as in 100:200")
+    log = FinishedLog(Path(path))
+    window = _window_of_steps(log, steps) if steps is not None else _window_of_time(log, time)
+    pieces = _pieces(log, *window)
+    if log.has_steps:
+        if not pieces:
+            raise NoEpisodesError(f"{path} has no whole transition in this part")
+        window = _without_single_records(log, pieces, *window)
+    cut = [piece for piece in pieces if not piece.is_whole]
+    spans = np.array([window], np.int64)
+    source = Source(
+        log.reader,
+        {id_: id_ for id_ in log.reader.channels},
+        spans,
+        also=log.states(spans),
+    )
+    more = _shorten(log, cut, source) if cut else []
+    with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
+        copied = copy_selected([source], unfinished, log.top_level, more)
+    transitions = sum(piece.stop - piece.start for piece in pieces)
+    return Edited(
+        Path(out), len(pieces), transitions, copied.messages, copied.whole, copied.rewritten
+    )
+
+
+def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
+    """Return the first and last time of a range of transitions, counted over all episodes.
+
+    Raises:
+        UsageError: There is no such transition.
+    """
+    log.need_steps()
+    count = int(log.lengths.sum())
+    start = 0 if steps[0] is None else int(steps[0])
+    stop = count if steps[1] is None else min(int(steps[1]), count)
+    if not 0 <= start < stop:
+        raise UsageError(f"{log.path} has the steps 0 to {count - 1}: none of them is in this part")
+    ends = np.cumsum(log.lengths)
+    first, last = (int(np.searchsorted(ends, step, side="right")) for step in (start, stop - 1))
+    # Each earlier episode has one record more than transitions.
+    low = int(log.times[start + first]) if start else 0
+    if stop == count:
+        return low, _LAST_TIME
+    if stop == ends[last]:
+        return low, int(log.times[log.firsts[last + 1]]) - 1
+    return low, int(log.times[stop + last])
+
+
+def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
+    """Return the first and last time of a part, given in seconds since the first message.
+
+    Raises:
+        UsageError: No message is in this part.
+    """
+    assert time is not None
+    begin_ns, end_ns = log.span_of_messages()
+    start, stop = time
+    low = 0 if start is None else begin_ns + round(start * _NS_PER_S)
+    high = _LAST_TIME if stop is None else begin_ns + round(stop * _NS_PER_S) - 1
+    if not (low <= min(high, end_ns) and high >= begin_ns):
+        seconds = (end_ns - begin_ns) / _NS_PER_S
+        raise UsageError(f"{log.path} lasts {seconds:.9g} s: no message is in this part")
+    return max(low, 0), high
+
+
+def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:
+    """Return the parts of episodes, with at least one transition, between two times."""
+    if not log.has_steps:
+        return []
+    first = int(np.searchsorted(log.times, low))
+    last = int(np.searchsorted(log.times, high, side="right")) - 1
+    found = []
+    for episode, (start, length) in enumerate(zip(log.firsts, log.lengths, strict=True)):
+        begin, end = max(first - int(start), 0), min(last - int(start), int(length))
+        if begin < end:
+            found.append(_Piece(episode, begin, end, int(length)))
+    return found
+
+
+def _without_single_records(
+    log: FinishedLog, pieces: list[_Piece], low: int, high: int
+) -> tuple[int, int]:
+    """Move the bounds so that they contain no record without a transition."""
+    firsts, first, last = log.firsts, pieces[0], pieces[-1]
+    before, after = firsts[first.episode] + first.start - 1, firsts[last.episode] + last.stop + 1
+    if before >= 0:
+        low = max(low, int(log.times[before]) + 1)
+    if after < len(log.times):
+        high = min(high, int(log.times[after]) - 1)
+    return low, high
+
+
+def _shorten(
+    log: FinishedLog, pieces: list[_Piece], source: Source
+) -> list[tuple[int, int, bytes]]:
+    """Let `source` change the records of shortened episodes; return their new summaries.
+
+    Raises:
+        LogError: The messages of `/rl/step` or `/rl/episode` are not those of this package.
+    """
+    channels = log.reader.channels_of(STEP_TOPIC)
+    dtypes = {one.id: _step_dtype(log, one) for one in channels}
+    firsts, times = log.firsts, log.times
+    starts = [int(times[firsts[one.episode] + one.start]) for one in pieces]
+    ends = [int(times[firsts[one.episode] + one.stop]) for one in pieces]
+    # The flag of the end is on the last transition, which precedes the final record.
+    lasts = [int(times[firsts[one.episode] + one.stop - 1]) for one in pieces]
+
+    def change(channel: Channel, time_ns: int, payload: memoryview) -> None:
+        number = int(np.searchsorted(ends, time_ns))
+        piece, row = pieces[number], np.frombuffer(payload, dtypes[channel.id], 1)
+        row["step"] -= piece.start
+        if piece.stop < piece.length:
+            if time_ns == lasts[number]:
+                row["truncated"] = True
+            elif time_ns == ends[number]:
+                make_final(row)
+
+    spans = np.array([starts, ends], np.int64).T
+    source.changed = {one.id: spans for one in channels}
+    source.change = change
+    listed = log.reader.channel_of(EPISODE_TOPIC)
+    if listed is None:
+        return []
+    if log.reader.schema_of(listed).data.decode(errors="replace") != messages.EPISODE_TEXT:
+        raise LogError(
+            f"{log.path}: {EPISODE_TOPIC} has messages of another version, so episodes cannot be"
+            " shortened; choose a part of whole episodes"
+        )
+    source.without = {listed.id: log.spans[[one.episode for one in pieces], 1]}
+    return _new_summaries(log.path, listed.id, pieces)
+
+
+def _step_dtype(log: FinishedLog, channel: Channel) -> np.dtype[Any]:
+    text = log.reader.schema_of(channel).data.decode(errors="replace")
+    dtype = message_dtype(text)
+    if dtype is None or channel.message_encoding != "cdr":
+        raise LogError(
+            f"{log.path}: {STEP_TOPIC} has messages of another program, so episodes cannot be"
+            " shortened; choose a part of whole episodes"
+        )
+    return dtype
+
+
+def _new_summaries(
+    path: Path, channel_id: int, pieces: list[_Piece]
+) -> list[tuple[int, int, bytes]]:
+    """Return the messages of `/rl/episode` of shortened episodes."""
+    numbers: NDArray[np.int64] = np.array([piece.episode for piece in pieces])
+    whole = LogReader(path, Selection(columns=())).read(numbers)
+    found = []
+    for piece, episode in zip(pieces, whole.episodes, strict=True):
+        rows = slice(piece.start, piece.stop)
+        summary: EpisodeSummary = episode.summary._replace(
+            length=piece.stop - piece.start,
+            total_reward=add_up(episode.rewards[rows].astype(np.float64)),
+            start_time_ns=int(episode.log_time_ns[piece.start]),
+            end_time_ns=int(episode.log_time_ns[piece.stop]),
+        )
+        if piece.stop < piece.length:
+            summary = summary._replace(terminated=False, truncated=True, reason=INTERRUPTED)
+        if piece.start > 0:
+            # The part does not begin with the state of the reset.
+            summary = summary._replace(seed=None, options="")
+        found.append((channel_id, summary.end_time_ns, summary.to_message()))
+    return found
