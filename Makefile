@@ -25,7 +25,7 @@ help:
 demo: $(VENV)/.demo
 	PATH="$(CURDIR)/$(BIN):$$PATH" sh examples/demo.sh demo
 
-test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.rivals tests/node/node_modules
+test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_modules
 	OMP_NUM_THREADS=1 $(BIN)/pytest
 
 faults: $(VENV)/.dev
@@ -78,7 +78,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,fast]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,remote,fast]' --group dev
 	@touch $@
 
 # The libraries that the benchmarks compare with.
@@ -107,6 +107,13 @@ $(VENV)/.lerobot: tests/lerobot.txt | $(VENV)/bin/python
 	$(BIN)/python -m venv $(VENV)/lerobot
 	$(VENV)/lerobot/bin/python -m pip install -qq -r tests/lerobot.txt
 	$(VENV)/lerobot/bin/python -m pip install -qq --no-deps lerobot==0.4.4 torchvision==0.28.0
+	@touch $@
+
+# An S3 server, which requires an older python-dateutil than constraints.txt has.
+$(VENV)/.s3: tests/s3.txt | $(VENV)/bin/python
+	@echo "installing into $(VENV)/s3"
+	$(BIN)/python -m venv $(VENV)/s3
+	$(VENV)/s3/bin/python -m pip install -qq -r tests/s3.txt -e '.[remote]'
 	@touch $@
 
 $(VENV)/.fuzz: $(VENV)/.dev

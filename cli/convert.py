@@ -22,6 +22,7 @@ from mcaprl.texts import counted
 @click.option("--suggest", is_flag=True, help="Print a mapping to begin with; there is no DST.")
 @click.option("--dry-run", is_flag=True, help="Write nothing; there is no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
 @json_option
 def convert(
     paths: tuple[str, ...],
@@ -33,6 +34,7 @@ def convert(
     suggest: bool,
     dry_run: bool,
     overwrite: bool,
+    upload: str | None,
     as_json: bool,
 ) -> None:
     """Read SRC, and write its transitions to DST.
@@ -57,6 +59,7 @@ def convert(
         lossy=lossy,
         trust_code=trust_code,
         overwrite=overwrite,
+        upload=upload,
     )
     if as_json:
         print_json(found.to_json())

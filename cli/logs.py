@@ -63,7 +63,7 @@ def check(files: tuple[str, ...], as_json: bool, **request: Any) -> int:
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("file")
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
     "--keep-unfinished",
@@ -99,7 +99,7 @@ def layout(source: str, out: Path, overwrite: bool) -> None:
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path, exists=True))
+@click.argument("file")
 @click.option("--policy", multiple=True, help="Path of a trained run; may be repeated.")
 @click.option("--gamma", type=click.FloatRange(0, 1), help="Discount. [default: that of the run]")
 @click.option("--scene", is_flag=True, help="Step the sim again and add its scene.")

@@ -56,6 +56,9 @@ from mcaprl.texts import counted, size
     type=click.FloatRange(0, min_open=True),
     help="Size in MB after which a new file is started (OUT-00000.mcap, OUT-00001.mcap, ...).",
 )
+@click.option(
+    "--upload", metavar="URL", help="Copy the finished log to a URL, such as s3://bucket/lane.mcap."
+)
 def record(no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.
 

@@ -19,6 +19,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.viewer.annotate import annotated_copy, values_topics
 from mcaprl.recorder.viewer.verify import Verification
+from mcaprl.remote import as_path
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def annotate(
         OutputExistsError: `out` exists.
     """
     check_fraction(gamma=gamma)
-    path, names, added = Path(file), as_names(policy), None
+    path, names, added = as_path(file, whole=True), as_names(policy), None
     if not names and not scene:
         raise UsageError("annotate needs --policy POLICY, --scene, or both")
     if mapping is not None:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mcaprl.api.data import MappingFile, Paths, mapped, open_data
+from mcaprl.errors import UsageError
 from mcaprl.files import check_target
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.formats.registry import target_format, write_format
+from mcaprl.remote import check_upload, upload_all
 
 if TYPE_CHECKING:
     from mcaprl.recorder.mapping.summary import MappingReport
@@ -68,6 +70,7 @@ def convert(
     lossy: bool = False,
     trust_code: bool = False,
     overwrite: bool = False,
+    upload: str | None = None,
 ) -> Conversion:
     """Read logs, another tool's dataset or another robot's bag, and write a log or a dataset.
 
@@ -82,6 +85,7 @@ def convert(
         lossy: Whether what the format cannot hold is left out or converted.
         trust_code: Whether the mapping may name a Python function, which is imported.
         overwrite: Whether an existing file or folder is replaced.
+        upload: URL to which the written file is copied when it is complete.
 
     Raises:
         UsageError: The format to write is not clear; or the mapping does not fit the bag, and the
@@ -95,12 +99,18 @@ def convert(
     form = None if out is None or is_log else target_format(out, to)
     if out is not None and is_log:
         check_target(Path(out), overwrite=overwrite)
+    if upload is not None:
+        check_upload(upload)
+        if out is None or (form is not None and not form.suffix):
+            raise UsageError("upload copies one file: the target is a folder, or there is none")
     dataset, report = _read(source, mapping, source_format, trust_code)
     lost: list[str] = []
     if out is not None and form is not None:
         lost = write_format(dataset, out, form, lossy=lossy, overwrite=overwrite)
     elif out is not None:
         dataset.save(out, overwrite=overwrite)
+    if upload is not None and out is not None:
+        upload_all([Path(out)], upload)
     return Conversion(dataset, report, None if out is None else Path(out), lost)
 
 

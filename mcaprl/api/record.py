@@ -20,6 +20,7 @@ from mcaprl.errors import LogError, OutputExistsError, UsageError
 from mcaprl.files import check_target, locked_file, locked_folder, work_folder
 from mcaprl.progress import ProgressBar, no_progress
 from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.remote import check_upload, upload_all
 from mcaprl.sims import make_sim
 from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
 from mcaprl.texts import counted
@@ -95,6 +96,7 @@ def record(
     overwrite: bool = False,
     append: bool = False,
     rotate_mb: float | None = None,
+    upload: str | None = None,
     progress: ProgressBar = no_progress,
 ) -> Recording:
     """Record episodes of a sim into an MCAP file; write each episode when it ends.
@@ -119,6 +121,8 @@ def record(
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
         rotate_mb: Size in MB after which a new file is started; None for one file.
+        upload: URL to which the log is copied when it is complete: a file such as
+            `s3://bucket/lane.mcap`, or the folder of several files. The local files remain.
         progress: Function that opens a progress bar.
 
     Raises:
@@ -145,6 +149,8 @@ def record(
         rotate_mb=rotate_mb,
     )
     _check_request(request, envs)
+    if upload is not None:
+        check_upload(upload)
     with progress(f"recording {sim}", episodes or steps) as advance:
 
         def on_episode(result: EpisodeResult) -> None:
@@ -154,6 +160,8 @@ def record(
             results = _record_file(request, on_episode)
         else:
             results = _record_shards(request, envs, on_episode)
+    if upload is not None:
+        upload_all(_files(request.out), upload)
     returns = np.array([result.total_reward for result in results])
     return Recording(
         request.out,

@@ -45,6 +45,7 @@ from mcaprl.recorder.viewer.video import (
     write_sheet,
     write_video,
 )
+from mcaprl.remote import as_path
 
 _Images = Iterator[NDArray[np.uint8]]
 _STILLS = 12
@@ -151,7 +152,7 @@ def verify(
         LogError: The log cannot be read, or the sim fails on a logged action.
         SpaceError: The spaces of the sim and the log differ.
     """
-    path = Path(file)
+    path = as_path(file)
     dataset = open_logs(path)
     check_episode(dataset, episode, path)
     with (
@@ -214,7 +215,7 @@ def render(
     check_positive(speed=speed)
     if video is None and contact_sheet is None:
         raise UsageError("render needs a video, a contact sheet, or both")
-    path = Path(file)
+    path = as_path(file)
     check_episode(open_logs(path, columns=[]), episode, path)
     movie, sheet = (None if out is None else Path(out) for out in (video, contact_sheet))
     for out, kinds in ((movie, VIDEO_KINDS), (sheet, (".png",))):

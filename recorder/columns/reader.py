@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from operator import attrgetter
@@ -20,7 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema, Statistics
+from mcap.records import (
+    Attachment,
+    Channel,
+    ChunkIndex,
+    Footer,
+    McapRecord,
+    Metadata,
+    Schema,
+    Statistics,
+)
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
@@ -45,8 +54,12 @@ from mcaprl.recorder.columns.records import (
     map_unchanged,
     parse_record,
     records_of,
+    start_of_summary,
 )
+from mcaprl.remote import RemotePath, as_path
 
+# The first and the last bytes of a remote file, which are fetched at once.
+_HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
 # The fields of a MessageIndex record before its entries.
 _INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
@@ -59,7 +72,6 @@ class McapReader:
 
     Attributes:
         path: Path of the file.
-        view: Bytes of the file.
         complete: Whether the file ends with a footer; if not, it was cut off or is being written.
         summary_start: First byte of the summary; 0 if there is none.
         data_end: First byte after the last record that was read from the data section.
@@ -77,9 +89,12 @@ class McapReader:
             CorruptLogError: The summary is damaged.
             LogError: The file cannot be opened.
         """
-        self.path = Path(path)
-        self.view, self._state = map_unchanged(self.path)
-        if bytes(self.view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
+        self.path = as_path(path)
+        self._remote = self.path.remote if isinstance(self.path, RemotePath) else None
+        self._view, self._state = map_unchanged(self.path)
+        size = len(self._view)
+        self.fetch([(0, _HEAD_BYTES), (size - _TAIL_BYTES, size)])
+        if bytes(self._view[: len(MCAP0_MAGIC)]) != MCAP0_MAGIC:
             raise NotMcapError(f"{self.path} is not an MCAP file: it has no magic bytes")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -93,9 +108,12 @@ class McapReader:
         self._contents: dict[int, ChunkContents] = {}
         self._ranges: dict[int, list[MessageRange]] = {}
         with self._named():
-            footer = footer_of(self.view)
+            footer = self._footer()
         self.complete = footer is not None
         self.summary_start = footer.summary_start if footer is not None else 0
+        if not self.summary_start:
+            # All records are read, because there is no list of them.
+            self.fetch([(0, size)])
         if self.summary_start:
             self._read_summary()
         self._summary_has_topics = bool(self.channels)
@@ -104,6 +122,41 @@ class McapReader:
         if self._unchunked:
             self._check_data_crc()
         self._find_topics_in_chunks()
+
+    @property
+    def view(self) -> memoryview:
+        """Bytes of the file; all of a remote file is fetched."""
+        self.fetch([(0, len(self._view))])
+        return self._view
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether the file is on another machine."""
+        return self._remote is not None
+
+    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Fetch ranges of bytes of a remote file; no effect on a local file.
+
+        Raises:
+            LogError: The file cannot be reached.
+        """
+        if self._remote is not None:
+            self._remote.fetch(ranges)
+
+    def fetch_chunks(self, parts: Iterable[MessageRange]) -> None:
+        """Fetch the chunks of messages of a remote file with their indexes, side by side."""
+        if self._remote is not None:
+            chunks = [part.chunk for part in parts]
+            if None in chunks:
+                self.fetch([(0, len(self._view))])
+            self.fetch([(one.chunk_start_offset, end_of(one)) for one in chunks if one is not None])
+
+    def _footer(self) -> Footer | None:
+        """Return the footer; None if the file does not end with one."""
+        if self._remote is not None:
+            start = start_of_summary(self._view)
+            self.fetch([(start, len(self._view))] if start else [])
+        return footer_of(self._view)
 
     def check_unchanged(self) -> None:
         """Check that the file was not changed in place since it was opened.
@@ -115,6 +168,9 @@ class McapReader:
         Raises:
             LogError: The file was truncated or written to.
         """
+        if self._remote is not None:
+            # The local file changes when parts are fetched.
+            return
         try:
             now, before = os.stat(self.path), self._state
         except OSError:
@@ -168,6 +224,11 @@ class McapReader:
             CorruptLogError: An index is damaged, or the indexes and the summary disagree.
         """
         if channel.id not in self._ranges:
+            if self._remote is not None:
+                # Without these, a topic that is in many chunks would need a request for each.
+                places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
+                starts = [one.chunk_start_offset + one.chunk_length for one in places]
+                self.fetch(zip(starts, map(end_of, places), strict=True))
             count, ranges = self._counts.get(channel.id), self._find_ranges(channel.id, lazily=True)
             if sum(map(len, ranges)) != count:
                 ranges = self._find_ranges(channel.id, lazily=False)
@@ -229,8 +290,9 @@ class McapReader:
         if last == start:
             return kept
         self.check_unchanged()
+        self.fetch([(start, end_of(chunk))])
         with self._named():
-            records = chunk_records(self.view, start, scratch)
+            records = chunk_records(self._view, start, scratch)
         if scratch is None:
             self._last_chunk = start, records
         else:
@@ -298,8 +360,12 @@ class McapReader:
 
     def _index_at(self, channel_id: int, offset: int, count: int | None = None) -> NDArray[Any]:
         self.check_unchanged()
+        if self._remote is not None:
+            self.fetch([(offset, offset + RECORD_HEADER_BYTES)])
+            _, length = RECORD_HEADER.unpack_from(self._view, offset)
+            self.fetch([(offset, offset + RECORD_HEADER_BYTES + length)])
         with self._named():
-            entries = message_index(self.view, offset, channel_id)
+            entries = message_index(self._view, offset, channel_id)
             if count not in (None, len(entries)):
                 raise CorruptLogError(
                     f"the message index at byte {offset} has {len(entries)} entries, but the"
@@ -316,7 +382,7 @@ class McapReader:
         return self._contents[start]
 
     def _read_summary(self) -> None:
-        for offset, opcode, content in records_of(self.view, self.summary_start):
+        for offset, opcode, content in records_of(self._view, self.summary_start):
             if opcode == Opcode.CHUNK_INDEX:
                 with self._named():
                     self.chunks.append(parse_chunk_index(content))
@@ -328,12 +394,17 @@ class McapReader:
         """Read the records that the summary does not list. Without a summary, read all records."""
         start, before = len(MCAP0_MAGIC), None
         found: list[ChunkIndex] = []
+        if self._remote is not None and self.summary_start:
+            starts = [start, *map(end_of, self.chunks)]
+            stops = [*(one.chunk_start_offset for one in self.chunks), self.summary_start]
+            gaps = zip(starts, stops, strict=True)
+            self.fetch([(low, high) for low, high in gaps if low < high])
         for chunk in self.chunks:
             # Most chunks follow each other without a gap.
             if start != chunk.chunk_start_offset:
                 found += self._read_records(start, chunk.chunk_start_offset, before, unchunked)
             before, start = chunk, end_of(chunk)
-            if start > len(self.view):
+            if start > len(self._view):
                 raise CorruptLogError(
                     f"{self.path}: the chunk at byte {chunk.chunk_start_offset} extends beyond the"
                     " end of the file"
@@ -355,10 +426,10 @@ class McapReader:
         Messages outside of chunks are added to `unchunked`.
         """
         self.data_end, found = start, []
-        for offset, opcode, content in records_of(self.view, start, stop):
+        for offset, opcode, content in records_of(self._view, start, stop):
             if opcode == Opcode.CHUNK:
                 with self._named():
-                    chunk = chunk_header(self.view, offset).to_index(offset, len(content))
+                    chunk = chunk_header(self._view, offset).to_index(offset, len(content))
                 found.append(chunk)
             elif opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 (channel_id,) = struct.unpack_from("<H", content)

@@ -226,6 +226,15 @@ def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
     return {int(channel_id): entries[ids == channel_id] for channel_id in np.unique(ids)}
 
 
+def start_of_summary(view: memoryview) -> int:
+    """Return the first byte of the summary; 0 if there is none, or no footer."""
+    start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
+    if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
+        return 0
+    (found,) = struct.unpack_from("<Q", view, start + RECORD_HEADER_BYTES)
+    return int(found) if found <= start else 0
+
+
 def footer_of(view: memoryview) -> Footer | None:
     """Return the footer; None if the file does not end with one.
 

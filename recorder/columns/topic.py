@@ -20,7 +20,7 @@ from mcaprl.errors import CorruptLogError, LogError, UnknownNameError
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.decoder import Columns, Decoder, Rows
 from mcaprl.recorder.columns.message_rows import MessageRange
-from mcaprl.recorder.columns.reader import McapReader
+from mcaprl.recorder.columns.reader import McapReader, end_of
 
 LOG_TIME = "log_time"
 
@@ -72,6 +72,7 @@ class Topic:
             CorruptLogError: An index is damaged.
         """
         times = np.empty(len(self), np.int64)
+        self._fetch_indexes()
         for (_, part), stop in zip(self.parts, self._stops.tolist(), strict=True):
             times[stop - len(part) : stop] = part.index["log_time"]
         if (times < 0).any():
@@ -143,6 +144,8 @@ class Topic:
             UnknownNameError: The type has no such field, or the field is a message.
         """
         self._check(wanted)
+        if self._reader.is_remote:
+            self._reader.fetch_chunks(self._needed(order))
         selected = self._all() if order is None else self._select(order)
         first = next(selected, None)
         if first is None:
@@ -187,6 +190,21 @@ class Topic:
                         f"{self._reader.path}: the channels of {self.name} have values of"
                         f" different types in {name}"
                     )
+
+    def _needed(self, order: NDArray[np.int64] | None) -> Iterator[MessageRange]:
+        """Yield the parts that contain the messages at these positions."""
+        numbers = range(len(self.parts))
+        if order is not None:
+            numbers = np.unique(np.searchsorted(self._stops, order, side="right")).tolist()
+        return (self.parts[number][1] for number in numbers)
+
+    def _fetch_indexes(self) -> None:
+        """Fetch the message indexes of a remote file, side by side."""
+        if self._reader.is_remote:
+            chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
+            stops = [end_of(chunk) for chunk in chunks]
+            lengths = [chunk.message_index_length for chunk in chunks]
+            self._reader.fetch([(b - n, b) for b, n in zip(stops, lengths, strict=True)])
 
     def _all(self) -> Iterator[_Selected]:
         for (decoder, part), stop in zip(self.parts, self._stops.tolist(), strict=True):

@@ -65,6 +65,8 @@ class _Images:
         Raises:
             CorruptLogError: A time has no message, or two messages have the same time.
         """
+        if self._reader.is_remote and self.topic.chunks_rise:
+            return self._order_in_chunks(times)
         by_time = time_order(self.topic)
         rising = self.topic.times if by_time is None else self.topic.times[by_time]
         place = np.searchsorted(rising, times)
@@ -79,6 +81,30 @@ class _Images:
         if (rising[1:] == rising[:-1]).any():
             raise CorruptLogError(f"{where} has two images with the same log_time")
         return place if by_time is None else by_time[place]
+
+    def _order_in_chunks(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the row of the message at each time; read only the chunks with these times.
+
+        Raises:
+            CorruptLogError: A time has no message.
+        """
+        parts = [part for _, part in self.topic.parts]
+        starts = [part.chunk.message_start_time for part in parts if part.chunk is not None]
+        stops = np.cumsum([len(part) for part in parts])
+        numbers = np.maximum(np.searchsorted(starts, times, side="right") - 1, 0)
+        chosen = np.unique(numbers).tolist()
+        self._reader.fetch_chunks(parts[number] for number in chosen)
+        order = np.empty(len(times), np.int64)
+        for number in chosen:
+            mine, index = numbers == number, parts[number].index["log_time"]
+            place = np.searchsorted(index, times[mine])
+            if (index[np.minimum(place, len(index) - 1)] != times[mine]).any():
+                raise CorruptLogError(
+                    f"{self._reader.path}: {self.topic.name} has no image for some records of"
+                    f" {STEP_TOPIC}"
+                )
+            order[mine] = place + stops[number] - len(index)
+        return order
 
     def read(self, order: NDArray[np.int64], threads: int = 1) -> NDArray[np.uint8]:
         """Read the images (F, *shape) into memory."""

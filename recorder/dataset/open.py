@@ -16,6 +16,7 @@ from mcaprl.errors import LogError, NoEpisodesError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
+from mcaprl.remote import find_remote, is_url
 
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
@@ -36,8 +37,8 @@ def open_logs(
     without a finished episode are skipped, with a warning.
 
     Args:
-        data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
-            the same spaces; their episodes are concatenated in the order of the files.
+        data: A file, a folder of `.mcap` files, a glob, a URL, or a sequence of these. The logs
+            must have the same spaces; their episodes are concatenated in the order of the files.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these. An empty sequence reads no
             observations. Actions, rewards and end flags are always read. Default: all keys.
@@ -126,6 +127,8 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
             raise LogError("no data: the list of files is empty")
         # A file that is listed under several paths is read once.
         return list({os.path.realpath(path): path for path in every}.values())
+    if is_url(data):
+        return list(find_remote(str(data)))
     path = Path(data)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))

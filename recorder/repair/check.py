@@ -32,6 +32,7 @@ from mcaprl.recorder.format.reading import (
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.repair.episode_check import EpisodeCheck
+from mcaprl.remote import as_path
 
 
 def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
@@ -44,7 +45,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
     Returns:
         Problems in file order.
     """
-    path = Path(path)
+    path = as_path(path)
     try:
         reader = McapReader(path)
     except LogError as error:

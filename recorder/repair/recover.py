@@ -33,6 +33,7 @@ from mcaprl.recorder.repair.whole_episodes import (
     plan_episodes,
     write_planned,
 )
+from mcaprl.remote import as_path
 
 _LISTS = ("damages", "dropped")
 
@@ -110,7 +111,7 @@ def recover_log(
         OutputExistsError, UsageError: The target exists, or is the source.
         LogError: Nothing can be kept, or the target cannot be written.
     """
-    source, target = Path(source), Path(target)
+    source, target = as_path(source, whole=True), Path(target)
     if source.exists() and target.exists() and target.samefile(source):
         raise UsageError(f"{target} is the damaged file: recover to another path")
     recovery = Recovery(str(source))

@@ -167,7 +167,7 @@ def test_infos_come_back_and_those_of_every_step_are_features(tmp_path: Path) ->
     found = Dataset.from_lerobot(tmp_path / "out").infos
     assert list(found) == list(_infos())
     for name, values in _infos().items():
-        both = np.ma.concatenate([values, values])
+        both = np.ma.concatenate([values, values])  # type: ignore[no-untyped-call]
         assert found[name].dtype == dataset.infos[name].dtype
         np.testing.assert_array_equal(np.ma.getmaskarray(found[name]), np.ma.getmaskarray(both))
         assert found[name].tolist() == both.tolist()

@@ -1,0 +1,317 @@
+"""Files on other machines, by fsspec: parts of a file are fetched when they are needed.
+
+A remote file has a local file of the same size, which is empty at first. Parts are fetched in
+blocks and stored there, so readers map the local file as any other.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaprl.errors import LogError, UsageError, import_extra
+from mcaprl.files import write_atomically
+
+CACHE_VARIABLE = "MCAPRL_CACHE"
+"""Environment variable with the folder in which fetched parts are kept for later commands."""
+BLOCK_BYTES = 2**16
+# Blocks closer than this are fetched by one request; longer ranges are divided among requests.
+_LEAST_GAP, _MOST_BYTES = 2 * BLOCK_BYTES, 8 * 2**20
+
+Range = tuple[int, int]
+"""First byte, and first byte after the range."""
+
+
+def is_url(name: object) -> bool:
+    """Return whether a name is a URL, such as `s3://bucket/lane.mcap`.
+
+    >>> is_url("https://host/lane.mcap"), is_url("logs/lane.mcap"), is_url(Path("lane.mcap"))
+    (True, False, False)
+    """
+    return isinstance(name, str) and "://" in name
+
+
+class RemoteFile:
+    """A remote file with its local copy of the parts that were fetched.
+
+    Attributes:
+        url: URL of the file.
+        size: Size of the file, bytes.
+        local: Path of the local file.
+    """
+
+    def __init__(self, url: str) -> None:
+        """Ask for the size of the file, and create the local file.
+
+        Raises:
+            LogError: There is no such file, or it cannot be reached.
+            MissingExtraError: The package for the URL's protocol is not installed.
+        """
+        self.url = url
+        self._system, self._path = system_of(url)
+        with _Errors(f"cannot read {url}"):
+            facts = self._system.info(self._path)
+        if facts.get("type") == "directory":
+            raise LogError(f"cannot read {url}: it is a folder")
+        if facts.get("size") is None:
+            raise LogError(f"cannot read {url}: its size is unknown; download it first")
+        self.size = int(facts["size"])
+        self._version = _version_of(facts)
+        folder, self._is_kept = _folder_of(url, f"{self._version} {self.size}")
+        self.local = folder / _last_part(url)
+        self._blocks_path = folder / "blocks"
+        self._lock = threading.Lock()
+        self._has = np.zeros(-(-self.size // BLOCK_BYTES), bool)
+        if self.local.exists() and self._blocks_path.exists():
+            bits = np.frombuffer(self._blocks_path.read_bytes(), np.uint8)
+            self._has = np.unpackbits(bits)[: len(self._has)].astype(bool)
+        else:
+            with self.local.open("wb") as file:
+                file.truncate(self.size)
+
+    def fetch(self, ranges: Iterable[Range]) -> None:
+        """Fetch the parts of these ranges that are missing, with several requests side by side.
+
+        Raises:
+            LogError: The file cannot be reached, has changed, or its server ignores ranges.
+        """
+        with self._lock:
+            wanted = np.zeros(len(self._has), bool)
+            for start, stop in ranges:
+                last = -(-min(stop, self.size) // BLOCK_BYTES)
+                wanted[max(start, 0) // BLOCK_BYTES : last] = True
+            pieces = [one for run in self._runs(wanted & ~self._has) for one in _divided(*run)]
+            if not pieces:
+                return
+            starts, stops = (list(each) for each in zip(*pieces, strict=True))
+            with _Errors(f"cannot read {self.url}"):
+                parts = self._system.cat_ranges(
+                    [self._path] * len(pieces), starts, stops, on_error="raise"
+                )
+            for (start, stop), part in zip(pieces, parts, strict=True):
+                if len(part) != stop - start:
+                    raise LogError(
+                        f"cannot read {self.url}: bytes {start} to {stop} were asked for, but"
+                        f" {len(part)} bytes came: the file has changed, or its server ignores"
+                        " ranges; download it first"
+                    )
+            with self.local.open("rb+") as file:
+                for (start, stop), part in zip(pieces, parts, strict=True):
+                    file.seek(start)
+                    file.write(part)
+                    self._has[start // BLOCK_BYTES : -(-stop // BLOCK_BYTES)] = True
+            if self._is_kept:
+                write_atomically(self._blocks_path, np.packbits(self._has).tobytes(), LogError)
+
+    def check_unchanged(self) -> None:
+        """Check that the remote file is still the one that was opened.
+
+        Raises:
+            LogError: It has changed, or cannot be reached.
+        """
+        with _Errors(f"cannot read {self.url}"):
+            facts = self._system.info(self._path)
+        if (facts.get("size"), _version_of(facts)) != (self.size, self._version):
+            raise LogError(f"{self.url} has changed while it was read: open it again")
+
+    def _runs(self, missing: NDArray[np.bool_]) -> Iterator[Range]:
+        """Yield ranges of missing blocks; those with small gaps between them are joined."""
+        blocks = np.flatnonzero(missing)
+        if not len(blocks):
+            return
+        breaks = np.flatnonzero(np.diff(blocks) * BLOCK_BYTES > _LEAST_GAP)
+        firsts = blocks[np.concatenate([[0], breaks + 1])]
+        lasts = blocks[np.concatenate([breaks, [len(blocks) - 1]])]
+        for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
+            yield first * BLOCK_BYTES, min((last + 1) * BLOCK_BYTES, self.size)
+
+
+class RemotePath(type(Path())):  # type: ignore[misc]
+    """Path of the local file of a remote one; as text it is the URL."""
+
+    remote: RemoteFile | None = None
+
+    @classmethod
+    def of(cls, url: str) -> RemotePath:
+        """Open a remote file; errors as in `RemoteFile`."""
+        remote = RemoteFile(url)
+        path = cls(remote.local)
+        path.remote = remote
+        return path
+
+    def __str__(self) -> str:
+        """Return the URL."""
+        return super().__str__() if self.remote is None else self.remote.url
+
+    def __fspath__(self) -> str:
+        """Return the local path."""
+        return str(super().__str__())
+
+    def __reduce__(self) -> Any:
+        """Open the file again in another process."""
+        return super().__reduce__() if self.remote is None else (RemotePath.of, (self.remote.url,))
+
+
+def as_path(name: str | Path, *, whole: bool = False) -> Path:
+    """Return the path of a local file, or of the local copy of a remote one.
+
+    Args:
+        name: Path, or URL.
+        whole: Whether all of a remote file is fetched, for readers that do not ask for parts.
+
+    Raises:
+        LogError: The remote file cannot be read.
+        MissingExtraError: The package for the URL's protocol is not installed.
+    """
+    path = RemotePath.of(str(name)) if is_url(name) else name
+    path = path if isinstance(path, Path) else Path(path)
+    if whole and isinstance(path, RemotePath) and path.remote is not None:
+        path.remote.fetch([(0, path.remote.size)])
+    return path
+
+
+def find_remote(url: str) -> list[RemotePath]:
+    """Return the logs of a URL: a file, a folder of `.mcap` files, or a glob, sorted by name.
+
+    Raises:
+        LogError: There are no files, or the server cannot be reached.
+        MissingExtraError: The package for the URL's protocol is not installed.
+    """
+    if url.endswith(".mcap") and not any(sign in url for sign in "*?["):
+        return [RemotePath.of(url)]
+    system, path = system_of(url)
+    with _Errors(f"cannot read {url}"):
+        is_pattern = any(sign in path for sign in "*?[")
+        if not is_pattern and not system.isdir(path):
+            return [RemotePath.of(url)]
+        pattern = path if is_pattern else f"{path.rstrip('/')}/*.mcap"
+        found = sorted(map(str, system.glob(pattern)))
+    if not found:
+        raise LogError(f"{url}: no such file, folder or match")
+    names = [name if is_url(name) else system.unstrip_protocol(name) for name in found]
+    return [RemotePath.of(name) for name in names]
+
+
+def upload(path: str | Path, url: str) -> None:
+    """Copy a file to a URL. It appears under its name when it is complete.
+
+    Args:
+        path: Local file.
+        url: URL of the copy; an existing file is replaced.
+
+    Raises:
+        LogError: The file cannot be copied; the local file is unchanged.
+        UsageError: The protocol cannot be written to.
+        MissingExtraError: The package for the URL's protocol is not installed.
+    """
+    system, target = system_of(url)
+    unfinished = f"{target}.part"
+    with _Errors(f"cannot upload {path} to {url}"):
+        try:
+            parent = system._parent(target)
+            if parent:
+                system.makedirs(parent, exist_ok=True)
+            system.put_file(os.fspath(path), unfinished)
+            system.mv(unfinished, target)
+        except NotImplementedError as error:
+            raise UsageError(f"{url}: this protocol can only be read") from error
+        finally:
+            if system.exists(unfinished):
+                system.rm_file(unfinished)
+
+
+def upload_all(paths: Sequence[Path], url: str) -> None:
+    """Copy one file to the URL of a file, or files into the URL of a folder; see `upload`."""
+    if len(paths) == 1 and url.endswith(paths[0].suffix):
+        upload(paths[0], url)
+        return
+    for path in paths:
+        upload(path, f"{url.rstrip('/')}/{path.name}")
+
+
+def check_upload(url: str) -> None:
+    """Check that a URL can be written to, before anything is recorded.
+
+    Raises:
+        UsageError: The name is no URL, or the protocol can only be read.
+        MissingExtraError: The package for the URL's protocol is not installed.
+    """
+    if not is_url(url):
+        raise UsageError(f"{url} is not a URL, such as s3://bucket/lane.mcap")
+    if url.startswith(("http://", "https://")):
+        raise UsageError(f"{url}: this protocol can only be read")
+    system_of(url)
+
+
+def system_of(url: str) -> tuple[Any, str]:
+    """Return the fsspec file system of a URL, and the path in it.
+
+    Raises:
+        LogError: The URL is not valid, or its server cannot be reached.
+        MissingExtraError: The package for the protocol is not installed.
+    """
+    core = import_extra("fsspec.core", "remote")
+    with _Errors(f"cannot open {url}"):
+        system, path = core.url_to_fs(url)
+    return system, str(path)
+
+
+class _Errors:
+    """Context in which errors of file systems, which are of many types, become LogErrors."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __enter__(self) -> None:
+        return
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: object) -> None:
+        if not isinstance(error, Exception) or isinstance(error, LogError | UsageError):
+            return
+        if isinstance(error, FileNotFoundError):
+            raise LogError(f"{self._text}: no such file") from error
+        what = str(error).strip().splitlines()
+        raise LogError(f"{self._text}: {what[0] if what else type(error).__name__}") from error
+
+
+def _divided(start: int, stop: int) -> list[Range]:
+    return [(one, min(one + _MOST_BYTES, stop)) for one in range(start, stop, _MOST_BYTES)]
+
+
+def _version_of(facts: dict[str, Any]) -> str:
+    """Return what differs between two versions of a file, as far as the server says it."""
+    names = ("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation")
+    return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
+
+
+def _folder_of(url: str, version: str) -> tuple[Path, bool]:
+    """Return a folder for a remote file, and whether it outlasts this process."""
+    name = hashlib.sha256(f"{url} {version}".encode()).hexdigest()[:24]
+    kept = os.environ.get(CACHE_VARIABLE)
+    if kept:
+        folder = Path(kept) / name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder, True
+    return Path(tempfile.mkdtemp(dir=_temporary())), False
+
+
+@cache
+def _temporary() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="mcaprl-remote-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _last_part(url: str) -> str:
+    return url.partition("?")[0].rstrip("/").rpartition("/")[2] or "log.mcap"

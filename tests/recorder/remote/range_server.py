@@ -1,0 +1,84 @@
+"""HTTP server of a folder on 127.0.0.1 that understands ranges and counts what it sends."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+
+@dataclass
+class RangeServer:
+    """A running server.
+
+    Attributes:
+        url: URL of the folder.
+        folder: Folder that is served.
+        sent: Number of bytes of each answer to a GET request.
+        knows_ranges: Whether ranges are understood.
+        cuts: Whether the connection is closed in the middle of an answer.
+    """
+
+    url: str
+    folder: Path
+    sent: list[int] = field(default_factory=list)
+    knows_ranges: bool = True
+    cuts: bool = False
+
+
+@contextmanager
+def range_server(folder: Path) -> Iterator[RangeServer]:
+    """Serve a folder until the context ends."""
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_HEAD(self) -> None:
+            self._answer(send=False)
+
+        def do_GET(self) -> None:
+            self._answer(send=True)
+
+        def _answer(self, *, send: bool) -> None:
+            path = folder / self.path.lstrip("/")
+            if not path.is_file():
+                self.send_error(404)
+                return
+            content = path.read_bytes()
+            wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+            start, stop = 0, len(content)
+            if wanted and state.knows_ranges:
+                start, stop = int(wanted[1]), min(int(wanted[2]) + 1, len(content))
+                self.send_response(206)
+                self.send_header("Content-Range", f"bytes {start}-{stop - 1}/{len(content)}")
+            else:
+                self.send_response(200)
+            if state.knows_ranges:
+                self.send_header("Accept-Ranges", "bytes")
+            self.send_header("Content-Length", str(stop - start))
+            self.end_headers()
+            if send:
+                state.sent.append(stop - start)
+                if state.cuts:
+                    self.wfile.write(content[start : (start + stop) // 2])
+                    self.close_connection = True
+                else:
+                    self.wfile.write(content[start:stop])
+
+        def log_message(self, *_: object) -> None:
+            return
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    state = RangeServer(f"http://127.0.0.1:{server.server_port}", folder)
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield state
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

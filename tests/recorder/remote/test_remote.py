@@ -1,0 +1,174 @@
+"""Logs at URLs: equal to local ones, fetched in few requests, and clear errors."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import LogError, UsageError
+from mcaprl.remote import BLOCK_BYTES, CACHE_VARIABLE, RemotePath, upload
+from tests.recorder.remote.range_server import RangeServer, range_server
+
+fsspec = pytest.importorskip("fsspec", reason="needs the extra remote")
+pytest.importorskip("aiohttp", reason="needs the extra remote")
+
+EPISODES, STEPS = 50, 40
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a log of images that do not compress."""
+    found = tmp_path_factory.mktemp("served")
+    random = np.random.default_rng(0)
+    count = EPISODES * STEPS
+    images = random.integers(0, 256, (count + EPISODES, 32, 32, 3), np.uint8)
+    rows = np.arange(count) + np.repeat(np.arange(EPISODES), STEPS)
+    ends = np.arange(1, count + 1) % STEPS == 0
+    mcaprl.Dataset.from_arrays(
+        observations=images[rows],
+        next_observations=images[rows + 1],
+        actions=random.integers(3, size=count),
+        rewards=random.standard_normal(count),
+        terminated=ends,
+        truncated=np.zeros(count, bool),
+    ).save(found / "images.mcap")
+    mcaprl.record("lane", found / "lane.mcap", episodes=2, epsilon=0.3)
+    return found
+
+
+@pytest.fixture
+def server(folder: Path) -> Iterator[RangeServer]:
+    with range_server(folder) as found:
+        yield found
+
+
+def test_a_remote_log_is_equal_to_the_local_one(server: RangeServer) -> None:
+    for name in ("images.mcap", "lane.mcap"):
+        remote, local = (mcaprl.open(f"{place}/{name}") for place in (server.url, server.folder))
+        assert remote.fingerprint == local.fingerprint
+        assert str(remote.sources[0]) == f"{server.url}/{name}"
+
+
+def test_one_episode_needs_few_requests_and_bytes(server: RangeServer) -> None:
+    url, size = f"{server.url}/images.mcap", (server.folder / "images.mcap").stat().st_size
+    found = mcaprl.open(url, episodes=25)
+    assert found.fingerprint == mcaprl.open(server.folder / "images.mcap", episodes=25).fingerprint
+    # The summary and the head; the chunks of /rl/episode and /rl/step; those of the images.
+    assert len(server.sent) <= 7
+    assert sum(server.sent) < 0.3 * size
+    # The chunk of the images has the bytes of 50 images or more.
+    assert sum(server.sent) < 100 * 32 * 32 * 3 + 12 * BLOCK_BYTES
+
+
+def test_all_parts_are_fetched_once(server: RangeServer) -> None:
+    mcaprl.open(f"{server.url}/images.mcap")
+    size = (server.folder / "images.mcap").stat().st_size
+    assert sum(server.sent) <= size
+    assert len(server.sent) <= 12
+
+
+def test_fetched_parts_are_kept_on_request(
+    server: RangeServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    url = f"{server.url}/images.mcap"
+    first = mcaprl.open(url, episodes=[3, 4])
+    server.sent.clear()
+    assert mcaprl.open(url, episodes=[3, 4]).fingerprint == first.fingerprint
+    assert server.sent == []
+    # Another version of the file has other parts.
+    other = server.folder / "other.mcap"
+    mcaprl.record("lane", other, episodes=1)
+    before = mcaprl.open(f"{server.url}/other.mcap").fingerprint
+    mcaprl.record("lane", other, episodes=2, seed=5, overwrite=True)
+    assert mcaprl.open(f"{server.url}/other.mcap").fingerprint != before
+    other.unlink()
+
+
+def test_commands_read_urls(server: RangeServer, capsys: pytest.CaptureFixture[str]) -> None:
+    url = f"{server.url}/lane.mcap"
+    assert run(["info", url]) == 0
+    assert url in capsys.readouterr().out
+    assert run(["check", url]) == 0
+    assert "1 file checked, no problems" in capsys.readouterr().out
+    assert run(["evaluate", "random", "--data", url, "--updates", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["data"] == url
+
+
+def test_memory_and_file_systems(folder: Path, tmp_path: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    for name in ("a.mcap", "b.mcap"):
+        memory.put_file(str(folder / "lane.mcap"), f"/logs/{name}")
+    expected = mcaprl.open(folder / "lane.mcap")
+    assert mcaprl.open("memory://logs/a.mcap").fingerprint == expected.fingerprint
+    assert len(mcaprl.open("memory://logs")) == 2 * len(expected)
+    assert len(mcaprl.open("memory://logs/*.mcap")) == 2 * len(expected)
+    assert len(mcaprl.open(["memory://logs/a.mcap", folder / "lane.mcap"])) == 2 * len(expected)
+    url = f"file://{folder}/lane.mcap"
+    assert mcaprl.open(url).fingerprint == expected.fingerprint
+    memory.rm("/logs", recursive=True)
+
+
+def test_errors_are_one_clear_line(server: RangeServer, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"cannot read http.*/none.mcap: no such file"):
+        mcaprl.open(f"{server.url}/none.mcap")
+    with pytest.raises(LogError, match=r"memory://nothing: no such file, folder or match|no such"):
+        mcaprl.open("memory://nothing")
+    with pytest.raises(LogError, match=r"cannot open nonsense://a.mcap: Protocol not known"):
+        mcaprl.open("nonsense://a.mcap")
+    (server.folder / "text.mcap").write_text("no log" * 100)
+    with pytest.raises(LogError, match=r"http.*/text.mcap is not an MCAP file"):
+        mcaprl.open(f"{server.url}/text.mcap")
+    (server.folder / "text.mcap").unlink()
+
+
+def test_a_server_without_ranges_is_refused(server: RangeServer) -> None:
+    server.knows_ranges = False
+    with pytest.raises(LogError, match="ignores ranges; download it first"):
+        mcaprl.open(f"{server.url}/images.mcap", episodes=0)
+
+
+def test_a_connection_that_breaks_is_an_error(server: RangeServer) -> None:
+    server.cuts = True
+    with pytest.raises(LogError, match=r"cannot read http.*/images.mcap"):
+        mcaprl.open(f"{server.url}/images.mcap")
+
+
+def test_a_file_that_changes_is_noticed(server: RangeServer) -> None:
+    path = server.folder / "grows.mcap"
+    mcaprl.record("lane", path, episodes=1)
+    remote = RemotePath.of(f"{server.url}/grows.mcap").remote
+    assert remote is not None
+    remote.check_unchanged()
+    mcaprl.record("lane", path, episodes=3, overwrite=True)
+    with pytest.raises(LogError, match="has changed while it was read"):
+        remote.check_unchanged()
+    path.unlink()
+
+
+def test_a_path_is_opened_again_in_another_process(server: RangeServer) -> None:
+    path = RemotePath.of(f"{server.url}/lane.mcap")
+    assert str(pickle.loads(pickle.dumps(path))) == str(path)
+
+
+def test_uploads_appear_when_complete(folder: Path, tmp_path: Path) -> None:
+    url = f"file://{tmp_path}/there/lane.mcap"
+    upload(folder / "lane.mcap", url)
+    assert (tmp_path / "there" / "lane.mcap").read_bytes() == (folder / "lane.mcap").read_bytes()
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["lane.mcap"]
+    out = tmp_path / "out.mcap"
+    mcaprl.record("lane", out, episodes=1, upload=f"file://{tmp_path}/there/new.mcap")
+    assert (tmp_path / "there" / "new.mcap").read_bytes() == out.read_bytes()
+    with pytest.raises(UsageError, match="can only be read"):
+        mcaprl.record("lane", tmp_path / "x.mcap", episodes=1, upload="https://host/x.mcap")
+    assert not (tmp_path / "x.mcap").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LogError, match="cannot upload"):
+        upload(out, f"file://{tmp_path}/file/below.mcap")
