@@ -62,7 +62,7 @@ def _tuned() -> dict[str, dict[str, Any]]:
     default=2.0,
     show_default=True,
     type=click.FloatRange(0, min_open=True),
-    help="With --live: simulated seconds per second in the episodes that are shown.",
+    help="With --live: speed of the shown episodes, in simulated seconds per second.",
 )
 @integer_option(
     "--port",

@@ -179,7 +179,7 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
 
 
 def remove_leftover(path: Path) -> None:
-    """Remove the work folder that a killed writer of this target left, if there is one."""
+    """Remove the work folder of a target if a process was killed while writing it."""
     if _work_path(path).is_dir():
         with suppress(OSError, LogError), work_folder(path):
             pass

@@ -23,7 +23,7 @@ _Kind = Literal["message", "done", "interrupted", "error"]
 _STOPS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 ]
-# Signal that ends a worker: background processes ignore SIGINT, and Windows cannot handle SIGTERM.
+# Signal that ends a worker: not SIGINT, which background processes ignore; Windows has no SIGTERM.
 _END = signal.SIGINT if sys.platform == "win32" else signal.SIGTERM
 
 

@@ -151,7 +151,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._begin_episode()
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset all environments; the watched one starts an episode."""
+        """Reset all environments; viewers see a new episode of the watched one."""
         self._observations, infos = self.env.reset(seed=seed, options=options)
         self._begin_episode()
         return self._observations, infos

@@ -116,7 +116,7 @@ class Task:
 
     @property
     def identity(self) -> RunIdentity:
-        """Parts that must be unchanged for a run of this task to be resumed."""
+        """Settings that may not change between a run of this task and its resumption."""
         parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
         return RunIdentity({**parts, "config": self.config.to_json()})
 

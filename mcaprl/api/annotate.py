@@ -67,7 +67,7 @@ def annotate(
         camera: Whether to add metric depth images to the scene.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
-            arguments to any environment.
+            arguments to environments other than the sims of `SIMS`.
         overwrite: Whether an existing file is replaced.
         mapping: Mapping of another robot's bag; see `open`.
         trust_code: Whether the mapping may name a Python function.

@@ -31,7 +31,7 @@ def as_names(policies: Names) -> list[str]:
 
 
 class TrainedPolicy(Policy, Protocol):
-    """Loaded policy with NumPy inputs and outputs, for batches of B observations and A actions.
+    """Loaded policy with NumPy inputs and outputs; B is the batch size, A the number of actions.
 
     A policy that stacks k > 1 frames stores the observations of its last k calls of `act` since
     `begin`; the other methods accept (B, k, *shape), oldest frame first.

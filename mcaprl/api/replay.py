@@ -144,7 +144,7 @@ def verify(
         episode: Index of the only episode to compare; None for all.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged
-            arguments to any environment.
+            arguments to environments other than the sims of `SIMS`.
         progress: Function that opens a progress bar.
 
     Raises:

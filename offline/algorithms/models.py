@@ -118,10 +118,10 @@ def build_model(networks: Sequence[Network]) -> Model:
 
 
 class TargetNetwork:
-    """Copy of a learning model, synced at intervals.
+    """Copy of a model that is trained; the copy is updated at intervals.
 
-    Outputs are constant between two syncs. They are computed once for the whole dataset and then
-    looked up, if that is faster than a forward pass for each batch.
+    Between two updates the outputs are constant. If that is faster than a forward pass for each
+    batch, they are computed for the whole dataset after each update, and then looked up.
 
     Attributes:
         model: K target networks.

@@ -198,7 +198,7 @@ class _Run:
     def _train_to_next_stop(
         self, learner: Learner, metrics: list[MetricsWriter]
     ) -> list[dict[str, float]]:
-        """Update until metrics or a checkpoint are due, and write them."""
+        """Update until metrics or a checkpoint is due, and write what is due."""
         config = learner.config
         while True:
             terms = self._update(learner)

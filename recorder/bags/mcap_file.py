@@ -1,4 +1,4 @@
-"""Topics of an MCAP file of any writer."""
+"""Topics of an MCAP file that any program wrote."""
 
 from __future__ import annotations
 

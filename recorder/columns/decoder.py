@@ -25,7 +25,7 @@ from mcaprl.recorder.columns.records import RECORD_HEADER
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
-# Messages of the same length have at most this many layouts; the others are decoded one by one.
+# Maximum number of layouts for a message length; messages of other layouts are decoded singly.
 _MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]

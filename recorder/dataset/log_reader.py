@@ -232,7 +232,7 @@ def described(reader: McapReader) -> LogMetadata | None:
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The summary section has a copy of this metadata, which a CRC protects.
+        # The copy in the summary section is protected by a CRC.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata

@@ -24,7 +24,7 @@ class Values(NamedTuple):
 
     Attributes:
         values: (N,) or (N, K) numbers, NaN where missing, or (N,) texts; for images, (N,)
-            positions of their messages.
+            indexes of their messages.
         missing: (N,) bool: whether there is no value.
         age_s: (N,) age of the value in seconds, NaN where missing.
     """

@@ -236,7 +236,7 @@ class Display:
     def _flush_messages(self) -> None:
         # Sorting by topic puts similar messages next to each other, which saves 10% of file size.
         self._messages.sort(key=itemgetter(0))
-        # The static scene has its own chunk, because that chunk is compressed at a higher level.
+        # The static scene is written as a separate chunk, which is compressed at a higher level.
         static = self.shown.channels.get(SCENE_STATIC)
         for alone in (True, False):
             part = [message for message in self._messages if (message[0] == static) == alone]

@@ -217,7 +217,7 @@ def three_d(
 
 
 def split(first: Node, second: Node, direction: str, percent: float) -> Node:
-    """Return two nodes in a `row` or a `column`; the first one has a percentage of the size."""
+    """Return two nodes in a `row` or a `column`; the first takes `percent` of the size."""
     return {"first": first, "second": second, "direction": direction, "splitPercentage": percent}
 
 

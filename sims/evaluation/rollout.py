@@ -55,7 +55,7 @@ class EpsilonGreedy:
     def __init__(
         self, policy: Policy | None, epsilon: float, action_space: spaces.Space[Any]
     ) -> None:
-        """Explore around `policy`.
+        """Follow `policy`, but take a random action with probability `epsilon`.
 
         Args:
             policy: Policy, or None for random actions.

@@ -1,4 +1,4 @@
-"""The sim `mcaprl/HighwayLane-v0`: lane keeping and racetracks of highway-env."""
+"""The sim `mcaprl/HighwayLane-v0`: the lane-keeping and racetrack environments of highway-env."""
 
 from mcaprl.sims.spec import SimSpec
 

@@ -164,7 +164,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return self.flight.drone.position_m
 
     def telemetry(self) -> dict[str, float]:
-        """Return the state of the drone by name, in ROS axes; names include the units."""
+        """Return the drone's state as named numbers, in ROS axes; the names include the units."""
         return {**powerline_scene.telemetry(self.flight), **self.fleet.info(0)}
 
     def depth_image_m(self) -> NDArray[np.float32]:

@@ -184,9 +184,10 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
     """Return the acceleration with which the velocity controller approaches the command.
 
-    On each axis, add k (c - v), the drag at the commanded speed, and the integral of the deviation
-    from the reference velocity. Wind causes such a deviation; a change of the command does not. The
-    result is limited to 6 m/s^2.
+    On each axis, it is the sum of three accelerations: k (c - v) for the command c and the velocity
+    v; that of the drag at the commanded speed; and the integral of the deviation from the reference
+    velocity. Wind causes such a deviation; a change of the command does not. The result is limited
+    to 6 m/s^2.
     """
     c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
     return Vector(_asked(c.x, v.x, i.x), _asked(c.y, v.y, i.y), _asked(c.z, v.z, i.z))

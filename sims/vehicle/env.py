@@ -82,7 +82,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         """Make the environment; see "Arguments" of the class.
 
         Raises:
-            UnknownNameError: An argument has a value that is not in its list.
+            UnknownNameError: An argument has a value that is not allowed.
             UsageError: A number is outside its range.
         """
         super().__init__(render_mode)

@@ -24,7 +24,7 @@ def native(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(native: Path, form: str) -> Path:
-    """Make a bag of the drives in a process of its own, as a user does."""
+    """Make a bag of the drives in a separate process, as a user does."""
     out = native.with_name(form if form == "ros2" else f"{form}.mcap")
     command = [sys.executable, str(EXAMPLE / "make_bag.py"), str(native), str(out)]
     done = subprocess.run([*command, "--format", form], capture_output=True, text=True, check=False)
