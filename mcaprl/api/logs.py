@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mcaprl.api.data import MappingFile, Paths, mapped
+from mcaprl.api.data import MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
 from mcaprl.files import size_of, write_json
@@ -18,7 +18,7 @@ from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.lint import lint
-from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.recorder.dataset.open import find_logs
 from mcaprl.recorder.format.reading import McapReader
 from mcaprl.recorder.record.scene import DepthSource
 from mcaprl.recorder.record.wrapper import RecordMcap
@@ -129,7 +129,7 @@ def info(
     """Return facts about logs, and their problems.
 
     Args:
-        data: File, folder or glob of logs, or several of them.
+        data: File, folder, glob or URL of logs, or several of them; or a dataset of another tool.
         report: Output folder of the HTML report, an image and JSON.
         threads: Number of threads that decompress chunks.
         mapping: Mapping of another robot's bag; see `open`.
@@ -146,13 +146,14 @@ def info(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if mapping is None:
-            dataset, noted = open_logs(data, threads=threads), []
-            paths: Sequence[Path] = find_logs(data)
+            dataset, noted = open_data(data, threads=threads), []
+            paths: Sequence[Path] = dataset.sources
         else:
             dataset, result = mapped(data, mapping, trust_code=trust_code)
             paths, noted = dataset.sources, result.problems()
     warned = [str(warning.message) for warning in caught]
-    found = _describe(dataset, paths, [*warned, *map(str, noted)], is_bag=mapping is not None)
+    are_logs = mapping is None and all(path.suffix == ".mcap" for path in paths)
+    found = _describe(dataset, paths, [*warned, *map(str, noted)], are_logs=are_logs)
     if report is not None:
         from mcaprl.recorder.viewer.report import dataset_figure, dataset_page
 
@@ -164,7 +165,7 @@ def info(
 
 
 def _describe(
-    dataset: Dataset, paths: Sequence[Path], warned: Sequence[str], *, is_bag: bool
+    dataset: Dataset, paths: Sequence[Path], warned: Sequence[str], *, are_logs: bool
 ) -> LogInfo:
     statistics, findings = dataset.statistics, lint(dataset)
     return LogInfo(
@@ -190,7 +191,7 @@ def _describe(
         storage=dataset.storage,
         problems=[*warned, *(str(one) for one in findings if one.severity == "problem")],
         findings=findings,
-        moments=[] if is_bag else [moment for path in paths for moment in moments_of(path)],
+        moments=[moment for path in paths for moment in moments_of(path)] if are_logs else [],
     )
 
 

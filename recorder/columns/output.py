@@ -125,12 +125,15 @@ class OutputFile:
             with HoldSignals():
                 if sum(map(len, parts)) <= _JOINED_BYTES:
                     parts = (b"".join(parts),)
+                # Of a mapped file, the CRC reads the pages faster than the write would.
+                crc = self._crc
+                for part in parts:
+                    crc = crc32(part, crc)
                 for part in parts:
                     rest = memoryview(part)
                     while rest:
                         rest = rest[self._file.write(rest) :]
-                for part in parts:
-                    self._crc = crc32(part, self._crc)
+                self._crc = crc
                 self.position += sum(map(len, parts))
         except OSError as error:
             self._give_up(error)

@@ -26,6 +26,7 @@ from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.images import read_images
 from mcaprl.recorder.dataset.mapped import Frames
 from mcaprl.recorder.dataset.transitions import Transitions, ranges
+from mcaprl.recorder.format.episode_summary import EpisodeSummary
 from mcaprl.recorder.format.infos import read_infos
 from mcaprl.recorder.format.metadata import METADATA_NAME, LogMetadata
 from mcaprl.recorder.format.reading import LOG_TIME, Columns, McapReader, Topic
@@ -86,6 +87,20 @@ class LogReader:
         """
         times, frames = self._steps.times, int(self.lengths.sum()) + len(self.lengths)
         return (times if self._order is None else times[self._order])[:frames]
+
+    def episode_summaries(self) -> list[EpisodeSummary]:
+        """Return the summary of each episode, read from `/rl/episode` if it has all of them.
+
+        Raises:
+            LogError: As for `read`.
+        """
+        lengths = self.lengths
+        ends = self.record_times()[np.cumsum(lengths + 1) - 1]
+        by_end = {one.end_time_ns: one for one in self._summaries.summaries(ends)}
+        found = [by_end[end] for end in ends.tolist() if end in by_end]
+        if [one.length for one in found] == lengths.tolist():
+            return found
+        return [episode.summary for episode in self.read().episodes]
 
     def read(self, episodes: NDArray[np.int64] | None = None) -> Dataset:
         """Read whole episodes.

@@ -27,7 +27,7 @@ def filter_log(
     condition = Expression(expression)
     if condition.uses_next:
         raise UsageError(f"'{expression}': next(...) has no meaning for episodes")
-    log = FinishedLog(Path(path))
+    log = FinishedLog(path)
     table = episode_columns(log.summaries(), condition.names)
     holds = condition.evaluate(table, np.arange(len(log.lengths)))
     if holds.dtype != np.bool_:
@@ -51,7 +51,7 @@ def split_log(
     overwrite: bool = False,
 ) -> list[Edited]:
     """Copy the episodes of a log to several logs in a folder; see `mcaprl.split`."""
-    log, out = FinishedLog(Path(path)), Path(out)
+    log, out = FinishedLog(path), Path(out)
     log.need_steps()
     parts = _parts(len(log.lengths), episodes, ratio)
     order = np.arange(len(log.lengths))
@@ -60,7 +60,7 @@ def split_log(
     found = []
     with replacing_folder(out, overwrite=overwrite) as folder:
         for number, (start, stop) in enumerate(parts):
-            name = f"{log.path.stem}-{number:05d}.mcap"
+            name = f"{Path(str(log.path)).stem}-{number:05d}.mcap"
             chosen = np.sort(order[start:stop])
             found.append(_copy_episodes(log, chosen, folder / name, out / name))
     return found

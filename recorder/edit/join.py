@@ -33,6 +33,9 @@ from mcaprl.recorder.format.selected_copy import (
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
+# Each of these topics has messages of one type, so that they can be read as columns.
+_OUR_TOPICS = "/rl/"
+
 
 def merge_logs(
     paths: str | Path | Sequence[str | Path],
@@ -76,8 +79,8 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     """
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
+    _check_types(logs, with_steps=not described_ones)
     if not described_ones:
-        _check_same_types(logs)
         return None
     without = [log.path for log, one in zip(logs, found, strict=True) if one is None]
     if without:
@@ -111,20 +114,27 @@ def _check_same(first: Path, one: LogMetadata, second: Path, other: LogMetadata)
             )
 
 
-def _check_same_types(logs: Sequence[FinishedLog]) -> None:
-    """Raise LogError if the messages of `/rl/step` have different types."""
-    types = [
-        {
-            (one.name, one.data)
-            for one in map(log.reader.schema_of, log.reader.channels_of(STEP_TOPIC))
-        }
-        for log in logs
-    ]
-    for log, found in zip(logs, types, strict=True):
-        if found != types[0]:
-            raise LogError(
-                f"{logs[0].path} and {log.path} have messages of different types on {STEP_TOPIC}"
-            )
+def _check_types(logs: Sequence[FinishedLog], *, with_steps: bool) -> None:
+    """Raise LogError if the messages of a `/rl/` topic have different types in two logs.
+
+    Args:
+        logs: Logs of episodes.
+        with_steps: Whether `/rl/step` is checked, whose type otherwise follows from the spaces.
+    """
+    known: dict[str, tuple[Path, object]] = {}
+    for log in logs:
+        for channel in log.reader.channels.values():
+            topic = channel.topic
+            if not topic.startswith(_OUR_TOPICS) or (topic == STEP_TOPIC and not with_steps):
+                continue
+            schema = log.reader.schema_of(channel)
+            found = (schema.name, schema.data, channel.metadata)
+            path, first = known.setdefault(topic, (log.path, found))
+            if found != first:
+                raise LogError(
+                    f"{path} and {log.path} have messages of different types on {topic}; they"
+                    " cannot be one log"
+                )
 
 
 def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift: bool) -> list[int]:

@@ -63,7 +63,7 @@ def slice_log(
     """Copy the part of a log between two steps or times; see `mcaprl.slice`."""
     if (steps is None) == (time is None):
         raise UsageError("give either steps or time, as in 100:200")
-    log = FinishedLog(Path(path))
+    log = FinishedLog(path)
     window = _window_of_steps(log, steps) if steps is not None else _window_of_time(log, time)
     pieces = _pieces(log, *window)
     if log.has_steps:

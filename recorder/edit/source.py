@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +19,7 @@ from mcaprl.recorder.format.selected_copy import Times, times_of
 from mcaprl.recorder.format.topics import PHASE_TOPIC, STEP_TOPIC
 from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
+from mcaprl.remote import as_path
 
 # The latest message of these topics is valid until the next one.
 _STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
@@ -56,24 +56,25 @@ class FinishedLog:
         top_level: Metadata records, schemas, channels and attachments, in this order.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open the file.
+    def __init__(self, path: str | Path) -> None:
+        """Open the file; a remote one is fetched as a whole.
 
         Raises:
             LogError: The file is damaged, not finished, or has records of an unfinished episode.
         """
-        self.path, self.reader = path, McapReader(path)
+        self.path = as_path(path, whole=True)
+        self.reader = McapReader(self.path)
         try:
             top_level = finished_state(self.reader).top_level
         except CorruptLogError as error:
-            what = str(error).removeprefix(f"{path}: ")
+            what = str(error).removeprefix(f"{self.path}: ")
             raise self._unusable(what) from error
         self.top_level = [
             *(record for record in top_level if isinstance(record, Metadata)),
             *(record for record in top_level if not isinstance(record, Metadata | Attachment)),
             *(record for record in top_level if isinstance(record, Attachment)),
         ]
-        self._log = LogReader(path) if self.reader.channels_of(STEP_TOPIC) else None
+        self._log = LogReader(self.path) if self.reader.channels_of(STEP_TOPIC) else None
 
     @property
     def has_steps(self) -> bool:
@@ -131,16 +132,14 @@ class FinishedLog:
         if self._log is None:
             raise NoStepsError(f"{self.path} has no topic {STEP_TOPIC}, hence no episodes")
 
-    def summaries(self, episodes: Sequence[int] | None = None) -> list[EpisodeSummary]:
-        """Read the summaries of these episodes; default: all.
+    def summaries(self) -> list[EpisodeSummary]:
+        """Return the summary of each episode.
 
         Raises:
             LogError: The log is damaged, or has no episodes.
         """
         self.need_steps()
-        log = LogReader(self.path, Selection(columns=()))
-        numbers = None if episodes is None else np.array(episodes, np.int64)
-        return [episode.summary for episode in log.read(numbers).episodes]
+        return LogReader(self.path, Selection(columns=())).episode_summaries()
 
     def span_of_messages(self) -> tuple[int, int]:
         """Return the smallest and largest log_time of all messages; (0, 0) if there are none."""

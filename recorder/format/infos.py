@@ -42,7 +42,10 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
     for topic in sorted({channel.topic for channel in channels}):
         metadata = next(one.metadata for one in channels if one.topic == topic)
         name = metadata.get("info", topic.removeprefix(INFO_TOPICS).replace("/", "."))
-        found[name] = _read(Topic(reader, topic), metadata.get("shape", "[]"), times_ns, order)
+        messages = Topic(reader, topic)
+        # A part of a log has the topics of the whole log, and possibly no messages on some.
+        if len(messages):
+            found[name] = _read(messages, metadata.get("shape", "[]"), times_ns, order)
     return found
 
 

@@ -20,6 +20,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     versions            JSON object: package -> version
     behavior_prob       "estimated" if the probabilities of the actions were not logged but
                         estimated afterwards; otherwise absent
+    about               JSON object: what the dataset of another tool says about itself, such as its
+                        author; absent if there is nothing
 """
 
 from __future__ import annotations
@@ -95,6 +97,8 @@ class LogMetadata:
         versions: Versions of the packages that the recording ran with.
         behavior_prob: `ESTIMATED` if the probabilities of the actions were estimated; otherwise
             empty.
+        about: What the dataset of another tool, from which the log was converted, says about
+            itself; JSON types only.
     """
 
     observation_space: spaces.Space[Any]
@@ -111,6 +115,7 @@ class LogMetadata:
     seed: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     behavior_prob: str = ""
+    about: Mapping[str, Any] = field(default_factory=dict)
 
     def action_names(self) -> dict[int, str]:
         """Return the names of the discrete actions by value; empty for other action spaces.
@@ -158,6 +163,7 @@ class LogMetadata:
             "seed": self.seed,
             "versions": json.dumps(dict(self.versions)),
             **({"behavior_prob": self.behavior_prob} if self.behavior_prob else {}),
+            **({"about": json.dumps(dict(self.about))} if self.about else {}),
         }
 
     @classmethod
@@ -193,6 +199,7 @@ class LogMetadata:
                 seed=strings.get("seed", ""),
                 versions=_object(strings, "versions"),
                 behavior_prob=strings.get("behavior_prob", ""),
+                about=_object(strings, "about"),
             )
         except (KeyError, ValueError, TypeError, MemoryError) as error:
             raise LogError(

@@ -102,7 +102,9 @@ def test_messages_that_contradict_their_schema(log_path: Path, wrong: bytes) -> 
     time_ns, data = messages[5]
     messages[5] = (time_ns, data + wrong if wrong else data[:-4])
     write_with_mcap(log_path, messages)
-    with pytest.raises(CorruptLogError, match=r"/rl/step at log_time .*: cannot decode .* as robot_msgs"):
+    with pytest.raises(
+        CorruptLogError, match=r"/rl/step at log_time .*: cannot decode .* as robot_msgs"
+    ):
         mcaprl.open(log_path)
 
 

@@ -32,6 +32,18 @@ MISSING = "missing_infos"
 """Group of an episode with the rows without an info, in the group `OWN`."""
 # The first version that reads images without JPEG. Minari refuses versions that are newer than it.
 _MINARI_VERSION = "0.5.4"
+_ABOUT = (
+    "author",
+    "author_email",
+    "code_permalink",
+    "description",
+    "requirements",
+    "eval_env_spec",
+    "ref_min_score",
+    "ref_max_score",
+    "num_episodes_average_score",
+)
+"""Facts about a dataset that Minari stores and that mean nothing to a log."""
 _NAMESPACE_FILE = "namespace_metadata.json"
 _ID = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d+")
 
@@ -134,6 +146,7 @@ def read_description(path: Path) -> Description:
             env_kwargs=env_kwargs,
             policy=str(raw.get("algorithm_name") or ""),
             versions={"minari": str(raw.get("minari_version", ""))},
+            about={name: raw[name] for name in _ABOUT if raw.get(name) is not None},
         )
         metadata = _own_metadata(raw, metadata)
     except (SpaceError, LogError) as error:
@@ -167,6 +180,7 @@ def description_text(
         "dataset_id": dataset_id,
         "minari_version": _MINARI_VERSION,
         OWN: metadata.to_strings(),
+        **{name: metadata.about[name] for name in _ABOUT if name in metadata.about},
     }
     if metadata.policy:
         raw["algorithm_name"] = metadata.policy

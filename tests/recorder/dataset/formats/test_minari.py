@@ -130,6 +130,14 @@ def test_a_collected_dataset_equals_the_log_of_the_same_episodes(
     assert [json.loads(text or "null") for (text,) in _summaries(found, "options")] == options
     assert (found.env_id, found.env_kwargs) == (log.env_id, log.env_kwargs)
     assert found.metadata["policy"] == "random"
+    # What the dataset says about itself is kept in a log, and on the way back.
+    found.save(tmp_path / "kept.mcap")
+    mcaprl.open(tmp_path / "kept.mcap").to_minari("minari:drive/again-v0")
+    about = json.loads((tmp_path / "sets/drive/again-v0/data/metadata.json").read_bytes())
+    assert about["description"] == "Test data."
+    assert about["author_email"] == json.loads(found.metadata["about"])["author_email"]
+    facts = mcaprl.info("minari:drive/part/collected-v2")
+    assert (facts.steps, facts.env_id) == (len(log), log.env_id)
 
 
 @pytest.mark.parametrize("kind", ["lane", "cameras"])
