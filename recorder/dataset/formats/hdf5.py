@@ -210,7 +210,7 @@ def _put_info(file: Any, name: str, info: StoredInfo, dataset: Dataset) -> None:
 def _put(file: Any, name: str, column: Any, rows: NDArray[np.int64], is_image: bool) -> None:
     """Write rows of a column block by block, because images on disk need not fit into memory."""
     shape = (len(rows), *column.shape[1:])
-    settings = nodes.image_settings(column) if is_image else {}
+    settings = nodes.image_settings(shape, column.dtype) if is_image else {}
     stored = file.create_dataset(name, shape, column.dtype, **settings)
     for start in range(0, len(rows), _BLOCK_ROWS):
         block = slice(start, start + _BLOCK_ROWS)

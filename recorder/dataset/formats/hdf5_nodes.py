@@ -55,11 +55,11 @@ def opened(path: Path) -> Iterator[Any]:
         raise LogError(f"{path}: not a readable HDF5 file: {error}") from error
 
 
-def image_settings(column: Any) -> dict[str, Any]:
-    """Return the arguments of `create_dataset` for images (N, *shape): whole images in a chunk."""
-    frame_bytes = math.prod(column.shape[1:]) * column.dtype.itemsize
-    rows = max(1, min(len(column), _CHUNK_BYTES // frame_bytes))
-    return {"chunks": (rows, *column.shape[1:]), "compression": "lzf"}
+def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Return the arguments of `create_dataset` for images (N, H, W, C): whole images in a chunk."""
+    frame_bytes = math.prod(shape[1:]) * dtype.itemsize
+    rows = max(1, min(shape[0], _CHUNK_BYTES // frame_bytes))
+    return {"chunks": (rows, *shape[1:]), "compression": "lzf"}
 
 
 def has(group: Any, name: str) -> bool:

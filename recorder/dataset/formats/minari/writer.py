@@ -80,7 +80,9 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
             for leaf, key, column in zip(leaves, keys, columns, strict=True):
                 values = np.asarray(column[frames])
                 name = "/".join(("observations", *key))
-                _put(group, name, values, **(image_settings(values) if leaf.encoding else {}))
+                is_image = leaf.encoding is not None
+                settings = image_settings(values.shape, values.dtype) if is_image else {}
+                _put(group, name, values, **settings)
             _put(group, "actions", dataset.actions[steps])
             _put(group, "rewards", dataset.rewards[steps])
             _put(group, "terminations", dataset.terminated[steps])
