@@ -9,14 +9,14 @@ import tempfile
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from benchmarks import bags, growth, logs, sims
+from benchmarks import bags, edits, formats, growth, logs, sims
 from benchmarks.measure import Table
 from benchmarks.workloads import IMAGE_STEPS
 from mcaprl.files import write_json
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results.json"
-PARTS = ["logs", "bags", "growth", "sims"]
+PARTS = ["logs", "bags", "edits", "formats", "growth", "sims"]
 LIBRARIES = (
     "numpy",
     "zstandard",
@@ -71,6 +71,10 @@ def main() -> None:
             found += logs.tables(folder, arguments.transitions)
         if "bags" in arguments.only:
             found += bags.tables(folder)
+        if "edits" in arguments.only:
+            found += edits.tables(folder)
+        if "formats" in arguments.only:
+            found += formats.tables(folder)
         if "growth" in arguments.only:
             found += growth.tables(folder, sizes)
         if "sims" in arguments.only:

@@ -1,0 +1,145 @@
+"""Measure conversions to and from the datasets of other tools, beside the tools' own functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mcaprl
+from benchmarks import rivals
+from benchmarks.measure import OURS, Side, Table, after, compare
+from benchmarks.workloads import vectors
+
+TRANSITIONS = 100_000
+# Sides that go transition by transition do this share.
+SHARE = 0.05
+
+
+def tables(folder: Path) -> list[Table]:
+    """Measure each format, with files in `folder`."""
+    data = vectors(TRANSITIONS)
+    minari = rivals.MinariFolder(folder / "minari")
+    return [
+        *_minari(folder, data, minari),
+        *_parquet(folder, data),
+        *_npz(folder, data),
+        _sb3(data),
+    ]
+
+
+def _minari(folder: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> list[Table]:
+    ours = folder / "ours-v0"
+    return [
+        compare(
+            "Writing a Minari dataset, HDF5",
+            [
+                Side(OURS, lambda: data.to_minari(ours, overwrite=True)),
+                Side("Minari", lambda: minari.write(data, "hdf5")),
+            ],
+            rounds=3,
+        ),
+        compare(
+            "Reading a Minari dataset, HDF5, to arrays",
+            [
+                Side(OURS, lambda: mcaprl.Dataset.from_minari(ours)),
+                Side(
+                    "Minari",
+                    after(
+                        lambda: minari.write(data, "hdf5"),
+                        lambda: minari.read(minari.name(data, "hdf5")),
+                    ),
+                ),
+            ],
+            rounds=3,
+        ),
+    ]
+
+
+def _parquet(folder: Path, data: mcaprl.Dataset) -> list[Table]:
+    ours, theirs = folder / "ours-parquet", folder / "theirs.parquet"
+    return [
+        compare(
+            "Writing Parquet",
+            [
+                Side(OURS, lambda: data.to_parquet(ours, overwrite=True)),
+                Side("pandas, a column for each element", lambda: _write_pandas(data, theirs)),
+            ],
+            rounds=3,
+        ),
+        compare(
+            "Reading Parquet to arrays",
+            [
+                Side(OURS, lambda: mcaprl.Dataset.from_parquet(ours)),
+                Side("pandas, a column for each element", lambda: _read_pandas(theirs)),
+            ],
+            rounds=3,
+        ),
+    ]
+
+
+def _write_pandas(data: mcaprl.Dataset, path: Path) -> None:
+    import pandas
+
+    columns = {f"observation_{k}": data.observations[:, k] for k in range(data.frames.shape[1])}
+    columns |= {f"next_{k}": data.next_observations[:, k] for k in range(data.frames.shape[1])}
+    names = ("actions", "rewards", "terminated", "truncated")
+    columns |= {name: getattr(data, name) for name in names}
+    pandas.DataFrame(columns).to_parquet(path)
+
+
+def _read_pandas(path: Path) -> list[Any]:
+    import pandas
+
+    frame = pandas.read_parquet(path)
+    parts = [[one for one in frame if one.startswith(begin)] for begin in ("observation_", "next_")]
+    return [frame[names].to_numpy() for names in parts]
+
+
+def _npz(folder: Path, data: mcaprl.Dataset) -> list[Table]:
+    ours, theirs = folder / "ours.npz", folder / "theirs.npz"
+    names = ("observations", "next_observations", "actions", "rewards", "terminated", "truncated")
+    arrays = {name: getattr(data, name) for name in names}
+    return [
+        compare(
+            "Writing npz",
+            [
+                Side(OURS, lambda: data.to_npz(ours, overwrite=True)),
+                Side("np.savez with both observations", lambda: np.savez(theirs, **arrays)),
+            ],
+            rounds=3,
+        ),
+        compare(
+            "Reading npz",
+            [
+                Side(OURS, lambda: mcaprl.Dataset.from_npz(ours)),
+                Side("np.load with both observations", lambda: dict(np.load(theirs))),
+            ],
+            rounds=3,
+        ),
+    ]
+
+
+def _sb3(data: mcaprl.Dataset) -> Table:
+    return compare(
+        "Filling Stable-Baselines3's ReplayBuffer",
+        [
+            Side(OURS, lambda: data.to_sb3()),
+            Side("ReplayBuffer.add for each transition", lambda: _add_each(data), SHARE),
+        ],
+        rounds=3,
+    )
+
+
+def _add_each(data: mcaprl.Dataset) -> None:
+    from stable_baselines3.common.buffers import ReplayBuffer
+
+    count = round(SHARE * len(data))
+    space, actions = data.observation_space, data.action_space
+    buffer = ReplayBuffer(len(data), space, actions, handle_timeout_termination=True)
+    observations, following = data.observations[:count], data.next_observations[:count]
+    done = data.terminated | data.truncated
+    for k in range(count):
+        info = {"TimeLimit.truncated": bool(data.truncated[k])}
+        buffer.add(observations[k], following[k], data.actions[k], data.rewards[k], done[k], [info])
