@@ -62,7 +62,9 @@ def merge_logs(
     records, attachments = _other_records(logs, strings)
     top_level = [*records, *topics.records(), *attachments]
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        copied = copy_selected(sources, unfinished, top_level)
+        # Another program's file may have another profile than logs have.
+        like = next((log.reader for log in logs if log.has_steps), None)
+        copied = copy_selected(sources, unfinished, top_level, like=like)
     episodes = sum(len(log.lengths) for log in logs)
     steps = sum(int(log.lengths.sum()) for log in logs)
     return Edited(Path(out), episodes, steps, copied.messages, copied.whole, copied.rewritten)
@@ -79,8 +81,8 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     """
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
-    _check_types(logs, with_steps=not described_ones)
     if not described_ones:
+        _check_types(logs, are_described=False)
         return None
     without = [log.path for log, one in zip(logs, found, strict=True) if one is None]
     if without:
@@ -88,6 +90,7 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
     (first, metadata), *others = described_ones
     for log, other in others:
         _check_same(first.path, metadata, log.path, other)
+    _check_types(logs, are_described=True)
     common = LogMetadata.common([one for _, one in described_ones])
     # An older log does not name the module of its environment.
     return replace(common, env_id=max((one.env_id for _, one in described_ones), key=len))
@@ -114,21 +117,23 @@ def _check_same(first: Path, one: LogMetadata, second: Path, other: LogMetadata)
             )
 
 
-def _check_types(logs: Sequence[FinishedLog], *, with_steps: bool) -> None:
+def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
     """Raise LogError if the messages of a `/rl/` topic have different types in two logs.
 
     Args:
         logs: Logs of episodes.
-        with_steps: Whether `/rl/step` is checked, whose type otherwise follows from the spaces.
+        are_described: Whether the logs have metadata. Then the type of `/rl/step` follows from the
+            spaces, and the metadata of other channels say what their messages mean.
     """
     known: dict[str, tuple[Path, object]] = {}
     for log in logs:
         for channel in log.reader.channels.values():
             topic = channel.topic
-            if not topic.startswith(_OUR_TOPICS) or (topic == STEP_TOPIC and not with_steps):
+            if not topic.startswith(_OUR_TOPICS) or (topic == STEP_TOPIC and are_described):
                 continue
-            schema = log.reader.schema_of(channel)
-            found = (schema.name, schema.data, channel.metadata)
+            schema = log.reader.schemas.get(channel.schema_id)
+            kind = None if schema is None else (schema.name, schema.data)
+            found = (kind, channel.metadata if are_described else None)
             path, first = known.setdefault(topic, (log.path, found))
             if found != first:
                 raise LogError(

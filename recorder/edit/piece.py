@@ -6,6 +6,7 @@ from 0, and its last record becomes its final record.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,9 @@ def slice_log(
     """Copy the part of a log between two steps or times; see `mcaprl.slice`."""
     if (steps is None) == (time is None):
         raise UsageError("give either steps or time, as in 100:200")
+    for bound in (*(steps or ()), *(time or ())):
+        if bound is not None and not math.isfinite(bound):
+            raise UsageError(f"a bound is {bound}, expected a number")
     log = FinishedLog(path)
     window = _window_of_steps(log, steps) if steps is not None else _window_of_time(log, time)
     pieces = _pieces(log, *window)
@@ -95,6 +99,8 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
     """
     log.need_steps()
     count = int(log.lengths.sum())
+    if any(bound is not None and bound != int(bound) for bound in steps):
+        raise UsageError(f"steps are {steps[0]} and {steps[1]}, expected integers")
     start = 0 if steps[0] is None else int(steps[0])
     stop = count if steps[1] is None else min(int(steps[1]), count)
     if not 0 <= start < stop:

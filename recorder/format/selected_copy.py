@@ -19,7 +19,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from mcaprl.errors import LogError
+from mcaprl.errors import CorruptLogError, LogError
 from mcaprl.recorder.columns.append import TopLevelRecord
 from mcaprl.recorder.columns.chunks import Scratch
 from mcaprl.recorder.columns.message_rows import (
@@ -39,7 +39,8 @@ Change = Callable[[Channel, int, memoryview], None]
 # Channel ids are 16-bit numbers.
 _MAX_CHANNEL_ID = 2**16 - 1
 _NO_TIMES: Times = np.empty(0, np.int64)
-ALL_TIMES: Times = np.array([[0, np.iinfo(np.int64).max]], np.int64)
+_LAST_TIME = np.iinfo(np.int64).max
+ALL_TIMES: Times = np.array([[0, _LAST_TIME]], np.int64)
 """Span of all log_times."""
 # A Message record up to its payload; see `MESSAGE_HEADER`.
 _HEADER = struct.Struct("<BQHIQQ")
@@ -176,22 +177,25 @@ def copy_selected(
     target: Path,
     top_level: Sequence[TopLevelRecord],
     more: Sequence[tuple[int, int, bytes]] = (),
+    *,
+    like: McapReader | None = None,
 ) -> Copied:
     """Write the selected messages of files to a new file.
 
     The chunks of each file keep their order. Chunks of several files are ordered by their times.
 
     Args:
-        sources: Files with the same compression; the new one has the compression of the first.
+        sources: Files and the selections of their messages.
         target: Path of the new file; an existing one is replaced.
         top_level: Records at the start of the new file, with all its channels.
         more: More messages: channel id, log_time in nanoseconds, and data.
+        like: File whose profile and compression the new one has; default: the first source.
 
     Raises:
         LogError: A file is damaged, or the new file cannot be written.
     """
-    first = sources[0].reader
-    with writer_like(first.view, first.records(len(MCAP0_MAGIC)), target) as writer:
+    like = like or sources[0].reader
+    with writer_like(like.view, like.records(len(MCAP0_MAGIC)), target) as writer:
         for record in top_level:
             writer.announce(record)
         copy = _Copy(writer)
@@ -245,16 +249,19 @@ class _Copy:
         start, end = chunk.message_start_time, chunk.message_end_time
         ids = chunk.message_index_offsets
         if not ids:
-            self._rewrite(source, chunk, self._indexes(source, chunk))
+            indexes = contents_of(source.reader.chunk_records(chunk)).indexes
+            if indexes:
+                _check_times(source, chunk, indexes)
+                self._rewrite(source, chunk, indexes)
             return
+        view = source.reader.view
+        indexes = {id_: message_index(view, offset, id_) for id_, offset in ids.items()}
+        _check_times(source, chunk, indexes)
         kept_whole = self._is_inside(source, start, end) and not any(
             id_ in source.without for id_ in ids
         )
         if not kept_whole and self._is_outside(source, start, end, list(ids)):
             return
-        indexes = {
-            id_: message_index(source.reader.view, offset, id_) for id_, offset in ids.items()
-        }
         masks = {} if kept_whole else {i: _kept(source, i, index) for i, index in indexes.items()}
         if not kept_whole and not any(mask.any() for mask in masks.values()):
             return
@@ -282,9 +289,6 @@ class _Copy:
         also = [source.also[id_] for id_ in ids if id_ in source.also]
         return not any(((start <= times) & (times <= end)).any() for times in also)
 
-    def _indexes(self, source: Source, chunk: ChunkIndex) -> dict[int, NDArray[Any]]:
-        return contents_of(source.reader.chunk_records(chunk)).indexes
-
     def _embeds_topics(self, source: Source) -> bool:
         """Return whether chunks contain channels whose ids differ in the new file.
 
@@ -310,6 +314,21 @@ class _Copy:
         self._writer.write_records(written, found)
         self.copied.rewritten += 1
         self.copied.messages += count
+
+
+def _check_times(source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArray[Any]]) -> None:
+    """Raise CorruptLogError if the times of a chunk are not those of its messages."""
+    times = [index["log_time"] for index in indexes.values() if len(index)]
+    bounds = (
+        [min(int(one.min()) for one in times), max(int(one.max()) for one in times)]
+        if times
+        else []
+    )
+    where = f"{source.reader.path}: the chunk at byte {chunk.chunk_start_offset}"
+    if bounds and bounds != [chunk.message_start_time, chunk.message_end_time]:
+        raise CorruptLogError(f"{where} has other times than its messages")
+    if bounds and bounds[1] + source.delay_ns > _LAST_TIME:
+        raise CorruptLogError(f"{where} has a log_time after the year 2262")
 
 
 def _kept(source: Source, channel_id: int, index: NDArray[Any]) -> NDArray[np.bool_]:

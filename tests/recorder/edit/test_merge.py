@@ -31,7 +31,7 @@ from tests.support.foreign_logs import (
     steps_of,
     variable_messages,
 )
-from tests.support.recordings import MIXED_SPACE, record
+from tests.support.recordings import MIXED_SPACE, ScriptedEnv, record
 from tests.support.strategies import transitions
 
 SPACE = spaces.Box(-1, 1, (2,), np.float32)
@@ -299,6 +299,38 @@ def test_types_of_steps_that_differ_are_refused(tmp_path: Path) -> None:
         mcaprl.merge(paths, tmp_path / "out.mcap")
     with pytest.raises(LogError, match=r"1\.mcap has no metadata, but .*a\.mcap has"):
         mcaprl.merge([logged(tmp_path / "a.mcap", [2]), paths[1]], tmp_path / "out.mcap")
+
+
+def with_info(path: Path, start_s: float, info: Any) -> Path:
+    """Record an episode of one step with an info."""
+    rows = [(SPACE.sample(), 0.0, False, False), (SPACE.sample(), 1.0, True, False)]
+    env = ScriptedEnv(SPACE, ACTIONS, [rows], {"info": info})
+    start_time_ns = 10**18 + round(start_s * S)
+    with closing(mcaprl.RecordMcap(env, path, start_time_ns=start_time_ns, infos=True)) as recorder:
+        recorder.reset(seed=0)
+        recorder.step(1)
+    return path
+
+
+def test_infos_are_joined(tmp_path: Path) -> None:
+    paths = [with_info(tmp_path / f"{k}.mcap", k, float(k)) for k in range(2)]
+    mcaprl.merge(paths, tmp_path / "out.mcap")
+    assert mcaprl.open(tmp_path / "out.mcap").infos["info"].tolist() == [None, 0.0, None, 1.0]
+    mcaprl.filter("episode == 1", tmp_path / "out.mcap", tmp_path / "part.mcap")
+    assert mcaprl.open(tmp_path / "part.mcap").infos["info"].tolist() == [None, 1.0]
+    # Log a has no info, so the part that is log a has none.
+    logged(tmp_path / "a.mcap", [1], start_s=5, step_duration_s=0.05)
+    mcaprl.merge([paths[0], tmp_path / "a.mcap"], tmp_path / "some.mcap")
+    mcaprl.filter("episode == 1", tmp_path / "some.mcap", tmp_path / "none.mcap")
+    assert mcaprl.open(tmp_path / "none.mcap").infos == {}
+    assert check_log(tmp_path / "none.mcap") == []
+
+
+def test_infos_that_differ_are_named(tmp_path: Path) -> None:
+    a = with_info(tmp_path / "a.mcap", 0, 1.0)
+    b = with_info(tmp_path / "b.mcap", 9, np.ones(3))
+    with pytest.raises(LogError, match=r"a\.mcap and .*b\.mcap have .* types on /rl/info/info"):
+        mcaprl.merge([a, b], tmp_path / "out.mcap")
 
 
 def test_messages_without_cdr_are_not_moved(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,9 @@ def test_part_of_a_file_without_steps(tmp_path: Path) -> None:
         ({"steps": (3, 3)}, "has the steps 0 to 7: none of them"),
         ({"steps": (-1, 3)}, "has the steps 0 to 7: none of them"),
         ({"time": (0.6, None)}, r"lasts 0\.5 s: no message is in this part"),
+        ({"steps": (0.5, 3)}, "steps are 0.5 and 3, expected integers"),
+        ({"steps": (math.nan, 3)}, "a bound is nan, expected a number"),
+        ({"time": (0, math.inf)}, "a bound is inf, expected a number"),
         ({"time": (2, 1)}, r"lasts 0\.5 s: no message is in this part"),
     ],
 )
