@@ -62,6 +62,7 @@ class InfoTopics:
 
     Attributes:
         refused: Names of the infos that were not written, with the reason.
+        warned: Names of the infos for which a warning was given.
     """
 
     def __init__(self, log: LogTopics) -> None:
@@ -70,6 +71,7 @@ class InfoTopics:
         self._channels: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {}
         self._topics: set[str] = set()
         self.refused: dict[str, str] = {}
+        self.warned: set[str] = set()
 
     def write(self, infos: Mapping[str, tuple[Sequence[int], NDArray[Any]]]) -> None:
         """Write values (K, *shape) of infos with their log_times (K,), by name.

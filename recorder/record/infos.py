@@ -9,24 +9,22 @@ from typing import Any
 import numpy as np
 
 from mcaprl.recorder.format.info_topics import InfoTopics, flat_infos, info_array
-from mcaprl.recorder.format.log_writer import LogTopics
 
 
 class EpisodeInfos:
     """Collector of the infos of one episode, which are written at its end."""
 
-    def __init__(self, log: LogTopics, names: bool | Sequence[str]) -> None:
+    def __init__(self, topics: InfoTopics, names: bool | Sequence[str]) -> None:
         """Begin without infos.
 
         Args:
-            log: Log to write.
+            topics: Topics of the infos in the log.
             names: Whether infos are recorded, or the names of those that are; `episode` includes
                 `episode.r`.
         """
-        self._topics = InfoTopics(log)
+        self._topics = topics
         self._names = None if isinstance(names, bool) else tuple(names)
         self._values: dict[str, tuple[list[int], list[Any]]] = {}
-        self._warned: set[str] = set()
 
     def begin(self, info: Mapping[str, Any]) -> None:
         """Store the info that `reset` returned, in place of those of an earlier episode."""
@@ -66,6 +64,26 @@ class EpisodeInfos:
         if found:
             self._topics.write(found)
         for name, why in (refused | self._topics.refused).items():
-            if name not in self._warned:
-                self._warned.add(name)
+            if name not in self._topics.warned:
+                self._topics.warned.add(name)
                 warnings.warn(f"the info '{name}' is not recorded: {why}", stacklevel=5)
+
+
+def info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
+    """Return the info of one environment from those of a vector environment.
+
+    Gymnasium puts the values of all environments into arrays; `_name` says which have the info.
+    """
+    found: dict[str, Any] = {}
+    for name, value in infos.items():
+        mask = infos.get(f"_{name}")
+        is_own = name in ("final_obs", "final_info") or name.startswith("_")
+        if is_own or (mask is not None and not mask[number]):
+            continue
+        if isinstance(value, Mapping):
+            inner = info_of(value, number)
+            if inner:
+                found[name] = inner
+        elif isinstance(value, np.ndarray | list | tuple):
+            found[name] = value[number]
+    return found

@@ -10,6 +10,7 @@ No scene is recorded: replay the seeds and actions in a single environment to ge
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import check_probability, is_impossible
 from mcaprl.recorder.format.rows import TopicRows
 from mcaprl.recorder.format.spaces import action_leaf, observation_leaves
 from mcaprl.recorder.format.writing import HoldSignals
 from mcaprl.recorder.record.display import Display
+from mcaprl.recorder.record.infos import EpisodeInfos, info_of
 from mcaprl.recorder.record.session import EpisodeLog, OpenEpisode, reason_of
 from mcaprl.recorder.record.step_rows import as_declared, converters
 from mcaprl.recorder.record.vector_rows import OpenRows, OpenSteps
@@ -61,6 +64,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         overwrite: bool = False,
         append: bool = False,
         max_file_bytes: int | None = None,
+        infos: bool | Sequence[str] = False,
         step_duration_s: float | None = None,
         start_time_ns: int | None = None,
     ) -> None:
@@ -108,6 +112,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._learner: OpenRows[TopicRows] | None = None
         if policy_version is not None:
             self._learner = OpenRows(log.learner_rows(), count)
+        topics = InfoTopics(log)
+        self._infos = [EpisodeInfos(topics, infos) for _ in range(count)] if infos else []
         self._places = [
             (self._images[leaf], "data") if leaf in self._images else (self._columns, leaf.name)
             for leaf in observation_leaves(self.single_observation_space)
@@ -153,7 +159,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         with HoldSignals():
             for number in numbers.tolist():
                 episode = OpenEpisode(self.policy, self.epsilon, seeds[number], given or None)
-                self._begin(number, values, episode)
+                self._begin(number, values, infos, episode)
         return observations, infos
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -179,13 +185,16 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._columns.put("reward", self._every, self._steps, np.asarray(rewards, np.float64))
             values = [convert(observations) for convert in self._converters]
             ended = self._running & np.logical_or(terminated, truncated)
+            if self._infos:
+                self._add_infos(infos, ended)
             if ended.any() or self._due.any() or self._steps.max() + 1 >= self._full_at:
                 # No signal may interrupt the writes or separate them from the step counters.
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
                     for number in np.flatnonzero(self._due).tolist():
-                        self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
+                        episode = OpenEpisode(self.policy, self.epsilon)
+                        self._begin(number, values, infos, episode)
                     self._end_some(np.flatnonzero(ended), values, terminated, truncated, infos)
             else:
                 self._observe(values)
@@ -239,8 +248,24 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         for (table, field), value in zip(self._places, values, strict=True):
             table.put(field, environments, steps, value)
 
-    def _begin(self, number: int, values: list[NDArray[Any]], episode: OpenEpisode) -> None:
+    def _add_infos(self, infos: dict[str, Any], ended: NDArray[np.bool_]) -> None:
+        """Store the infos of the environments that made a step."""
+        same_step = self._autoreset is AutoresetMode.SAME_STEP
+        for number in np.flatnonzero(self._running).tolist():
+            is_final = same_step and ended[number]
+            source = infos.get("final_info", {}) if is_final else infos
+            self._infos[number].add(int(self._steps[number]) + 1, info_of(source, number))
+
+    def _begin(
+        self,
+        number: int,
+        values: list[NDArray[Any]],
+        infos: dict[str, Any],
+        episode: OpenEpisode,
+    ) -> None:
         """Begin an episode of one environment with its observation."""
+        if self._infos:
+            self._infos[number].begin(info_of(infos, number))
         self._put(number, 0, [value[number] for value in values])
         self._open[number], self._steps[number] = episode, 0
         self._running[number], self._due[number] = True, False
@@ -264,7 +289,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._end(number, is_terminal, bool(truncated[number]), reason)
             self._due[number] = self._autoreset is AutoresetMode.NEXT_STEP
             if same_step:
-                self._begin(number, values, OpenEpisode(self.policy, self.epsilon))
+                self._begin(number, values, infos, OpenEpisode(self.policy, self.epsilon))
 
     def _final_observation(self, infos: dict[str, Any], number: int) -> list[NDArray[Any]]:
         """Return an episode's last observation from the infos of same-step mode."""
@@ -304,6 +329,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         for table in self._images.values():
             table.write(number, steps + 1, start_ns, step_ns)
         self._display.end(summary)
+        if self._infos:
+            self._infos[number].end(steps, start_ns, step_ns)
         recording.log.write_episodes([summary], log_lines=True)
         if self._learner is not None:
             self._learner.write(number, steps, start_ns, step_ns)

@@ -17,6 +17,7 @@ import gymnasium as gym
 
 from mcaprl.errors import SpaceError, UsageError
 from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.format.info_topics import InfoTopics
 from mcaprl.recorder.format.metadata import LogMetadata
 from mcaprl.recorder.format.probability import SMALLEST, check_probability
 from mcaprl.recorder.format.writing import HoldSignals
@@ -119,7 +120,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             start_time_ns=start_time_ns,
         )
         log = self._recording.log
-        self._infos = EpisodeInfos(log, infos) if infos else None
+        self._infos = EpisodeInfos(InfoTopics(log), infos) if infos else None
         self._display = Display(log, env.unwrapped, scene=scene, camera=camera)
         self._columns = columns = StepColumns(log)
         self._shows_steps = self._display.shows_steps

@@ -193,3 +193,25 @@ def test_the_record_function_records_infos(log_path: Path) -> None:
     assert data.infos["reason"].compressed().tolist() == [one.reason for one in data.episodes]
     speed = data.observation_names.index("speed")
     assert np.abs(data.infos["speed_m_s"] - 30 * data.frames[:, speed]).max() < 1e-5
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_vector_environments_record_the_infos_of_each_episode(log_path: Path, mode: str) -> None:
+    def make() -> gym.Env[Any, Any]:
+        env = gym.make("CartPole-v1", max_episode_steps=4)
+        return gym.wrappers.RecordEpisodeStatistics(env)
+
+    envs = gym.vector.SyncVectorEnv([make, make], autoreset_mode=gym.vector.AutoresetMode(mode))
+    recorded = mcaprl.RecordVecMcap(envs, log_path, infos=True)
+    recorded.reset(seed=0)
+    for _ in range(14):
+        recorded.step(np.array([0, 1]))
+    recorded.close()
+    data = mcaprl.open(log_path)
+    finished = [one for one in data.episodes if one.reason != "interrupted"]
+    assert len(finished) >= 4
+    for episode in finished:
+        returns = episode.infos["episode.r"]
+        assert np.flatnonzero(~np.ma.getmaskarray(returns)).tolist() == [episode.length]
+        assert returns[-1] == episode.total_reward
+        assert episode.infos["episode.l"][-1] == episode.length
