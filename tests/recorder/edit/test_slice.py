@@ -11,6 +11,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 import mcaprl
 from mcaprl.cli import run
@@ -144,6 +145,36 @@ def test_part_of_a_file_without_steps(tmp_path: Path) -> None:
     assert [message[:2] for message in messages_of(tmp_path / "out.mcap")] == [
         ("/camera/2", 10**18 + 2)
     ]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "is_kept"),
+    [
+        ({"offered_qos_profiles": "- history: 3\n  durability: 1\n  depth: 1\n"}, True),
+        ({"offered_qos_profiles": "- durability: transient_local\n"}, True),
+        ({"latching": "1"}, True),
+        ({"offered_qos_profiles": "- history: 3\n  durability: 2\n  depth: 1\n"}, False),
+        ({}, False),
+    ],
+)
+def test_latched_messages_before_the_part(
+    tmp_path: Path, metadata: dict[str, str], is_kept: bool
+) -> None:
+    with (tmp_path / "robot.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        robot = writer.register_channel("/robot_description", "json", 0, metadata)
+        speed = writer.register_channel("/speed", "json", 0)
+        for time_s in range(6):
+            writer.add_message(speed, 10**18 + time_s * 10**9, b"%d" % time_s, 0)
+            if time_s in (0, 1, 5):
+                writer.add_message(robot, 10**18 + time_s * 10**9, b"robot %d" % time_s, 0)
+        writer.finish()
+    mcaprl.slice(tmp_path / "robot.mcap", tmp_path / "out.mcap", time=(3, 5))
+    # The second of the three descriptions is the one that is valid at 3 s.
+    robots = [b"robot 1"] if is_kept else []
+    found = sorted(data for _, _, _, data in messages_of(tmp_path / "out.mcap"))
+    assert found == sorted([b"3", b"4", *robots])
 
 
 @pytest.mark.parametrize(

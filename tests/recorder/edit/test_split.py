@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -273,6 +274,18 @@ def test_log_can_be_replaced_by_its_part(log: Path) -> None:
     assert [episode.summary.episode for episode in mcaprl.open(log).episodes] == [1]
 
 
+def test_logs_at_urls(log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    url = f"file://{log}"
+    mcaprl.filter("episode < 2", url, tmp_path / "a.mcap")
+    mcaprl.slice(url, tmp_path / "b.mcap", steps=(5, None))
+    mcaprl.merge([f"file://{tmp_path / 'a.mcap'}", tmp_path / "b.mcap"], tmp_path / "out.mcap")
+    assert messages_of(tmp_path / "out.mcap") == messages_of(log)
+    parts = mcaprl.split(url, tmp_path / "parts", episodes=4)
+    assert [part.out.name for part in parts] == ["log-00000.mcap"]
+    assert messages_of(parts[0].out) == messages_of(log)
+
+
 def test_unfinished_logs_are_refused(log: Path, tmp_path: Path) -> None:
     content = log.read_bytes()
     cut = tmp_path / "cut.mcap"
@@ -288,6 +301,19 @@ def test_commands(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "out.mcap: 2 episodes, 7 steps, " in capsys.readouterr().out
     assert run(["split", str(log), str(parts), "--ratio", "1:1", "--seed", "0"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 2
+    (tmp_path / "out.mcap").unlink()
+    assert run(["filter", "length > 2", str(log), str(out), "--json"]) == 0
+    (one,) = json.loads(capsys.readouterr().out)["logs"]
+    # 9 records of 2 episodes, 2 summaries, and the start and end of each episode on 2 topics. So
+    # short a log has 2 chunks for each episode.
+    assert one == {
+        "out": str(out),
+        "episodes": 2,
+        "steps": 7,
+        "messages": 19,
+        "whole_chunks": 4,
+        "rewritten_chunks": 0,
+    }
     assert run(["split", str(log), str(parts), "--ratio", "1:x"]) == 2
     assert capsys.readouterr().err == "mcaprl: --ratio has 'x', which is not a number\n"
     assert run(["filter", "nothing > 2", str(log), str(out)]) == 2
