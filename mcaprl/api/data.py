@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mcaprl.errors import UsageError, import_extra
+from mcaprl.errors import NotMcapError, UsageError, import_extra
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.open import Episodes, open_logs
@@ -70,7 +70,16 @@ def open_data(
     """
     other = None if mapping is not None else _other_format(data, format)
     if mapping is None and other is None:
-        return open_logs(data, columns=columns, episodes=episodes, images=images, threads=threads)
+        try:
+            return open_logs(
+                data, columns=columns, episodes=episodes, images=images, threads=threads
+            )
+        except NotMcapError as error:
+            from mcaprl.recorder.dataset.formats.registry import FORMATS
+
+            raise NotMcapError(
+                f"{error}, nor is it a dataset of one of the formats {', '.join(FORMATS)}"
+            ) from error
     if columns is not None or episodes is not None or images == "mapped":
         what = f"the format {other.name}" if other is not None else "a mapping"
         raise UsageError(f"columns, episodes and mapped images are for logs, not for {what}")

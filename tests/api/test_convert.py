@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -130,3 +132,43 @@ def test_a_suggested_mapping_gives_a_dataset(bag: Path, tmp_path: Path) -> None:
     data = mcaprl.open(bag, mapping=path)
     assert len(data) == STEPS - 1
     assert "odom_linear_x" in data.observation_names
+
+
+@pytest.mark.parametrize(("form", "target"), [("npz", "lane.npz"), ("parquet", "lane")])
+def test_a_killed_conversion_leaves_nothing_under_the_final_name(
+    tmp_path: Path, form: str, target: str
+) -> None:
+    pytest.importorskip("pyarrow", reason="needs the extra tables")
+    log, out = tmp_path / "lane.mcap", tmp_path / target
+    mcaprl.record("lane", log, episodes=1)
+    program = (
+        "import os, mcaprl\n"
+        f"from mcaprl.recorder.dataset.formats import {form} as module\n"
+        "write = module.write\n"
+        "def killed(*arguments, **options):\n"
+        "    write(*arguments, **options)\n"
+        "    os._exit(9)\n"
+        "module.write = killed\n"
+        f"mcaprl.convert({str(log)!r}, {str(out)!r}, to={form!r})\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 9
+    assert not out.exists()
+    mcaprl.convert(log, out, to=form)
+    assert mcaprl.open(out).fingerprint == mcaprl.open(log).fingerprint
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["lane.mcap", target])
+
+
+def test_unknown_formats_list_those_that_are_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "lane.mcap"
+    mcaprl.record("lane", log, episodes=1)
+    assert run(["convert", str(log), str(tmp_path / "out"), "--to", "parqet"]) == 2
+    error = capsys.readouterr().err
+    assert "parquet" in error
+    assert "lerobot" in error
+    (tmp_path / "text.csv").write_text("a,b\n")
+    assert run(["convert", str(tmp_path / "text.csv"), str(tmp_path / "out.mcap")]) == 1
+    error = capsys.readouterr().err
+    assert "text.csv is not an MCAP file" in error
+    assert "nor is it a dataset of one of the formats lerobot, minari, parquet" in error
