@@ -38,7 +38,7 @@ def make_sim(name: str, /, **kwargs: Any) -> gym.Env[Any, Any]:
         UnknownNameError: There is no such sim, or an argument has a value that the sim does not
             accept.
         MissingExtraError: The packages that the sim needs are not installed.
-        UsageError: The environment does not accept such an argument, or cannot be made.
+        UsageError: The environment does not accept an argument, or creating it fails.
     """
     env_id, spec = _resolve(name)
     with _clear_errors(name, spec, kwargs):
@@ -87,7 +87,7 @@ def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
 
 
 def _resolve(name: str) -> tuple[str, SimSpec | None]:
-    """Return the Gymnasium id for a name, and the sim's description, None if it is not a sim."""
+    """Return the Gymnasium id for a name, and the sim's `SimSpec`; None if there is no such sim."""
     env_id = SIMS.get(name, name)
     is_known_to_gymnasium = env_id in gym.registry or ":" in env_id
     return env_id, SIMS.find(env_id, loads=not is_known_to_gymnasium)

@@ -139,7 +139,7 @@ def _load(found: EntryPoint) -> SimSpec:
     """Load the sim of an entry point.
 
     Raises:
-        UsageError: The entry point cannot be loaded, or the sim has another name.
+        UsageError: The entry point cannot be loaded, or does not return a sim of the same name.
     """
     package = f" of package '{found.dist.name}'" if found.dist else ""
     place = f"entry point '{found.name} = {found.value}' in group '{GROUP}'{package}"

@@ -104,16 +104,13 @@ def _only(data: Paths) -> str | Path | None:
 def _other_format(data: Paths, name: str | None) -> Format | None:
     """Return the format of another tool's dataset; None for logs."""
     one = _only(data)
-    path = None if one is None else Path(one)
-    is_log = path is None or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap")))
-    if name is None and is_log:
+    if name is None and (one is None or Path(one).suffix == ".mcap"):
         return None
-    from mcaprl.recorder.dataset.formats.registry import format_named, recognized
+    from mcaprl.recorder.dataset.formats.registry import format_named, other_format
 
     if name is not None:
         return format_named(name)
-    assert one is not None
-    return recognized(one)
+    return None if one is None else other_format(one)
 
 
 def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +12,18 @@ from numpy.typing import NDArray
 
 from mcaprl.errors import UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.recorder.dataset.formats.registry import other_format, read_format
 from mcaprl.recorder.dataset.open import find_logs, open_logs
+from mcaprl.remote import RemotePath
 
 
 def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, NDArray[np.float64]]:
     """Read logs as one dataset, and return it with one weight per episode.
 
     Args:
-        data: Files, folders or globs, each with an optional suffix `:WEIGHT`. A transition of
-            weight 2 is drawn twice as often as one of weight 1, the default.
+        data: Files, folders, globs or URLs of logs, or datasets of other tools, each with an
+            optional suffix `:WEIGHT`. A transition of weight 2 is drawn twice as often as one of
+            weight 1, the default.
         threads: Number of threads that read chunks.
 
     Raises:
@@ -26,19 +31,32 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
         LogError: A file is missing, damaged, not an MCAP file, or has no finished episode.
         SpaceError: The spaces of the logs differ.
     """
-    weights: dict[Path, float] = {}
+    weights: dict[str, float] = {}
+    found: dict[str, Callable[[], Dataset]] = {}
     for part in data:
         name, weight = _split_weight(part)
-        for path in find_logs(name):
-            if weights.setdefault(path.resolve(), weight) != weight:
+        for key, read in _readers(name, threads):
+            found.setdefault(key, read)
+            if weights.setdefault(key, weight) != weight:
                 raise UsageError(
-                    f"{path} is named twice, with weights {weights[path.resolve()]:g} and"
-                    f" {weight:g}; name it once"
+                    f"{key} is named twice, with weights {weights[key]:g} and {weight:g}; name it"
+                    " once"
                 )
-    parts = [open_logs(path, threads=threads) for path in weights]
+    parts = [read() for read in found.values()]
     pairs = zip(parts, weights.values(), strict=True)
     each = [np.full(len(part.episodes), weight) for part, weight in pairs]
     return Dataset.concatenate(parts), np.concatenate(each)
+
+
+def _readers(name: str, threads: int) -> Iterator[tuple[str, Callable[[], Dataset]]]:
+    """Yield a unique name and a function that reads it, for each log or dataset of a name."""
+    other = other_format(name)
+    if other is not None:
+        yield name, partial(read_format, name, other)
+        return
+    for path in find_logs(name):
+        key = str(path) if isinstance(path, RemotePath) else os.path.realpath(path)
+        yield key, partial(open_logs, path, threads=threads)
 
 
 def _split_weight(part: str) -> tuple[str, float]:

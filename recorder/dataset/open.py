@@ -16,7 +16,7 @@ from mcaprl.errors import LogError, NoEpisodesError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
-from mcaprl.remote import find_remote, is_url
+from mcaprl.remote import as_path, find_remote, is_url
 
 Result = TypeVar("Result")
 Episodes = int | slice | Sequence[int]
@@ -129,7 +129,7 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
         return list({os.path.realpath(path): path for path in every}.values())
     if is_url(data):
         return list(find_remote(str(data)))
-    path = Path(data)
+    path = as_path(data)
     if path.is_dir():
         found = sorted(path.glob("*.mcap"))
         if not found:

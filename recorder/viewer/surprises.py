@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage, or entropy if there are no Q-values."""
+    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]
@@ -97,7 +97,7 @@ def _largest(numbers: NDArray[Any], chosen: NDArray[np.bool_]) -> list[int]:
 
 
 def _places(steps: Topic) -> dict[int, tuple[int, int]]:
-    """Return a dict from each log_time to its episode and step."""
+    """Return a dict that maps each log_time to an episode index and a step index."""
     times = steps.times
     order = np.argsort(times, kind="stable")
     step = steps.read(("step",))["step"][order]

@@ -111,9 +111,9 @@ def verify(
 
     Args:
         dataset: Dataset of one log.
-        env: New environment of the same kind, which is reset and stepped.
-        only: Index of the episode to compare. Earlier episodes are also compared if its random
-            state depends on them. Default: all episodes.
+        env: New environment of the same kind as the logged one; this function resets and steps it.
+        only: Index of the episode to compare. If the start of this episode depends on earlier
+            episodes, these are also compared. Default: all episodes.
         on_frame: Function that is called with the episode and step after each identical
             observation, while the environment is in that state.
 
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return the episode `only` and the episodes that its start depends on; default: all."""
+    """Return the episode `only` and the episodes that its start depends on; all if it is None."""
     if only is None:
         return episodes
     first = only
@@ -187,7 +187,10 @@ _Frame = tuple[Any, float, bool, bool]
 def _stepped(
     env: gym.Env[Any, Any], episode: Episode, action_space: spaces.Space[Any]
 ) -> Iterator[_Frame]:
-    """Yield observation, reward, terminated and truncated of `reset` and of each step."""
+    """Yield (observation, reward, terminated, truncated) after `reset` and after each step.
+
+    After `reset`, the reward is 0 and both flags are False.
+    """
     options = json.loads(episode.summary.options) if episode.summary.options else None
     step = 0
     try:
@@ -247,7 +250,7 @@ def _bits(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _at(episode: Episode, step: int) -> Any:
-    """Return the logged observation at a step, from 0 to the length of the episode."""
+    """Return the logged observation at a step; `step` is from 0 to the episode's length."""
     source = episode.observations if step < episode.length else episode.next_observations
     return _row(source, min(step, episode.length - 1))
 

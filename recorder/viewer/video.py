@@ -26,7 +26,7 @@ _GAP_PX = 6
 
 
 def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
-    """Check that a video or contact sheet can be written before rendering images.
+    """Before images are rendered, check that a video or contact sheet can be written.
 
     Args:
         path: Path of the output.
@@ -34,7 +34,7 @@ def check_output(path: Path, kinds: Sequence[str], *, overwrite: bool) -> None:
         overwrite: Whether to replace an existing file.
 
     Raises:
-        UnknownNameError: The path has another suffix.
+        UnknownNameError: The suffix of the path is not supported.
         OutputExistsError: The file exists and `overwrite` is not set.
         MissingExtraError: imageio is not installed.
     """
@@ -118,7 +118,7 @@ def contact_sheet(images: Sequence[Image]) -> Image:
 
 
 def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
-    """Return the steps of an episode that a video shows, and its frame rate.
+    """Return the steps of an episode that a video shows, and the frame rate of the video.
 
     Steps are skipped at a constant stride if the frame rate would exceed `MAX_FPS`; the last step
     is always shown.
@@ -132,7 +132,9 @@ def shown_steps(length: int, steps_per_s: float) -> tuple[range, float]:
 
 
 def parts_of_step(images_per_s: float) -> int:
-    """Return the number of images per shown step, so that a video has at least 20 per second.
+    """Return how many images to render per shown step, for at least 20 images per second.
+
+    `images_per_s` is the number of shown steps per second.
 
     >>> parts_of_step(2.0), parts_of_step(10.0), parts_of_step(30.0)
     (10, 2, 1)

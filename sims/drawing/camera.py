@@ -43,7 +43,7 @@ def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
 
 
 def focal_lengths(view: Lens, shape: tuple[int, int]) -> tuple[float, float]:
-    """Return the focal lengths of an image of another (height, width), in its pixels.
+    """Return the focal lengths in x and y of an image of another size, in pixels of that image.
 
     >>> focal_lengths(lens(256, 144, math.pi / 2), (72, 64))
     (32.00000000000001, 64.00000000000001)
@@ -72,7 +72,7 @@ def level_axes(yaw_rad: float) -> Floats:
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the (T, 4) planes of triangles: the front's unit normal n, and n p for a corner p."""
+    """Return the (T, 4) planes of triangles: the front's unit normal n, and n . p of a corner p."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -135,7 +135,10 @@ def draw(
 
 
 class _Plane(NamedTuple):
-    """Plane x p_x + y p_y + z p_z = offset; the offset is negative if the camera is in front."""
+    """Plane of all points p with x p_x + y p_y + z p_z = offset.
+
+    The offset is negative if the camera is in front of the plane.
+    """
 
     x: float
     y: float
@@ -243,8 +246,10 @@ def _fill(
     """Fill a convex polygon that lies in a plane.
 
     A pixel is filled if its middle is inside. If the middle is on an edge, the pixel belongs to the
-    polygon to the right of the edge or below it. In the plane, the inverse depth at a pixel (u, v),
-    relative to the middle of the image, is (x u/f + y v/f + z) / offset with focal length f.
+    polygon to the right of the edge or below it.
+
+    At a pixel (u, v), relative to the middle of the image, the inverse depth of the plane is
+    (x u/f + y v/f + z) / offset. The focal length is f; the other values are fields of `plane`.
 
     Args:
         rows: First row that the polygon covers, and the row after the last one.
@@ -310,7 +315,7 @@ def draw_wires(
 
 @compiled
 def _cut_near(ends: Floats) -> bool:
-    """Clip a wire at the near plane, in place; return whether any of it lies beyond the plane."""
+    """Clip a wire at the near plane, in place; return whether any part is beyond the plane."""
     if ends[0, 2] < _NEAR_M and ends[1, 2] < _NEAR_M:
         return False
     for i in range(2):
@@ -328,7 +333,7 @@ def _trace(ends: Floats, main: int, inverse_z: Floats) -> None:
     Args:
         ends: (2, 3) u, v and 1/z of both ends.
         main: Main direction: 0 for u, 1 for v.
-        inverse_z: Image, whose second axis is the main direction.
+        inverse_z: Image to draw into; its second axis is the main direction.
     """
     first, last = (0, 1) if ends[0, main] <= ends[1, main] else (1, 0)
     width, length = inverse_z.shape

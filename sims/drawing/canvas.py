@@ -88,7 +88,7 @@ class Canvas:
         return part
 
     def finish(self) -> NDArray[np.uint8]:
-        """Show the image if there is a window, and return it, (height, width, 3)."""
+        """Return the image, (height, width, 3). If there is a window, show the image there."""
         if self._window is not None:
             self._window.blit(self._image, (0, 0))
             self.pygame.event.pump()

@@ -1,8 +1,8 @@
 """Perspective view of a scene from behind a body, drawn with pygame from back to front.
 
-Faces that lie flat on the ground are drawn first, the lowest first. Then all others are drawn, the
-farthest first. A face's distance is that of its middle, so the order can be wrong for a large face
-beside a small one. For depth images, see `sims.drawing.camera`.
+Faces that lie flat on the ground are drawn first, the lowest first. Then all other faces are drawn,
+the farthest first. The order is based on the distances to the middles of the faces, so it can be
+wrong for a large face beside a small one. For depth images, see `sims.drawing.camera`.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
 
 
 def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]:
-    """Return which spheres may be visible: those not beyond a border of the image."""
+    """Return a mask of the spheres that are not completely outside the view of the camera."""
     x_m, y_m, z_m = ((middles_m - eye.at_m) @ eye.axes).T
     seen: NDArray[np.bool_] = z_m + radii_m > _NEAR_M
     for aside_m, size_px in ((x_m, SIZE_PX[0]), (y_m, SIZE_PX[1])):
@@ -256,7 +256,7 @@ def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]
 
 
 def _seen(piece: _Piece, eye: Pose) -> Floats | None:
-    """Project a piece to a polygon in the image; return None if none of it is in front."""
+    """Project a piece to a polygon in the image; None if no part is in front of the camera."""
     corners = _before_eye((piece.corners_m - eye.at_m) @ eye.axes, closed=piece.width_m == 0)
     if len(corners) < 2:
         return None

@@ -63,7 +63,7 @@ class Overlaps(NamedTuple):
     first: NDArray[np.int64]
     """(new,) index of the first old pixel that overlaps each new one."""
     weights: Floats
-    """(new, K) share of each new pixel that each of K old pixels, from the first one on, covers."""
+    """(new, K) fraction of each new pixel that each of K old pixels covers, starting at `first`."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
@@ -103,7 +103,7 @@ def shrink(
         sums[:], hits[:] = 0.0, 0.0
         for k in range(rows.weights.shape[1]):
             line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
-            # Most new rows overlap fewer than K old ones; their last weights are 0.
+            # Most new rows overlap fewer than K old rows; the other weights are 0.
             if weight > 0.0:
                 for column in range(width):
                     sums[column] += weight * line[column]
@@ -158,7 +158,7 @@ class DepthCamera:
         return inverse
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Render the small image: (h, w) meters along each ray, infinity where it hits nothing."""
+        """Render the small image: (h, w) meters along each ray; infinity if a ray hits nothing."""
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
         if len(self._wires):

@@ -43,7 +43,7 @@ class FollowView:
         frames_per_s: int,
         floor: Iterable[Shape] = (),
     ) -> None:
-        """Prepare the static shapes. Shapes in `floor` are drawn below all others.
+        """Prepare the static shapes. Shapes in `floor` are drawn below all other shapes.
 
         The image shows `width_m` meters of the ground from left to right.
 
@@ -61,7 +61,7 @@ class FollowView:
     def draw(self, moving: Iterable[Shape], body: Body, text: str) -> None:
         """Draw the body, its surroundings, and a line of text at the bottom.
 
-        Before it calls `show`, the caller may draw more on `canvas`.
+        The caller may draw more on `canvas` before the call of `show`.
         """
         lifted = [
             patch._replace(top_m=patch.top_m + body.height_m) if patch.frame != "map" else patch
@@ -74,7 +74,7 @@ class FollowView:
         self.canvas.text(text, (12, SIDE_PX - 26), 26, _INK)
 
     def show(self) -> NDArray[np.uint8]:
-        """Show the image if there is a window, and return it, (600, 600, 3)."""
+        """Return the image, (600, 600, 3). If there is a window, show the image there."""
         return self.canvas.finish()
 
     def close(self) -> None:

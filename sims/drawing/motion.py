@@ -1,4 +1,4 @@
-"""Motion of a vehicle between two poses, for sims that do not compute it."""
+"""Motion of a vehicle between two poses, for sims that compute only these two poses."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ Pose = tuple[float, float, float]
 def arc(start: Pose, end: Pose, share: float) -> Pose:
     """Return a pose on the way from `start` to `end` at constant speed and yaw rate.
 
-    The way is an arc. With the turn w, its chord up to a share s of the way has the length
-    s sinc(s w / 2) / sinc(w / 2), relative to the whole chord, and is rotated by (s - 1) w / 2.
+    The way is an arc with the turn angle w. Compare the chord of a fraction s of the arc with the
+    chord of the whole arc: the ratio of their lengths is s sinc(s w / 2) / sinc(w / 2), and the
+    angle between them is (s - 1) w / 2. Here, sinc(a) = sin(a) / a.
 
     Args:
         start: First pose.
@@ -37,7 +38,7 @@ def arc(start: Pose, end: Pose, share: float) -> Pose:
 
 
 def car_moments(start: Pose, end: Pose, duration_s: float) -> list[Sequence[Frame]]:
-    """Return the frames of a car on an arc, at equal intervals of at most 0.05 s and at its end."""
+    """Return frames of a car on an arc, at equal intervals of at most 0.05 s up to the end."""
     count = math.ceil(duration_s / LONGEST_S - 1e-9)
     return [(car_frame(*arc(start, end, (1 + k) / count)),) for k in range(count)]
 

@@ -90,7 +90,7 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
-    """Return the `points` of a line through positions; repeat a single position."""
+    """Return the `points` of a line through positions; a single position is used twice."""
     return np.array(points if len(points) > 1 else [*points, *points])
 
 
@@ -101,15 +101,16 @@ def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
 
 
 def coarse(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round points that change at each step to 1/8 m; short numbers take little space in logs."""
+    """Round points that change at each step to 1/8 m, so that they compress well in logs."""
     rounded: NDArray[np.float64] = np.rint(points_m * _COARSE_PER_M) / _COARSE_PER_M
     return rounded
 
 
 def cut(segments_m: NDArray[np.float64], longest_m: float) -> NDArray[np.float64]:
-    """Cut segments into pieces of `longest_m` each, the last one shorter.
+    """Cut each segment into pieces of `longest_m`; the last piece may be shorter.
 
-    Viewers do not draw a line that begins behind the camera, so that long lines disappear there.
+    Viewers do not draw a line that begins behind the camera, even if the rest of the line is in
+    front. With short pieces, little is missing.
 
     Args:
         segments_m: (2 N, K) starts and ends in turn.

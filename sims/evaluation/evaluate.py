@@ -41,7 +41,7 @@ class PolicyScore:
         interval: 95 % interval of the mean, over seeds and episodes.
         normalized_score: Score on the scale random = 0, pilot = 1; None without a pilot.
         normalized_interval: Interval on the same scale.
-        successes: Reasons that count as success; None if the environment does not define them.
+        successes: End reasons that count as success; None if the environment defines none.
     """
 
     policy: str
@@ -139,7 +139,7 @@ def evaluate(
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
-    """Add the score on the scale random = 0, pilot = 1; without a pilot, change nothing."""
+    """Normalize a score to the scale random = 0, pilot = 1; without a pilot, it is unchanged."""
     if pilot is None or pilot.mean_return == random.mean_return:
         return score
     span = pilot.mean_return - random.mean_return
@@ -157,7 +157,7 @@ def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None
 
 @dataclass(frozen=True)
 class Improvement:
-    """Probability that an episode of one policy has a higher return than one of another.
+    """Probability that one policy's episode has a higher return than another policy's episode.
 
     Attributes:
         better: Policy with the higher mean return.

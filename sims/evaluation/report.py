@@ -152,7 +152,8 @@ def evaluation_page(
         compared: Comparisons of pairs of policies.
         world: Static shapes of the map.
         behavior: Mean, low and high of the logged episodes' returns, if there is a log.
-        recorded: Log with the episodes of the first policies, and the number of those policies.
+        recorded: Log with the episodes of the first policies in `scores`, and the number of these
+            policies.
         curves: Learning curves of the policies.
 
     Raises:

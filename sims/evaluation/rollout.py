@@ -38,7 +38,8 @@ class EpisodeResult:
         seed: Seed of the reset.
         total_reward: Undiscounted return.
         length: Number of transitions.
-        reason: Reason of the end; `interrupted` if the maximum number of steps was reached.
+        reason: Reason why the episode ended; `interrupted` if the maximum number of steps was
+            reached.
         positions: (length + 1, 2) x and y, meters; (0, 2) if the environment does not report them.
     """
 
@@ -80,8 +81,8 @@ class EpsilonGreedy:
     def choose(self, observation: Any) -> tuple[Any, float]:
         """Return the action for one observation, and the probability of that action.
 
-        Each of A actions has the probability epsilon / A, plus 1 - epsilon if it is the policy's
-        own. The probability is NaN if actions are not discrete.
+        Each of the A actions has the probability epsilon / A; the policy's greedy action has an
+        additional 1 - epsilon. If actions are not discrete, the returned probability is NaN.
         """
         greedy = None if self.policy is None else self.policy.act(_batch(observation))[0]
         explores = self.epsilon > 0 and self._random.random() < self.epsilon
@@ -191,12 +192,13 @@ def batch_rollout(
     seeds: Sequence[int],
     on_episode: Callable[[EpisodeResult], None] | None = None,
 ) -> list[EpisodeResult]:
-    """Run one greedy episode for each seed in parallel; the results equal `run_episode`'s.
+    """Run one greedy episode for each seed in parallel, with the same results as `run_episode`.
 
-    An environment whose episode has ended is still stepped; its later episodes are ignored.
+    All environments are stepped until the last of these episodes ends. Further episodes that start
+    in an environment are ignored.
 
     Args:
-        envs: Vector environment of one copy per seed, in autoreset mode `NextStep`.
+        envs: Vector environment with one environment per seed, in autoreset mode `NextStep`.
         policy: Policy for batches of observations.
         seeds: Seeds of the episodes.
         on_episode: Function called after each episode, in the order in which they end.
@@ -228,10 +230,10 @@ def batch_rollout(
 
 
 def check_fit(policy: Any, env: gym.Env[Any, Any]) -> None:
-    """Validate that a trained policy has the spaces of an environment.
+    """Validate that the spaces of a trained policy and of an environment match; see `same_form`.
 
     Raises:
-        PolicyError: The policy was trained on other spaces.
+        PolicyError: The policy was trained on spaces that do not match.
     """
     for role in ("observation_space", "action_space"):
         trained, actual = getattr(policy, role, None), getattr(env, role)

@@ -74,7 +74,8 @@ def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
 
     With several seeds, two intervals are combined: Student's t over the means of the seeds, and
     bootstrap-t over the means of the starts. The squared distances of their limits from the mean
-    are added, because neither interval covers the variation of the other.
+    are added, because the first interval covers only the variation between seeds, and the second
+    only the variation between starts.
 
     Args:
         returns: (S, E) returns.
@@ -106,10 +107,10 @@ def bootstrap_interval(
 
 
 def improvement_probability(first: Floats, second: Floats) -> float:
-    """Return the probability that an episode of `first` has a higher return than one of `second`.
+    """Return the probability that a return from `first` is higher than a return from `second`.
 
-    Ties count half: this is the Mann-Whitney statistic divided by the number of pairs, 0.5 for
-    equal policies.
+    A tie counts as half a win. The result is the Mann-Whitney U statistic divided by the number of
+    pairs; it is 0.5 for equal policies.
 
     Args:
         first: (S, E) returns of the first policy.
@@ -148,8 +149,9 @@ def _student_interval(values: Floats) -> tuple[float, float]:
 def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
     """Return the 95 % bootstrap-t interval of the mean of N > 1 values.
 
-    Few or equal values have few different bootstrap samples. Therefore, the interval is at least as
-    wide as that of Student's t on each side. Samples without a standard error are excluded.
+    If there are few values or many are equal, the bootstrap samples differ little. Therefore, the
+    interval is at least as wide on each side as the interval of Student's t. Samples whose standard
+    error is almost 0 are excluded.
     """
     random = np.random.default_rng(seed)
     count, mean, error = len(values), values.mean(), _standard_errors(values)

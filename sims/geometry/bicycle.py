@@ -34,13 +34,13 @@ def roll(
     wheelbase_m: float,
     duration_s: float,
 ) -> Motion:
-    """Advance a bicycle by one explicit Euler step, which turns it by at most 90 degrees.
+    """Advance a bicycle by one explicit Euler step, which must turn it by at most 90 degrees.
 
     Let beta be the slip angle, l half the wheelbase and v the speed. Then x' = v cos(yaw + beta),
     y' = v sin(yaw + beta), yaw' = v sin(beta) / l, and v' = acceleration. Polack, Altche,
     d'Andrea-Novel and de La Fortelle, "The kinematic bicycle model: a consistent model for planning
     feasible trajectories for autonomous vehicles?", IEEE IV 2017, eq. 1. cos(yaw + beta) and
-    sin(yaw + beta) are expanded into products, since only the sine of beta is given.
+    sin(yaw + beta) are expanded into products, because the argument `slip_sine` is sin(beta).
     """
     cos, sin = motion.heading
     slip_cosine = math.sqrt(1.0 - slip_sine * slip_sine)
@@ -75,8 +75,9 @@ def steering_of(slip_sine: float) -> float:
 def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) -> float:
     """Return sin(beta) for a turn with the given lateral acceleration and speed.
 
-    The radius of the turn is l / sin(beta), so the lateral acceleration is v^2 sin(beta) / l. If
-    the speed is too low for this acceleration, the result is 1.
+    Let l be half the wheelbase and v the speed. The radius of the turn is l / sin(beta), so the
+    lateral acceleration is v^2 sin(beta) / l. If the speed is too low for the given acceleration,
+    the result is 1.
     """
     least = 0.5 * wheelbase_m * lateral_m_s2
     return least / max(speed_m_s * speed_m_s, least)

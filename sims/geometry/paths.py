@@ -66,10 +66,10 @@ def wrap_angle(angle_rad: float) -> float:
 
 @inlined
 def sine(angle_rad: float) -> float:
-    """Return the sine of an angle of at most 45 degrees, accurate to about one bit.
+    """Return the sine of an angle from -45 to 45 degrees, accurate to about the last bit.
 
-    Has no branches or calls, so that the compiler can vectorize loops. The series is
-    x - x^3/3! + x^5/5! - ...; the first omitted term is below 6e-17 of the sine.
+    The function has no branches or calls, so that the compiler can vectorize loops. The series is
+    x - x^3/3! + x^5/5! - ...; relative to the sine, the first omitted term is below 6e-17.
     """
     square = angle_rad * angle_rad
     rest = 1.0 / 6227020800.0 - square * (1.0 / 1307674368000.0)
@@ -83,7 +83,7 @@ def sine(angle_rad: float) -> float:
 
 @inlined
 def cosine(angle_rad: float) -> float:
-    """Return the cosine of an angle of at most 45 degrees, computed as in `sine`.
+    """Return the cosine of an angle from -45 to 45 degrees, computed as in `sine`.
 
     The series is 1 - x^2/2! + x^4/4! - ...; the first omitted term is below 2e-18.
     """
@@ -110,11 +110,11 @@ class Heading(NamedTuple):
 
 @inlined
 def heading_of(yaw_rad: float) -> Heading:
-    """Return the direction of a yaw angle, accurate to about one bit.
+    """Return the direction of a yaw angle, accurate to about the last bit.
 
     Like `sine`, the function has no branches or calls. It splits the angle into quarter turns and
     a remainder of at most 45 degrees, and computes the sine and cosine of the remainder. The number
-    of quarter turns determines their order and signs.
+    of quarter turns determines which of the two is the cosine of the yaw, and their signs.
     """
     quarters = np.floor(yaw_rad * (2.0 / math.pi) + 0.5)
     rest_rad = (yaw_rad - quarters * _QUARTER_RAD) - quarters * _QUARTER_REST_RAD
@@ -133,7 +133,7 @@ def heading_of(yaw_rad: float) -> Heading:
 def turned(heading: Heading, angle_rad: float) -> Heading:
     """Rotate a direction counter-clockwise by an angle from -90 to 90 degrees.
 
-    Uses the angle addition formulas and cos(a) = 1 - 2 sin^2(a / 2).
+    The function uses the angle addition formulas and cos(a) = 1 - 2 sin^2(a / 2).
     """
     half = sine(0.5 * angle_rad)
     cos = 1.0 - 2.0 * half * half

@@ -39,7 +39,7 @@ def minus(a: Vector, b: Vector) -> Vector:
 
 @inlined
 def times(factor: float, a: Vector) -> Vector:
-    """Return factor a."""
+    """Return the vector a multiplied by `factor`."""
     return Vector(factor * a.x, factor * a.y, factor * a.z)
 
 

@@ -95,8 +95,8 @@ def courses_of(network: Any) -> tuple[Course, ...]:
 def _edges(graph: dict[str, dict[str, list[Any]]]) -> Iterator[tuple[str, str, list[Any]]]:
     """Yield start node, end node and lanes of each edge, in the direction of travel.
 
-    The first start node is the one without a predecessor. A closed road has no such node; there it
-    is the first node of the graph.
+    The first edge starts at the node without a predecessor. A closed road has no such node; its
+    first edge starts at the first node of the graph.
     """
     reached = {end for ends in graph.values() for end in ends}
     first = next((node for node in graph if node not in reached), next(iter(graph)))

@@ -86,7 +86,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     ## Observation Space
 
-    `observation="state"`: `Box(-4, 4)` of 15 float32; values beyond are clipped.
+    `observation="state"`: `Box(-4, 4)` of 15 float32; values are clipped to these bounds.
 
     | Index | Observation | Unit |
     |---|---|---|
@@ -186,7 +186,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._last_action = 0
         self._reward = 0.0
         self._trail_m: deque[tuple[float, float]] = deque(maxlen=TRAIL_LENGTH)
-        # Car before the last step.
+        # State of the car before the last step.
         self._before: Car | None = None
         self._locate()
 
@@ -354,10 +354,10 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         return (car_frame(*self._car.pose),)
 
     def motion(self) -> list[tuple[float, Sequence[Frame]]]:
-        """Return the car's frame at moments within the last step, on the arc between its ends.
+        """Return the car's frames within the last step, on an arc from its first to its last pose.
 
-        Each element consists of the seconds before the end of the step, and the frames; moments
-        are at most 0.05 s apart, in order of time. There are none after `reset`.
+        Each element consists of the seconds before the end of the step, and the frames at that
+        time. Elements are in order of time, at most 0.05 s apart. After `reset`, the list is empty.
         """
         if self._before is None:
             return []

@@ -23,9 +23,10 @@ class HighwayPilot(ScriptedPilot[HighwayLaneEnv]):
     def choose(self) -> int:
         """Choose the action for the current state of the car.
 
-        The circle that is tangent to the car's heading and passes through a point at distance d, l
-        to the left, has the radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path
-        tracking algorithm", CMU-RI-TR-92-01, 1992.
+        Let a point ahead be at distance d from the car, and l meters to the left of its heading.
+        The circle through this point that is tangent to the heading has the radius d^2 / (2 l).
+        Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01,
+        1992.
         """
         car, course = self.sim.car, self._free_course()
         along_m = course.nearest(car.x_m, car.y_m).along_m

@@ -72,7 +72,7 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
 
 def _edges(network: Any) -> Iterator[tuple[Any, Floats, Floats]]:
-    """Yield each lane with its left and right edge, as (N, 2) map points about 3 m apart."""
+    """Yield each lane and its two edges, left first: (N, 2) points in the map, about 3 m apart."""
     for lane in network.lanes_list():
         along_m = np.linspace(0.0, lane.length, 2 + int(lane.length / PIECE_M))
         half_m = [lane.width_at(each) / 2 for each in along_m]

@@ -2,7 +2,8 @@
 
 Cars are stored in blocks, as structures of arrays. The loops over a block have no branches and no
 calls. All offsets are constants, so the compiler can prove that cars do not overlap in memory, and
-vectorizes the loops. A step takes a third of the time of single cars and has bit-identical results.
+vectorizes the loops. A step takes a third of the time that the same cars take when
+they are stepped one by one. The results are bit-identical.
 """
 
 from __future__ import annotations

@@ -65,7 +65,10 @@ def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
 
 
 def street_bounds(half_width_m: float) -> NDArray[np.float64]:
-    """Return the streets as (K, 4) rectangles x0, y0, x1, y1, meters, including their ends."""
+    """Return the streets as (K, 4) rectangles x0, y0, x1, y1, meters.
+
+    Each rectangle extends `half_width_m` beyond both ends of the street's leg.
+    """
     ends = np.array(streets())
     return np.hstack([ends.min(axis=1) - half_width_m, ends.max(axis=1) + half_width_m])
 

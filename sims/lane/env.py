@@ -126,13 +126,14 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     - Speed is divided by about 300 m/s, so its term is always near -0.5. The reward is near 0 for a
       fast car in the middle of the lane, and below -0.5 per second at an offset of 0.3 m. A whole
       lap has a return far below -3, but leaving the road at once has a return of only -3.
-    - The limit of -1 on the reward is a second limit on the distance: 1.1 m at rest, more at higher
-      speed, and none from 10 m/s.
+    - The limit of -1 on the reward is a second limit on the distance. It is 1.1 m at rest and
+      increases with the speed; at 10 m/s or more, there is no second limit.
     - The lines are infinite. A car that leaves the course along the extension of a leg gets the
       same reward as on the course.
     - Standing still with the brake never ends an episode, and costs less than most driving.
     - In the published code, a collision ends an episode only during the action straight.
-    - A second is too long for corrections: at 15 m/s, any steering action leaves the lane.
+    - A decision of one second is too long for corrections: at 15 m/s, any steering action makes
+      the car leave the lane.
     - The image encoding uses half of its values for distances of 1 to 2 m.
 
     The car and the town differ from the published ones, and images are downsampled by averaging

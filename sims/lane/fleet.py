@@ -90,7 +90,7 @@ class LaneFleet(Fleet):
         return Car._make(self._cars[i, :STARTED_AT].tolist())
 
     def substeps(self, before: Car, action: int) -> list[Car]:
-        """Return a car after each 0.05 s of a decision; the last one is the result of the step."""
+        """Return the states of a car after each 0.05 s of a decision, including its end."""
         if not self._classic:
             return [drive(before, action, 1 + k) for k in range(SUBSTEPS)]
         cars = [before]
@@ -143,7 +143,7 @@ class LaneFleet(Fleet):
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)
         if self._depth_m:
             self._depth_m.clear()
-        # A literal is faster than `dict(zip(CAR_INFO, ...))`.
+        # A dict display is faster than `dict(zip(CAR_INFO, ...))`.
         info = {
             "lateral_offset_m": offset_m,
             "heading_error_rad": heading_error_rad,
@@ -161,7 +161,7 @@ class LaneFleet(Fleet):
         kind, outcome = (self._on_line, self._classic), (self.rewards, self.ends, self._states)
         return ready(start_car, self._shares, *kind, self._cars, *outcome, examples=(0,))
 
-    # A fleet of one car uses the next function.
+    # Only a fleet of one car uses `_drive_only`.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], tuple[float, int, float, float, float, float]]:

@@ -52,7 +52,7 @@ def touches(car: Car) -> bool:
 def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
     """Return the distance from a point to the nearest obstacle in a direction, at most 100 m.
 
-    This is the slab method: inside a box, a ray is between both pairs of parallel sides.
+    The slab method is used: a point of the ray is in a box if it is between both pairs of sides.
     """
     per_x, per_y = _per_meter(math.cos(angle_rad)), _per_meter(math.sin(angle_rad))
     nearest_m = FAR_M
@@ -68,5 +68,5 @@ def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
 
 @compiled
 def _per_meter(share: float) -> float:
-    """Return 1 / share; if that is too large, return `_HUGE` with the same sign."""
+    """Return 1 / share, with the absolute value limited to `_HUGE`."""
     return 1.0 / share if abs(share) * _HUGE > 1.0 else math.copysign(_HUGE, share)

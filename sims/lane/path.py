@@ -78,7 +78,10 @@ def course_next(leg: float) -> float:
 def course_point_ahead(
     leg: Leg, following: Leg, rest_m: float, ahead_m: float
 ) -> tuple[float, float]:
-    """Return the point (x, y), meters, `ahead_m` (less than `LONGEST_LOOK_M`) after a position."""
+    """Return the point (x, y), meters, at a distance `ahead_m` along the course from a position.
+
+    The position is `rest_m` after the start of `leg`; `ahead_m` must be less than `LONGEST_LOOK_M`.
+    """
     on_leg_m = rest_m + ahead_m
     is_beyond = on_leg_m >= leg.length_m
     on_leg_m = on_leg_m - leg.length_m if is_beyond else on_leg_m

@@ -39,9 +39,9 @@ HORIZON = 12
 def pursue(car: Car) -> int:
     """Choose an action by pure pursuit; brake for the next corner if necessary.
 
-    The circle that is tangent to the car's heading and passes through a point at distance d, l to
-    the left, has the radius d^2 / (2 l). Coulter, "Implementation of the pure pursuit path tracking
-    algorithm", CMU-RI-TR-92-01, 1992.
+    Let a point ahead be at distance d from the car, and l meters to the left of its heading. The
+    circle through this point that is tangent to the heading has the radius d^2 / (2 l). Coulter,
+    "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992.
     """
     leg = leg_at(COURSE, car.along_m)
     corner_m = COURSE.along_m[leg + 1] - car.along_m % COURSE.length_m
@@ -78,7 +78,10 @@ def pursuit_value(car: Car, substeps: int = SUBSTEPS) -> float:
 
 @compiled
 def choose(car: Car, substeps: int = SUBSTEPS) -> int:
-    """Choose the pursuit action if pursuit stays safe; else search for two other actions first.
+    """Choose the pursuit action if `HORIZON` decisions of pursuit are safe; else search.
+
+    The search tries all pairs of two actions, each followed by pursuit. The result is the first
+    action of the best pair.
 
     Args:
         car: State of the car.

@@ -75,7 +75,7 @@ _LIMITS: tuple[float, ...] = tuple(OBSERVATION_LIMIT.tolist())
 
 
 class Car(NamedTuple):
-    """State of one car on the course. Fleets store it as 9 numbers in an array's row."""
+    """State of one car on the course. Fleets store it as 9 numbers in a row of an array."""
 
     x_m: float
     y_m: float
@@ -115,7 +115,7 @@ def slip(steering: float, speed_m_s: float) -> float:
     60 km/h and 70 % at 120 km/h. The slip angle is limited so that the lateral acceleration is at
     most 9 m/s^2.
     """
-    # The curve is convex, so it is the maximum of its straight lines.
+    # The curve is convex and consists of straight lines, so it is the maximum of these lines.
     share = max(
         max(
             1.0 - _FALL_1 * speed_m_s,
@@ -135,7 +135,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Return the car with this motion. Its position on the path is searched near `near_m`."""
+    """Return the car with this motion; search near `near_m` for its position along the path."""
     place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,

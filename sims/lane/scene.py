@@ -41,7 +41,7 @@ DASH_M = 3.0
 
 
 def _asphalt() -> NDArray[np.float64]:
-    """Return the corners of two triangles for each paved cell, (6 times the cells, 3)."""
+    """Return the corners (6 C, 3) of the triangles of C paved cells, two triangles per cell."""
     x_m, y_m, paved = course.pavement(course.RAIL_OFFSET_M)
     corners = []
     for i, j in np.argwhere(paved):

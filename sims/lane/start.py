@@ -82,8 +82,8 @@ def start_car(
         on_line: Whether to start on the start line instead of anywhere.
         classic: Whether a car on the start line first drives straight ahead for a second.
         cars: (N, 10) output: the fields of `Car`, then its distance along the path at the start.
-        rewards: (N,) output: 0.
-        ends: (N,) output: DRIVING.
+        rewards: (N,) output; set to 0 for car i.
+        ends: (N,) output; set to DRIVING for car i.
         observations: (N, 12) output.
         i: Index of the car.
     """

@@ -62,7 +62,10 @@ def ground_triangles() -> Floats:
 
 
 def grid_triangles(x_m: Floats, y_m: Floats) -> Floats:
-    """Return the ground of an NED grid in ROS axes, (T, 3, 3) meters, cell by cell, facing up."""
+    """Return the triangles of the ground for the cells of a grid, (T, 3, 3) meters, facing up.
+
+    The grid's x and y are in NED axes. The triangles are in ROS axes, ordered by cell.
+    """
     corners = np.array([[(x, y, -ground_height(x, y)) for y in y_m] for x in x_m])
     here, north = corners[:-1, :-1], corners[1:, :-1]
     east, both = corners[:-1, 1:], corners[1:, 1:]
@@ -110,7 +113,7 @@ class DroneCamera:
         self._camera = DepthCamera(world_mesh(), LENS, IMAGE_SHAPE, world_wires())
 
     def image_m(self, drone: Drone) -> NDArray[np.float32]:
-        """Return (84, 84) distances along each ray, meters; infinity without a surface."""
+        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
         return self._camera.image_m(*self.pose(drone))
 
     def without_wires(self, drone: Drone) -> Floats:

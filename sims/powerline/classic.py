@@ -55,7 +55,10 @@ def classic_end(position_m: Vector, hit: bool) -> int:
 
 @compiled
 def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
-    """Return the reward (exp(-d) - 0.5) + (speed - 0.5); -10 beyond 7 m, -100 for a collision."""
+    """Return the reward (exp(-d) - 0.5) + (speed - 0.5); -10 beyond 7 m, -100 for a collision.
+
+    The distance d to the nearest infinite line is in meters, and the speed is in m/s.
+    """
     end = classic_end(position_m, hit)
     if end == COLLISION:
         return COLLISION_REWARD
@@ -66,7 +69,11 @@ def classic_reward(position_m: Vector, speed_m_s: float, hit: bool) -> float:
 
 @compiled
 def classic_decide(plant: int, flight: Flight, action: int) -> tuple[Flight, bool]:
-    """Fly 5 s at the measured velocity plus a step; return the flight, and whether it collided."""
+    """Fly for 5 s; the command is the measured velocity plus the velocity change of the action.
+
+    Returns:
+        State of the drone, and whether the drone collided.
+    """
     step = times(CLASSIC_VELOCITY_STEP_M_S, vector_at(DIRECTIONS[action], 0))
     command = plus(flight.drone.velocity_m_s, step)
     wind = plus(flight.wind_m_s, flight.gust_m_s)

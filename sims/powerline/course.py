@@ -204,8 +204,9 @@ def distance_to_segment(position_m: Vector, start_m: Floats, end_m: Floats) -> f
 def catenary(span_m: float, rise_m: float, sag_m: float, x_m: Floats) -> Floats:
     """Return the heights of a hanging wire relative to its first end, meters.
 
-    y = a cosh((x - x0) / a) + c. For a given a, x0 follows from the rise. Bisection finds the a
-    for `sag_m`, the distance of the wire's middle below the straight line between its ends.
+    The curve is y = a cosh((x - x0) / a) + c, where x0 follows from a and the rise. Bisection finds
+    the value of a that results in the sag `sag_m`: the distance of the wire's middle below the
+    straight line between its ends.
 
     Args:
         span_m: Horizontal distance between the ends.

@@ -83,9 +83,9 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     `start="line"`: the drone has flown for 5 s with the command (1, -0.5, -1) m/s from the first
     point of the line, with an offset of up to 0.2 m on each axis.
-    `start="anywhere"`: half of the episodes start as above. The others start at a random position
-    on the line, except its last 20 m, with an offset of up to 1 m. The drone flies along the line
-    at 0 to 5 m/s; the velocity is rounded to 0.5 m/s on each axis.
+    `start="anywhere"`: half of the episodes start as with `"line"`. The other half start at a
+    random position on the line, except its last 20 m, with an offset of up to 1 m. The drone flies
+    along the line at 0 to 5 m/s; the velocity is rounded to 0.5 m/s on each axis.
     `reset(options={"pose": (x_m, y_m, z_m)})`, optionally with the velocity in m/s as three more
     numbers, starts at that pose; the velocity is also the first command.
 
@@ -104,9 +104,9 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     `rules="classic"` are the published rules, by default for a point mass that follows its command
     with a lag of 0.5 s. A decision lasts 5 s; actions change the *measured* velocity by
     0.25 m/s. The reward is (exp(-d) - 0.5) + (speed - 0.5), with the distance d to the nearest of
-    the *infinite* lines through the legs. An episode terminates beyond 7 m with -10, and at a
-    collision with -100. It starts after 5 s of flight with the command (1, -0.67, -0.8) m/s. Known
-    faults:
+    the *infinite* lines through the legs. An episode starts after 5 s of flight with the
+    command (1, -0.67, -0.8) m/s. It terminates beyond 7 m with the reward -10, and at a collision
+    with the reward -100. Known faults:
 
     - Speed is rewarded in any direction: flying back and forth has a higher return than following
       the line.
@@ -114,7 +114,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
     - The line has no end: flying beyond the last tower is also rewarded.
     - Hovering on the line costs nothing and never ends the episode; flying backward is rewarded
       like flying forward.
-    - Commands that change the measured velocity drift: the effects of gusts and lag persist.
+    - Actions change the measured velocity, so the effects of gusts and lag on the velocity persist
+      in the next command.
     - Decisions of 5 s are too long for corrections: at 5 m/s, the drone flies 25 m, but an episode
       terminates 7 m from the line.
     - The image encoding spends half of its values on distances of 1 to 2 m.
@@ -168,7 +169,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return {**powerline_scene.telemetry(self.flight), **self.fleet.info(0)}
 
     def depth_image_m(self) -> NDArray[np.float32]:
-        """Return (84, 84) distances along the camera's rays, meters; infinity without surface."""
+        """Return (84, 84) distances along each ray, meters; infinity where a ray hits nothing."""
         return self.fleet.depth_image_m(0)
 
     def depth_focal_px(self) -> tuple[float, float]:

@@ -103,10 +103,10 @@ class PowerlineFleet(Fleet):
         return flight_at(self._flights[i])
 
     def drones_from(self, before: Flight) -> list[Drone]:
-        """Return the only drone after each 0.05 s of its last decision, which began at `before`.
+        """Return the states of the only drone after each 0.05 s of its last decision.
 
-        The last one is its current state. A drone whose episode ended within the decision stays at
-        its place for the rest of it.
+        The decision began in the state `before`; the last returned state is the current one. If the
+        episode ended during the decision, the drone keeps its state for the rest of the decision.
         """
         after = self.flight(0)
         wind_m_s = plus(after.wind_m_s, after.gust_m_s)
@@ -169,7 +169,7 @@ class PowerlineFleet(Fleet):
         return {key: np.stack([each[key] for each in seen]) for key in ("depth", "motion")}
 
     def depth_image_m(self, i: int) -> NDArray[np.float32]:
-        """Return (84, 84) distances along the rays of drone i, meters; infinity for no surface."""
+        """Return (84, 84) distances along the rays of drone i, meters; infinity without a hit."""
         if i not in self._depth_m:
             if self._camera is None:
                 self._camera = DroneCamera(self.camera_view)

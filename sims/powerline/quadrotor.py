@@ -153,6 +153,7 @@ def fly(
 def lag(drone: Drone, command_m_s: Vector, duration_s: float) -> Drone:
     """Advance a point mass by the exact solution of v' = (c - v) / T.
 
+    The velocity is v, the command c, the position x, and the lag T. The solution is
     v(t) = c + (v - c) e and x(t) = x + c t + (v - c) T (1 - e), with e = exp(-t / T).
     """
     left = math.exp(-duration_s / POINT_LAG_S)
@@ -213,9 +214,10 @@ def rotor_commands(drone: Drone, wanted_m_s2: Vector) -> Rotors:
     """Return the commanded thrusts of the rotors, newtons, for a desired acceleration.
 
     The desired attitude is the shortest rotation from upright that points the body's z axis along
-    g - a. The attitude error determines the commanded angular velocity. The error of the angular
-    velocity determines the torques. Mellinger and Kumar describe this cascade in "Minimum snap
-    trajectory generation and control for quadrotors", ICRA 2011.
+    g - a, with gravity g and the desired acceleration a. The attitude error determines the
+    commanded angular velocity. The error of the angular velocity determines the torques. Mellinger
+    and Kumar describe this cascade in "Minimum snap trajectory generation and control for
+    quadrotors", ICRA 2011.
     """
     down = minus(Vector(0.0, 0.0, GRAVITY_M_S2), wanted_m_s2)
     size = norm(down)
@@ -261,9 +263,11 @@ def _limited(thrust_n: float) -> float:
 def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     """Advance a rigid body by 2 ms with the semi-implicit Euler method.
 
-    m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega, q' = q (0, omega) / 2, and
-    each thrust follows its command with a lag of 20 ms. The new rates and velocity advance attitude
-    and position.
+    The equations are m v' = m g + R f + m d (w - v), J omega' = torque - omega x J omega and
+    q' = q (0, omega) / 2. Here, m is the mass, v the velocity, g gravity, R the rotation from body
+    to world axes, f the total thrust in body axes, d the drag coefficient, w the wind, J the
+    inertia, omega the angular velocity, and q the attitude. Each thrust follows its command with a
+    lag of 20 ms. The attitude and position are advanced with the new rates and velocity.
     """
     share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(

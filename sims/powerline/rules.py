@@ -152,11 +152,12 @@ def commanded(command_m_s: Vector, action: int) -> Vector:
 def next_gust(gust_m_s: Vector, strength_m_s: float, noise: NDArray[np.float64]) -> Vector:
     """Return the gust of the next decision, an Ornstein-Uhlenbeck process on each axis.
 
-    g' = g e + s sqrt(1 - e^2) n with e = exp(-0.5 s / 2 s) has the stationary standard deviation s.
+    The new gust is g' = g e + sigma sqrt(1 - e^2) n, whose stationary standard deviation is sigma.
+    A decision lasts 0.5 s and the time constant is 2 s, so e = exp(-0.5 / 2).
 
     Args:
         gust_m_s: Gust g of the last decision.
-        strength_m_s: Standard deviation s.
+        strength_m_s: Standard deviation sigma.
         noise: (3,) standard normal numbers n.
     """
     kept = math.exp(-DECISION_S / GUST_TIME_S)
@@ -192,7 +193,7 @@ def reward_of(furthest_m: float, after: Flight, end: int) -> float:
     It is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from the line,
     and ds is its progress beyond `furthest_m`, the maximum before the decision. The finish adds 5;
     a failure gives -5 instead. The reward decreases beyond 5 m/s. If it were constant there, an
-    agent with a discount would fly too fast, although a crash forfeits the remaining rewards.
+    agent that discounts rewards would fly too fast, although a crash forfeits further rewards.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD

@@ -64,7 +64,7 @@ def start_anywhere(random: np.random.Generator, wind: Vector) -> Flight:
     point = point_on_line(along_m)
     speed_m_s = random.uniform(0.0, MAX_SPEED_M_S)
     steps = np.rint(speed_m_s * TANGENTS[nearest_on_line(point).leg] / VELOCITY_STEP_M_S)
-    # The offset on each axis is scaled so that its length is at most NOISE_M.
+    # The factor 1 / sqrt(3) limits the length of the offset vector to NOISE_M.
     noise = random.uniform(-NOISE_M, NOISE_M, 3) / np.sqrt(3.0)
     position = Vector(*np.add(point, noise).tolist())
     return begin(position, Vector(*(VELOCITY_STEP_M_S * steps).tolist()), wind)

@@ -110,7 +110,7 @@ def _ground_under(along_m: Floats) -> Floats:
 
 
 def _middle_wire() -> tuple[Floats, Floats]:
-    """Return distances along the line, and the heights of the middle conductor there."""
+    """Return distances along the line, and heights of the middle conductor at these distances."""
     shares = np.linspace(0.0, 1.0, CHORDS + 1)
     spans = WIRES_M[len(PHASES_M) // 2 :: len(PHASES_M)]
     along_m = ALONG_M[:-1, None] + shares * np.diff(ALONG_M)[:, None]

@@ -68,7 +68,7 @@ def placed(
 ) -> Car:
     """Return a car on a track before its first step; the gate ahead is its next gate.
 
-    The car's position along the path is searched within half a lap of `near_m`.
+    The function searches for the car's position along the path within half a lap of `near_m`.
     """
     half_lap_m = 0.5 * track.path.length_m
     x_m, y_m = METERS_PER_PX * x_px, METERS_PER_PX * (IMAGE_HEIGHT_PX - y_px)

@@ -100,7 +100,7 @@ def asphalt(track: Track) -> Floats:
 def _progress(path: Path, corners_px: Floats) -> list[float]:
     """Return the distance along the path to each wall corner of one side.
 
-    The last item is the first corner again, one lap later.
+    The last item is for the first corner again, one lap later: the length of the path.
     """
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
@@ -175,7 +175,7 @@ def _along(line: Floats) -> Floats:
 
 
 def _at(values: Floats, along: Floats, places: Floats) -> Floats:
-    """Interpolate values (M, 2), known at the distances `along`, at the distances `places`."""
+    """Interpolate values (M, 2), which are given at distances `along`, to distances `places`."""
     return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
 
 

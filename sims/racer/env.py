@@ -55,7 +55,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     | 7 | forward left | +2 | 15 degrees to the left |
     | 8 | forward right | +2 | 15 degrees to the right |
 
-    `actions=5` allows actions 0 to 4; `actions=8` all except `none`, renumbered from 0.
+    `actions=5` allows actions 0 to 4; `actions=8` allows all actions except `none`,
+    renumbered from 0.
 
     ## Observation Space
 
@@ -100,15 +101,16 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     `rules="classic"` are the published rules, on a different track. They differ as follows:
 
     - Forward and back are swapped: `forward` drives in the direction opposite to ray 0, so that
-      gates can only be passed with `back`. The observed speed has the sign of `forward`.
+      gates can only be passed with `back`. The observed speed is positive in the direction in
+      which `forward` drives.
     - Rays that start at the front corners have lengths that are measured from the car's center. The
       sideways ray of the left corner points right, across the nose, and vice versa.
     - The hit point of a ray is rounded down to whole pixels, so that a car in the middle of a
       straight observes unequal distances.
     - Rays are observed as (1000 - d) / 1000; five of six values are between 0.8 and 1.
-    - A gate is passed if it is straight ahead of the car and within 20 pixels of its center
-      (rounded down), hence before the car crosses it. A gate that the car crosses otherwise can
-      never be passed.
+    - A gate is passed if it is straight ahead of the car and within 20 pixels of the car's center
+      (rounded down), hence before the car crosses it. A gate that the car crosses in any other
+      way can never be passed.
     - The reward of a crash is -1 for each wall that is hit; at the joint of two walls, it is -2.
     - The start is always exactly on the line, at rest.
     - An episode is truncated after 10,000 steps.
@@ -119,8 +121,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     - `observation`: `"rays"`.
     - `start`: `"anywhere"` or `"line"`; None means `"anywhere"`, or `"line"` in the classic rules.
     - `actions`: 5, 8 or 9.
-    - `drift`: whether the direction of travel follows the heading by at most 100 / (speed + 1)
-      degrees per step.
+    - `drift`: whether the direction of travel lags behind the heading. It turns toward the heading
+      by at most 100 / (speed + 1) degrees per step.
     - `track_seed`: None for the default track, or the seed of a random track, at least 0.
     - `render_mode`: None, `"human"` or `"rgb_array"`.
 

@@ -129,7 +129,7 @@ class RacerFleet(Fleet):
         arrays = (self._shares, self._cars, self._seen)
         return ready(start_car, self.track, self.classic, *arrays, examples=(0,))
 
-    # Functions for a fleet of one car.
+    # Only a fleet of one car uses `_drive_only`.
 
     @cached_property
     def _drive_only(self) -> Callable[[int], StepResult]:

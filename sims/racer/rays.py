@@ -41,8 +41,8 @@ def crossing(
     Args:
         x: x of the first point.
         y: y of the first point.
-        dx: x from the first point to the second.
-        dy: y from the first point to the second.
+        dx: Difference in x from the first point to the second.
+        dy: Difference in y from the first point to the second.
         line: (4,) x1, y1, x2, y2.
 
     Returns:
@@ -60,7 +60,9 @@ def crossing(
 
 @compiled
 def write_rays(car: Car, classic: bool, rays: NDArray[np.float64]) -> None:
-    """Write a car's rays (4, 18): x and y of the start, and x and y of a vector of 1000 pixels.
+    """Write a car's rays (4, 18): x, y, dx and dy.
+
+    A ray starts at (x, y) and ends at (x + dx, y + dy), 1000 pixels away.
 
     The sideways ray of the left corner points left; in the classic rules, it points right.
     """
@@ -111,9 +113,10 @@ def cast(
 
 @compiled
 def floored_distance(car: Car, line: NDArray[np.float64], share: float) -> float:
-    """Return the distance from a car's center to a point on a line, rounded to whole pixels.
+    """Return the distance from a car's center to a point on a line.
 
-    The coordinates of the point are rounded down; `share` is its position on the line, 0 to 1.
+    The coordinates of the point are rounded down to whole pixels. `share` is the position of the
+    point as a fraction of the line, 0 to 1.
     """
     hit_x = math.floor(line[0] + share * (line[2] - line[0]))
     hit_y = math.floor(line[1] + share * (line[3] - line[1]))
@@ -140,7 +143,7 @@ def floored_ray_length(
 def measure(
     walls: NDArray[np.float64], car: Car, classic: bool, lengths_px: NDArray[np.float64]
 ) -> None:
-    """Write the lengths (18,) of the car's rays; classic lengths start at the car's center."""
+    """Write the lengths (18,) of the car's rays; classic lengths are measured from its center."""
     rays = np.empty((4, RAYS))
     write_rays(car, classic, rays)
     if classic:

@@ -138,7 +138,8 @@ def sees_gate(car: Car, gate: NDArray[np.float64]) -> bool:
 def outcome_of(track: Track, before: Car, after: Car, classic: bool) -> tuple[float, int]:
     """Return a step's reward and end: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
 
-    The reward is +1 for a gate and -1 for a crash. In the classic rules, each wall hit costs 1.
+    The reward is +1 for a gate and -1 for a crash. In the classic rules, a crash has the
+    reward -1 for each wall that is hit.
     """
     hits = walls_hit(track, after)
     reward = after.gates - before.gates

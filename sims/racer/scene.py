@@ -91,7 +91,7 @@ def moving_shapes(
     return (
         shapes.trail(trail_m, 0.15),
         Shape("next_gate", "segments", NEXT_GATE, raised(gate_m, 0.04), size=(0.35, 0.0, 0.0)),
-        # Above the walls, so that the ends are visible.
+        # The rays are drawn above the walls, so that the ends of the rays are visible.
         *shapes.rays(rays_m, car_frame(car), WALL_HEIGHT_M + 0.025),
         shapes.label(speed_of(car), 2.5),
     )

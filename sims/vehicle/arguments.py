@@ -14,7 +14,7 @@ from mcaprl.errors import UnknownNameError, UsageError
 
 
 class Pose(NamedTuple):
-    """Pose and speed, in the map, at which a ground vehicle is to start."""
+    """Starting pose and speed of a ground vehicle in the map."""
 
     x_m: float
     y_m: float
@@ -61,7 +61,8 @@ def check_actions(actions: Any, vehicles: int, count: int) -> NDArray[np.int64]:
     """Validate the actions of many vehicles and return them as int64.
 
     Raises:
-        UsageError: There is not one integer for each vehicle, or one is not 0 to count - 1.
+        UsageError: The number of actions is wrong, or an action is not an integer from 0 to
+            count - 1.
     """
     numbers = np.asarray(actions)
     if numbers.shape != (vehicles,) or numbers.dtype.kind not in "iu":

@@ -133,7 +133,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
                 f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
                 " disabled: reset(options={'reset_mask': terminated | truncated}) first"
             )
-        # This step resets the episodes that have ended before.
+        # This step resets the environments whose episodes ended before this step.
         fresh, fleet = self._ended.copy(), self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():

@@ -48,7 +48,7 @@ class Draws:
         self._generators: list[Any] = [None] * count
 
     def use_generator(self, i: int, generator: np.random.Generator) -> None:
-        """Assign a generator to vehicle i. If it is a new one, drop the numbers of the old one."""
+        """Assign a generator to vehicle i. A new generator discards the numbers of the old one."""
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 

@@ -98,7 +98,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        # State after the last step, and the state before it with its action, while watched.
+        # While watched: the current state, and the state before the last step with its action.
         self._now: Any = None
         self._last_step: tuple[Any, int] | None = None
 
@@ -130,7 +130,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # This call raises the error. It is too slow for every step.
+            # This call raises the error. To save time, valid actions do not reach it.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -162,19 +162,21 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         """Return the moving frames within the last step, at most 0.05 s apart, in order of time.
 
         Each element consists of the seconds before the end of the step, and the frames at that
-        moment. There are none after `reset`, and before the first read of `trail`.
+        moment. The list is empty after `reset` and before the first read of `trail`.
         """
         if self._last_step is None:
             return []
         return before_end(self._moments(*self._last_step), self.step_duration_s)
 
     def imitate(self, fleet: AnyFleet, j: int, action: int | None) -> None:
-        """Copy the state of vehicle j of a fleet, to show it; call this after each of its steps.
+        """Copy the state of vehicle j of a fleet, so that this environment shows the vehicle.
+
+        Call this method after each step of the vehicle.
 
         Args:
             fleet: Fleet of this sim.
             j: Index of the vehicle.
-            action: Action of its last step; None after a reset.
+            action: Action of the vehicle's last step; None after a reset.
         """
         self.fleet.imitate(0, fleet, j)
         self._is_watched = True
@@ -197,7 +199,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         """
 
     def _watch(self) -> None:
-        """Keep the vehicle's position and state, and show it in mode `human`."""
+        """Store the vehicle's position and state. In mode `human`, render the vehicle."""
         self._trail.append(self.place)
         self._now = self._state()
         if self.render_mode == "human":
@@ -205,7 +207,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Return the frames within a step with the time that is left; drop those at its end.
+    """Pair the frames within a step with the time to the step's end; omit the frames at the end.
 
     Args:
         moments: Frames at equal intervals of the step, the last at its end.

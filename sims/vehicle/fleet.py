@@ -111,7 +111,10 @@ class Fleet(ABC):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, without cached properties, which refer to these arrays."""
+        """Return the state for copying or pickling, without cached properties.
+
+        Cached properties refer to the arrays of this fleet, not to those of the copy.
+        """
         kind = type(self)
         return {
             name: value

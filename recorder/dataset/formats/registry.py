@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from mcaprl.errors import LogError, UnknownNameError, UsageError
 from mcaprl.files import replacing, replacing_folder
 from mcaprl.recorder.dataset.dataset import Dataset
+from mcaprl.remote import is_url
 
 
 class Format(NamedTuple):
@@ -78,6 +79,14 @@ def recognized(path: str | Path) -> Format | None:
         return None
     readable = (form for form in FORMATS.values() if form.reads)
     return next((form for form in readable if form.module.matches(Path(path))), None)
+
+
+def other_format(name: str | Path) -> Format | None:
+    """Return the format of another tool's dataset; None for logs and what is unknown."""
+    path = Path(name)
+    if is_url(name) or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
+        return None
+    return recognized(name)
 
 
 def target_format(path: str | Path, name: str | None) -> Format:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mcaprl
 from mcaprl.cli import run
 from mcaprl.errors import LogError, SpaceError, UsageError
 from mcaprl.offline.batches.sources import open_weighted
@@ -90,3 +91,16 @@ def test_the_command_accepts_weights(capsys: pytest.CaptureFixture[str]) -> None
     assert "other data" in capsys.readouterr().err
     again = ["train-offline", "logs/a.mcap", "--out", "run", "--resume", "--other-data"]
     assert run(again) == 0
+
+
+def test_datasets_of_other_tools_and_urls_are_sources(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec", reason="needs the extra remote")
+    log = tmp_path / "lane.mcap"
+    mcaprl.record("lane", log, episodes=2)
+    mcaprl.convert(log, tmp_path / "lane.npz")
+    names = [str(tmp_path / "lane.npz"), f"file://{log}:2"]
+    data, weights = open_weighted(names)
+    assert len(data.episodes) == 4
+    assert weights.tolist() == [1.0, 1.0, 2.0, 2.0]
+    expected = mcaprl.open(log).fingerprint
+    assert [open_weighted([name])[0].fingerprint for name in names] == [expected] * 2
