@@ -57,6 +57,7 @@ def _tuned() -> dict[str, dict[str, Any]]:
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")
+@click.option("--upload", metavar="URL", help="With --record: copy the finished log to a URL.")
 @click.option(
     "--live-speed",
     default=2.0,

@@ -20,6 +20,7 @@ from mcaprl.recorder.dataset.open import open_logs
 from mcaprl.recorder.record.layout import LAYOUT_NAME
 from mcaprl.recorder.viewer.foxglove_server import DEFAULT_PORT
 from mcaprl.recorder.viewer.live_stream import DEFAULT_SPEED
+from mcaprl.remote import check_upload, upload_all
 from mcaprl.runs import run_to_resume
 from mcaprl.settings import check_settings, settings_from_json
 
@@ -149,6 +150,7 @@ def train_online(
     seed: int = 0,
     threads: int = 1,
     record: str | Path | None = None,
+    upload: str | None = None,
     sources: str | Path | Sequence[str | Path] = (),
     resume: bool = False,
     live: bool = False,
@@ -174,6 +176,8 @@ def train_online(
         seed: Seed of the first agent; agent k uses seed + k.
         threads: Number of threads of PyTorch.
         record: Output log of all transitions; with several seeds, a folder.
+        upload: URL to which the log of `record` is copied at the end of the training; with several
+            seeds, the URL of a folder.
         sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
             the agents.
         resume: Whether training continues from the checkpoints in `out`.
@@ -211,6 +215,10 @@ def train_online(
     check_least(0, seed=seed)
     check_positive(live_speed=live_speed)
     check_port(port)
+    if upload is not None:
+        check_upload(upload)
+        if record is None:
+            raise UsageError("upload needs record: there is no log to copy")
     out = Path(out)
     options = all_options(observation, rules, sim_options)
     task = choose_task(sim, algo, options, settings, preset=preset, resumed=out if resume else None)
@@ -224,7 +232,7 @@ def train_online(
             )
             stream = stack.enter_context(closing(viewers)).stream
             on_live(LiveAddress(stream.app_url, stream.url, out / LAYOUT_NAME))
-        return train_agents(
+        trained = train_agents(
             task,
             out,
             seeds=seeds,
@@ -236,6 +244,10 @@ def train_online(
             live=viewers,
             progress=progress,
         )
+    if upload is not None and record is not None:
+        folder = Path(record)
+        upload_all(sorted(folder.glob("*.mcap")) if folder.is_dir() else [folder], upload)
+    return trained
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:

@@ -172,3 +172,13 @@ def test_uploads_appear_when_complete(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="cannot upload"):
         upload(out, f"file://{tmp_path}/file/below.mcap")
+
+
+def test_online_training_uploads_its_log(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="needs the extra online")
+    url, log = f"file://{tmp_path}/there/online.mcap", tmp_path / "online.mcap"
+    train = ["train-online", "CartPole-v1", "--algo", "dqn", "--steps", "200", "--hidden", "8"]
+    assert run([*train, "--out", str(tmp_path / "run"), "--upload", url]) == 2
+    request = ["--out", str(tmp_path / "run"), "--record", str(log), "--upload", url]
+    assert run([*train, *request]) == 0
+    assert (tmp_path / "there" / "online.mcap").read_bytes() == log.read_bytes()
