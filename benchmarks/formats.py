@@ -19,12 +19,15 @@ SHARE = 0.05
 
 def tables(folder: Path) -> list[Table]:
     """Measure each format, with files in `folder`."""
-    data = vectors(TRANSITIONS)
+    data, log = vectors(TRANSITIONS), folder / "part.mcap"
+    data.save(log)
     minari = rivals.MinariFolder(folder / "minari")
     return [
         *_minari(folder, data, minari),
         *_parquet(folder, data),
         *_npz(folder, data),
+        *_hdf5(folder, data),
+        _d3rlpy(folder, log),
         _sb3(data),
     ]
 
@@ -119,6 +122,63 @@ def _npz(folder: Path, data: mcaprl.Dataset) -> list[Table]:
             rounds=3,
         ),
     ]
+
+
+def _hdf5(folder: Path, data: mcaprl.Dataset) -> list[Table]:
+    ours, theirs = folder / "ours.hdf5", folder / "theirs.hdf5"
+    return [
+        compare(
+            "Writing D4RL's HDF5",
+            [
+                Side(OURS, lambda: data.to_hdf5(ours, overwrite=True)),
+                Side("h5py, the arrays alone", lambda: _write_h5py(data, theirs)),
+            ],
+            rounds=3,
+        ),
+        compare(
+            "Reading D4RL's HDF5",
+            [
+                Side(OURS, lambda: mcaprl.Dataset.from_hdf5(ours)),
+                Side("h5py, the arrays alone", lambda: _read_h5py(theirs)),
+            ],
+            rounds=3,
+        ),
+    ]
+
+
+def _write_h5py(data: mcaprl.Dataset, path: Path) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name in ("observations", "next_observations", "actions", "rewards", "terminated"):
+            file[name] = getattr(data, name)
+
+
+def _read_h5py(path: Path) -> list[Any]:
+    import h5py
+
+    with h5py.File(path) as file:
+        return [file[name][()] for name in file]
+
+
+def _d3rlpy(folder: Path, log: Path) -> Table:
+    path = folder / "buffer.h5"
+    mcaprl.convert(log, path, overwrite=True)
+    return compare(
+        "Reading d3rlpy's file",
+        [
+            Side(OURS, lambda: mcaprl.open(path)),
+            Side("d3rlpy's ReplayBuffer.load", lambda: _load_d3rlpy(path)),
+        ],
+        rounds=3,
+    )
+
+
+def _load_d3rlpy(path: Path) -> None:
+    import d3rlpy
+
+    with path.open("rb") as file:
+        d3rlpy.dataset.ReplayBuffer.load(file, d3rlpy.dataset.InfiniteBuffer())
 
 
 def _sb3(data: mcaprl.Dataset) -> Table:
