@@ -201,7 +201,7 @@ class McapWriter(OutputFile):
         is_rare = len(records) > RARE_MESSAGE_BYTES * len(messages)
         self._store(
             memoryview(records),
-            # There are few entries, for which `struct` is faster than an array.
+            # For a small number of entries, `struct` is faster than an array.
             {id_: struct.pack(f"<{len(pairs)}Q", *pairs) for id_, pairs in entries.items()},
             (min(times), max(times)),
             self._compressors.rare if is_rare else self._compressors.mixed,
@@ -265,7 +265,7 @@ class McapWriter(OutputFile):
             raise
 
     def _copy(self, source: Path, path: Path, overwrite: bool) -> None:
-        """Create a file with the data of another one."""
+        """Create a file, and copy the records of `source` to it."""
         written = written_state(source)
         self._file, self.path, self.untouched = create(path, overwrite=overwrite), path, False
         try:
@@ -281,7 +281,9 @@ class McapWriter(OutputFile):
         self.position, self._crc = written.end, written.crc
 
     def _replace_summary(self) -> None:
-        """Replace the file, which readers may have mapped, with a copy without the summary.
+        """Replace the file with a copy that has no summary section.
+
+        The file is not changed in place, because readers may have mapped it into memory.
 
         Raises:
             LogError: The copy cannot be written; the file stays unchanged.

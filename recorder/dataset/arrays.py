@@ -1,4 +1,4 @@
-"""Conversion of arrays of transitions to columns of episodes, with inferred spaces if needed."""
+"""Conversion of transition arrays to episode columns; spaces that are not given are inferred."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def _scalars(role: str, values: Any, dtype: Any, steps: int) -> Any:
 
 
 def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy an array in a dtype that holds each of its values exactly.
+    """Copy an array to another dtype without changing any value.
 
     Args:
         where: Name of the array for the error.
@@ -178,7 +178,7 @@ def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[An
         dtype: Data type of the result.
 
     Raises:
-        SpaceError: A value changes.
+        SpaceError: The dtype cannot represent a value exactly.
     """
     if array.dtype == dtype:
         return array.copy()
@@ -192,7 +192,11 @@ def exactly(where: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[An
 def _last_steps(
     ends: NDArray[np.bool_], here: list[NDArray[Any]], there: list[NDArray[Any]]
 ) -> NDArray[np.int64]:
-    """Return the index of each episode's last transition."""
+    """Return the index of each episode's last transition.
+
+    `ends` (N,) marks the transitions with an end flag. `here` and `there` contain the observations
+    and the next observations of the N transitions, one array for each leaf.
+    """
     last = ends.copy()
     last[-1] = True
     for observation, following in zip(here, there, strict=True):
@@ -202,5 +206,5 @@ def _last_steps(
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return rows as bytes, so that NaN equals NaN."""
+    """Return rows as bytes, because two NaN values only compare as equal in this form."""
     return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)

@@ -1,9 +1,10 @@
 """Calibration of logged behavior probabilities.
 
-A log contains only the probability p of the action taken. If actions are drawn with probabilities
-p, E[1 / p] is the number of actions with p > 0. The same sum over only those steps whose p is in a
-range, divided by the number of all steps, estimates how many actions per state have a probability
-in that range. For example, an epsilon-greedy policy over nine actions has one action of high
+A log contains only the probability p of the action taken. If each action is drawn with its
+probability p, the expected value of 1 / p is the number of actions with p > 0. This also works for
+a range of probabilities: the sum of 1 / p over the steps whose p is in the range, divided by the
+number of all steps, estimates how many actions per state have a probability in the range. For
+example, an epsilon-greedy policy over nine actions has one action of high
 probability and eight of low probability.
 """
 
@@ -69,8 +70,9 @@ class Calibration:
         """Whether the probabilities are consistent with the number of actions.
 
         With A actions, the chance that a step draws an action of probability p or less is at most
-        A p. The smallest probability is checked against this bound, because a few tiny
-        probabilities inflate the standard error and so hide the problem.
+        A p. The smallest probability is checked against this bound. The mean of 1 / p is not
+        sufficient for this check, because a few tiny probabilities also increase its standard
+        error.
         """
         drawable = self.smallest * self.available * self.steps >= _LEAST_CHANCE
         return drawable and (self.actions <= self.available + _STANDARD_ERRORS * self.error + 1e-6)

@@ -24,10 +24,10 @@ class Conversions:
 
         Args:
             path: Path of the folder.
-            video: Whether images become H.264 video, which changes their pixels and so needs
-                `lossy`; default: PNG.
-            lossy: Whether what the format cannot hold is left out or converted.
-            overwrite: Whether what exists at the path is replaced.
+            video: Whether to store images as H.264 video instead of PNG. Video changes the pixels,
+                so it also needs `lossy`.
+            lossy: Whether to leave out or convert data that the format cannot store.
+            overwrite: Whether to replace an existing file or folder.
 
         Returns:
             One sentence for each thing that was left out or changed.
@@ -57,10 +57,11 @@ class Conversions:
         """Write a Minari dataset.
 
         Args:
-            path: Path of the folder, whose name is the dataset's and ends with its version, such as
-                `drive-v0`; or `minari:ID` for Minari's folder of local datasets.
-            lossy: Whether what the format cannot hold is left out or converted.
-            overwrite: Whether what exists at the path is replaced.
+            path: Path of the folder, or `minari:ID` for a dataset in Minari's local folder. The
+                name of the folder is the name of the dataset, and ends with a version, such as
+                `drive-v0`.
+            lossy: Whether to leave out or convert data that the format cannot store.
+            overwrite: Whether to replace an existing file or folder.
 
         Returns:
             One sentence for each thing that was left out or changed.
@@ -92,14 +93,14 @@ class Conversions:
         lossy: bool = False,
         overwrite: bool = False,
     ) -> list[str]:
-        """Write Parquet files, one of transitions and one of episodes.
+        """Write a folder with two Parquet files, for transitions and for episodes.
 
         Args:
             path: Path of the folder.
-            next_observations: Whether each row has its next observation, too. Other tools may need
-                it; `from_parquet` does not. It doubles the size of images.
-            lossy: Whether what the format cannot hold is left out or converted.
-            overwrite: Whether what exists at the path is replaced.
+            next_observations: Whether to add the next observation to each row. Other tools may need
+                it; `from_parquet` does not. Images then take twice the space.
+            lossy: Whether to leave out or convert data that the format cannot store.
+            overwrite: Whether to replace an existing file or folder.
 
         Returns:
             One sentence for each thing that was left out or changed.
@@ -114,7 +115,7 @@ class Conversions:
 
     @staticmethod
     def from_parquet(path: str | Path) -> Dataset:
-        """Read Parquet files, one of transitions and one of episodes.
+        """Read a folder with two Parquet files, for transitions and for episodes.
 
         Raises:
             LogError: The files are missing, damaged or of another format.
@@ -130,8 +131,8 @@ class Conversions:
 
         Args:
             path: Path of the file.
-            lossy: Whether what the format cannot hold is left out or converted.
-            overwrite: Whether what exists at the path is replaced.
+            lossy: Whether to leave out or convert data that the format cannot store.
+            overwrite: Whether to replace an existing file.
 
         Returns:
             One sentence for each thing that was left out or changed.
@@ -162,8 +163,8 @@ class Conversions:
 
         Args:
             path: Path of the file.
-            lossy: Whether what the format cannot hold is left out or converted.
-            overwrite: Whether what exists at the path is replaced.
+            lossy: Whether to leave out or convert data that the format cannot store.
+            overwrite: Whether to replace an existing file.
 
         Returns:
             One sentence for each thing that was left out or changed.
@@ -188,7 +189,9 @@ class Conversions:
         return _read("npz", path)
 
     def to_d3rlpy(self) -> Any:
-        """Return a `d3rlpy.dataset.MDPDataset` with all transitions, those before a truncation too.
+        """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
+
+        The last transition before a truncation is included.
 
         Raises:
             SpaceError: d3rlpy cannot hold a space.
@@ -200,7 +203,7 @@ class Conversions:
 
     @staticmethod
     def from_d3rlpy(buffer: Any) -> Dataset:
-        """Copy the episodes of a d3rlpy replay buffer, `MDPDataset` included.
+        """Copy the episodes of a d3rlpy replay buffer, such as an `MDPDataset`.
 
         Raises:
             SpaceError: A log cannot hold a space or dtype of the data.
@@ -212,12 +215,13 @@ class Conversions:
     def to_sb3(self, *, device: str = "cpu", buffer_class: Any = None, **options: Any) -> Any:
         """Return a Stable-Baselines3 `ReplayBuffer` or `DictReplayBuffer` with all transitions.
 
-        As SB3's algorithms do, it puts the channels of images first and scales the actions of a
-        bounded Box to [-1, 1].
+        Images are stored with the channels first, and actions of a bounded Box are scaled to
+        [-1, 1], as SB3's algorithms store them.
 
         Args:
             device: Torch device of the samples.
-            buffer_class: Class of the buffer, such as `NStepReplayBuffer`; default: by the space.
+            buffer_class: Class of the buffer, such as `NStepReplayBuffer`; default:
+                `DictReplayBuffer` for a Dict observation space, otherwise `ReplayBuffer`.
             options: Further arguments of the buffer. The default of `buffer_size` is the number of
                 rows that the dataset needs.
 
@@ -241,17 +245,19 @@ class Conversions:
     ) -> Dataset:
         """Copy the transitions of a Stable-Baselines3 replay buffer.
 
-        The environments follow each other; the transitions of each are in order from old to new.
+        The result contains all transitions of the first environment, then those of the second, and
+        so on. The transitions of an environment are in order from old to new.
 
         Args:
             buffer: `ReplayBuffer` or `DictReplayBuffer`.
-            channels_last: Whether images are returned as (height, width, channels), as environments
-                have them, and not as SB3 transposes them.
-            scaled_actions: Whether the buffer has the actions of a bounded Box scaled to [-1, 1],
-                as SB3's algorithms store them. They are scaled back, which rounds them.
-            lossy: Whether a buffer with `handle_timeout_termination=False` is read, with all its
-                truncations as terminations. If it also has `optimize_memory_usage`, its final
-                observations are lost: each becomes a copy of the observation before it.
+            channels_last: Whether to return images as (height, width, channels), the order of axes
+                in environments. Otherwise, images keep the order of axes in the buffer.
+            scaled_actions: Whether the actions of a bounded Box in the buffer are scaled to
+                [-1, 1], as SB3's algorithms store them. Such actions are scaled back to the bounds
+                of the Box, which rounds them.
+            lossy: Whether to read a buffer with `handle_timeout_termination=False`. All its
+                truncations become terminations. If the buffer also has `optimize_memory_usage`, it
+                has lost the final observations: each becomes a copy of the observation before it.
 
         Raises:
             SpaceError: A log cannot hold a space or dtype of the data.

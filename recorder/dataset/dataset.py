@@ -194,8 +194,8 @@ class Dataset(Conversions):
     def infos(self) -> dict[str, np.ma.MaskedArray[Any, Any]]:
         """(F, *shape) masked array of each info by its dotted name, such as `episode.r`.
 
-        Row k is what the environment returned with row k of `frames`, masked where it returned
-        none. Empty if no infos were recorded.
+        Row k is the info that the environment returned with row k of `frames`; the row is masked
+        if the environment returned none. The mapping is empty if no infos were recorded.
         """
         return dict(self._transitions.infos)
 
@@ -285,11 +285,11 @@ class Dataset(Conversions):
 
         Args:
             probs: (N,) probability of each action under the behavior policy; NaN if unknown.
-            estimated: Whether they are estimates. Saving the dataset keeps this mark, and
-                estimates that use the probabilities say it.
+            estimated: Whether the probabilities are estimates. This flag is saved with the
+                dataset, and results that are based on such probabilities mention it.
 
         Raises:
-            SpaceError: The number of probabilities is not that of the transitions.
+            SpaceError: The length of `probs` is not the number of transitions.
         """
         column = np.asarray(probs, np.float32)
         if column.shape != (len(self),):
@@ -362,9 +362,10 @@ class Dataset(Conversions):
 
         Args:
             table: `transitions` or `episodes`.
-            tensors: Form of vectors and images in the table of transitions: `columns` for one
-                column per element up to 64 elements, otherwise flat lists; `lists` for one column
-                of fixed-size lists each, which shares its memory with the dataset where possible.
+            tensors: Form of vectors and images in the table of transitions. With `columns`, a
+                tensor of up to 64 elements becomes one column per element, and a larger tensor
+                becomes one column of flat lists. With `lists`, each tensor becomes one column of
+                fixed-size lists, which shares its memory with the dataset where possible.
 
         Raises:
             MissingExtraError: PyArrow is not installed.

@@ -33,7 +33,7 @@ def time_order(topic: Topic) -> NDArray[np.int64] | None:
 
 
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
-    """Return row indexes that sort `/rl/step` records into whole episodes; None for file order.
+    """Return row indexes that sort `/rl/step` records into whole episodes; None if already sorted.
 
     Records are sorted by log_time. If channels were recorded at the same time, for example by two
     robots, records are sorted by channel first.
@@ -111,7 +111,7 @@ class EpisodeTopic:
         return self._columns["length"].astype(np.int64)
 
     def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-        """Read the summaries of the episodes that end at these log_times, and possibly others."""
+        """Read at least the summaries of the episodes that end at these log_times."""
         if not self._is_ours:
             return []
         fields, rows = EpisodeSummary._fields, None
@@ -176,7 +176,7 @@ def summaries_of_records(
     firsts = finals - lengths
     lasts = np.maximum(finals - 1, firsts)
     rewards = columns["reward"].astype(np.float64, copy=False)
-    # These values have the order of the fields of `EpisodeSummary`.
+    # The values are in the same order as the fields of `EpisodeSummary`.
     values = (
         columns["episode"][finals].tolist(),
         lengths.tolist(),

@@ -1,4 +1,4 @@
-"""Datasets from the arrays of episodes, as most formats store them."""
+"""Conversion of arrays of episodes, which most formats store, to datasets."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class EpisodeArrays:
         behavior_probs: (T,) probability of each action; None if unknown.
         times_ns: (T + 1,) time of each observation, nanoseconds since the Unix epoch; None if
             unknown.
-        infos: Array of T + 1 rows for each info, by its dotted name; masked where there was none.
+        infos: Masked array of T + 1 rows for each info, by its dotted name.
         summary: Fields of `EpisodeSummary` that the format knows: seed, reason, policy, ...
     """
 
@@ -50,8 +50,8 @@ class EpisodeArrays:
 def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: object) -> Dataset:
     """Return a dataset of these episodes.
 
-    The log_times are those of the episodes if they increase throughout, otherwise they start at 0
-    and advance by the metadata's step duration.
+    If the times of the episodes increase strictly from row to row, they become the log_times.
+    Otherwise, the log_times start at 0 and increase by the step duration in the metadata.
 
     Args:
         episodes: Episodes in order; those without a transition are left out.
@@ -94,7 +94,7 @@ def dataset_of(episodes: Sequence[EpisodeArrays], metadata: LogMetadata, where: 
 
 
 def episode_slices(dataset: Dataset) -> list[tuple[slice, slice]]:
-    """Return the rows of each episode in the transitions, and in `Dataset.frames`."""
+    """Return two slices for each episode: its transitions, and its rows of `Dataset.frames`."""
     lasts = np.cumsum(dataset.episode_lengths).tolist()
     return [
         (slice(last - length, last), slice(last - length + k, last + k + 1))
@@ -122,7 +122,7 @@ def _times(episodes: Sequence[EpisodeArrays]) -> NDArray[np.int64]:
 
 
 def _last_rows(lengths: NDArray[np.int64], flags: Sequence[bool]) -> NDArray[np.bool_]:
-    """Return a column (N,) that is set where the flag of an episode is, in its last row."""
+    """Return a column (N,) with the flag of each episode in its last row, otherwise False."""
     column = np.zeros(int(lengths.sum()), bool)
     column[np.cumsum(lengths) - 1] = flags
     return column

@@ -1,13 +1,14 @@
 """d3rlpy's episodes: `MDPDataset` and other replay buffers, and the HDF5 files of `dump`.
 
-An episode of d3rlpy has as many observations as actions. If it is terminated, each step is a
-transition, and the next observation of the last one is zero. Otherwise the last step is no
-transition: it only has the next observation of the step before it. So an episode that was not
-terminated is stored with one step more, whose observation is the final one, and whose action and
-reward are zero.
+An episode of d3rlpy has as many observations as actions. In a terminated episode, each step is a
+transition, and the next observation of the last transition is zero. In any other episode, the last
+step is not a transition: it only contains the next observation of the step before it. Therefore, an
+episode that was not terminated is stored with one additional step, which contains the final
+observation, a zero action and a zero reward.
 
 Images have their channels first, other tensors are vectors, and a Dict is a list of arrays. The
-file has a group `mcaprl` with what d3rlpy has no place for; d3rlpy does not read it.
+group `mcaprl` of the file contains the data that d3rlpy's format cannot store; d3rlpy does not read
+this group.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def to_mdp_dataset(dataset: Dataset) -> Any:
             " docs/formats.md lists it"
         ) from error
     space, kinds = dataset.action_space, d3rlpy.ActionSpace
-    # Without them, d3rlpy takes whole numbers for discrete actions, and the largest one that occurs
-    # for the last one.
+    # Without these arguments, d3rlpy treats all integer actions as discrete, and infers the number
+    # of actions from the largest one in the data.
     if isinstance(space, spaces.Discrete):
         action_space, action_size = kinds.DISCRETE, int(space.n)
     else:
@@ -86,12 +87,13 @@ def to_mdp_dataset(dataset: Dataset) -> Any:
 def from_buffer(buffer: Any) -> Dataset:
     """Copy the episodes of a replay buffer of d3rlpy.
 
-    A terminated episode has no final observation in d3rlpy: the one before it is repeated.
+    d3rlpy does not store the final observation of a terminated episode. The observation before it
+    is repeated instead.
 
     Raises:
         SpaceError: A log cannot hold a space or dtype of the data.
         LogError: There are no transitions.
-        UsageError: It is not a replay buffer.
+        UsageError: `buffer` is not a replay buffer of d3rlpy.
     """
     if not (hasattr(buffer, "episodes") and hasattr(buffer, "dataset_info")):
         raise UsageError(
@@ -110,11 +112,11 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether actions that d3rlpy takes for something else are written, and infos that
-            cannot be stored are left out.
+        lossy: Whether to write actions of a space that d3rlpy does not support, and to leave out
+            infos that cannot be stored.
 
     Returns:
-        One sentence for each of these.
+        One sentence for each info that was left out, and one for an unsupported action space.
 
     Raises:
         SpaceError: d3rlpy does not support the action space, or an info cannot be stored, and
@@ -150,7 +152,8 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
 def read(path: Path) -> Dataset:
     """Read a file of d3rlpy's `dump`, or of `write`.
 
-    The file does not say which actions are discrete: one integer for each step is.
+    The file does not state whether actions are discrete. They are read as discrete if each step has
+    one integer.
 
     Raises:
         LogError: The file is damaged, or of another version.
@@ -205,7 +208,7 @@ def _joined(observations: Sequence[Any]) -> Any:
 
 
 def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return terminals and timeouts; the last step of the episode has one of them."""
+    """Return the terminals and the timeouts of an episode; one of them is set at the last step."""
     flags = np.zeros((2, len(episode["rewards"])), np.float32)
     flags[0 if episode["terminated"] else 1, -1] = 1
     return flags[0], flags[1]
@@ -244,7 +247,7 @@ def _dataset_of(
 
 
 def _frames(episode: Mapping[str, Any]) -> Any:
-    """Return the observations of an episode with a final one, and images with the channels last."""
+    """Return the T + 1 observations of an episode; images have their channels last."""
     stored = episode["observations"]
     if isinstance(stored, list | tuple):
         parts = [_frames({**episode, "observations": part}) for part in stored]
@@ -278,10 +281,10 @@ def _whole_number(file: Any, name: str, where: object) -> int:
 
 
 def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
-    """Check that the arrays of an episode are numbers, and have a row for each step.
+    """Check that the arrays of an episode are numeric and have one row for each step.
 
     Raises:
-        LogError: They are not.
+        LogError: An array is not numeric, or has another number of rows.
     """
     stored = episode["observations"]
     parts = [*stored] if isinstance(stored, list) else [stored]

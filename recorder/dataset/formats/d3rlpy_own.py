@@ -1,7 +1,7 @@
-"""The group `mcaprl` in d3rlpy's files: what d3rlpy has no place for.
+"""The group `mcaprl` in d3rlpy's files: the data that d3rlpy's format cannot store.
 
-The group has the log's metadata, the end reasons and so on of the episodes, the final observations
-of terminated episodes, truncations, probabilities, log_times and infos.
+The group contains the log's metadata, fields of the episode summaries such as the end reason, the
+final observations of terminated episodes, truncations, probabilities, log_times and infos.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _DESCRIPTION = "description"
 
 
 def write_own(group: Any, dataset: Dataset, infos: Mapping[str, StoredInfo]) -> None:
-    """Store what d3rlpy has no place for."""
+    """Write the data that d3rlpy's format cannot store to `group`."""
     lasts = np.cumsum(dataset.episode_lengths) - 1
     ends = dataset.frame_of_step[lasts[dataset.terminated[lasts]]] + 1
     names = []
@@ -58,7 +58,7 @@ def write_own(group: Any, dataset: Dataset, infos: Mapping[str, StoredInfo]) -> 
 
 
 def read_own(file: Any, episodes: Sequence[Mapping[str, Any]], path: Path) -> Dataset | None:
-    """Return the dataset that was written; None if the episodes have changed since."""
+    """Return the dataset that `write_own` stored; None if the episodes were changed since."""
     group = nodes.group_in(file, OWN)
     text = str(nodes.array_in(group, _DESCRIPTION))
     metadata, summaries, names = parse_description(text, path)
@@ -118,7 +118,7 @@ def stored_rows(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def restored_rows(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
-    """Return rows (N, *shape) for those that `stored_rows` returned."""
+    """Convert rows from the form of `stored_rows` back to (N, *shape)."""
     empty = np.empty((1, *leaf.shape), leaf.dtype)
     if values.shape[1:] != stored_rows(leaf, empty).shape[1:]:
         raise LogError(f"{leaf.name} has rows of shape {values.shape[1:]}")

@@ -35,14 +35,15 @@ def flat_dataset(
 ) -> Dataset:
     """Return a dataset of flat arrays.
 
-    Without next observations, that of a terminal transition is the observation itself, and the
-    last transition before a timeout is left out, because its next observation is unknown.
+    If there are no next observations, the observation of a terminal transition is repeated as its
+    next observation. The last transition before a timeout is left out, because its next observation
+    is unknown.
 
     Args:
         found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
         where: Name of the source, for errors and warnings.
-        infos: Arrays by dotted name; those of N rows are the infos of the observations. The final
-            observations have none.
+        infos: Arrays by dotted name. The arrays of N rows are the infos of the N observations; the
+            final observations have no infos.
 
     Raises:
         LogError: An array is missing.

@@ -1,7 +1,7 @@
-"""HDF5 files: D4RL's form both ways, and robomimic's to read.
+"""HDF5 files: D4RL's form is read and written, robomimic's form is only read.
 
-D4RL's form is flat arrays of all transitions. Ours has `next_observations` too, which D4RL's own
-files often lack, and the group `mcaprl` with what D4RL has no place for.
+D4RL's form is flat arrays of all transitions. The files written here also have `next_observations`,
+which D4RL's own files often lack, and a group `mcaprl` with the data that D4RL's form cannot store.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     Args:
         dataset: Episodes to write.
         path: New file.
-        lossy: Whether Dict observations are written, as one array for each key, and infos that HDF5
-            cannot hold are left out.
+        lossy: Whether to write Dict observations as one array for each key, and to leave out infos
+            that HDF5 cannot store.
 
     Returns:
-        One sentence for each thing that was changed for D4RL's readers.
+        One sentence for each thing that was left out or differs from D4RL's form.
 
     Raises:
         SpaceError: The observations are a Dict or HDF5 cannot hold an info, and `lossy` is not set.
@@ -127,7 +127,7 @@ def read(path: Path) -> Dataset:
 
 
 def _own(file: Any, path: Path) -> Dataset | None:
-    """Return the dataset that was written; None if the arrays have other lengths now."""
+    """Return the dataset that `write` stored; None if the arrays have different lengths now."""
     own = nodes.group_in(file, OWN)
     text = str(nodes.array_in(own, _DESCRIPTION))
     metadata, summaries, names = parse_description(text, path)
@@ -179,7 +179,7 @@ def _own(file: Any, path: Path) -> Dataset | None:
 def _own_infos(
     file: Any, lengths: Sequence[int], described: Mapping[str, tuple[str, np.dtype[Any]]]
 ) -> dict[str, Any]:
-    """Return the infos (F, *shape) with the rows of each final observation."""
+    """Return the infos (F, *shape), including the rows of the final observations."""
     finals = np.cumsum(np.array(lengths) + 1) - 1
     found = {}
     for name, (array, dtype) in described.items():
@@ -197,7 +197,7 @@ def _own_infos(
 
 
 def _put_info(file: Any, name: str, info: StoredInfo, dataset: Dataset) -> None:
-    """Write an info: a row for each step as D4RL has it, and the rows of final observations."""
+    """Write an info: one row per step, as in D4RL's files, and the rows of final observations."""
     finals = np.cumsum(dataset.episode_lengths + 1) - 1
     is_text = info.values.dtype.kind == "U"
     values = info.values.astype(object) if is_text else info.values

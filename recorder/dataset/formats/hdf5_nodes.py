@@ -1,6 +1,7 @@
 """Names and arrays in HDF5 files.
 
-The files may be of others: sizes are checked, and links to other files are not followed.
+The files may come from untrusted sources, so sizes are checked, and links to other files are not
+followed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from mcaprl.errors import LogError, McaprlError, import_extra
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
-# The filters of HDF5 compress at most to 1/1032. A larger dataset was declared, but never written.
+# HDF5's filters compress data to 1/1032 of its size at most. If an array is larger than this ratio
+# allows, its shape was declared, but its values were never written.
 _MAX_RATIO = 2_000
 _SMALL_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 18
@@ -28,7 +30,7 @@ _ELSEWHERE = "is stored in another file: copy it into one file"
 
 
 def is_hdf5(path: Path) -> bool:
-    """Return whether a path is a file that begins as HDF5."""
+    """Return whether a path is a file that starts with the HDF5 signature."""
     try:
         with path.open("rb") as file:
             return file.read(len(SIGNATURE)) == SIGNATURE
@@ -41,7 +43,7 @@ def opened(path: Path) -> Iterator[Any]:
     """Open a file for reading.
 
     Raises:
-        LogError: The file is missing, or damaged where it is read.
+        LogError: The file is missing, or a part that is read is damaged.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)
@@ -56,7 +58,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def image_settings(shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return the arguments of `create_dataset` for images (N, H, W, C): whole images in a chunk."""
+    """Return the arguments of `create_dataset` for images (N, H, W, C): chunks of whole images."""
     frame_bytes = math.prod(shape[1:]) * dtype.itemsize
     rows = max(1, min(shape[0], _CHUNK_BYTES // frame_bytes))
     return {"chunks": (rows, *shape[1:]), "compression": "lzf"}
@@ -122,7 +124,7 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
 
 
 def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
-    """Read the array at a path of names; a number is the index in a Tuple of Minari.
+    """Read the array at a path of names; an integer in the path is an index in a Tuple of Minari.
 
     Raises:
         LogError: There is no such array, or it is not stored in this file.
@@ -146,7 +148,7 @@ def tree_in(parent: Any, name: str) -> Any:
 
 
 def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield all arrays of a group and its groups by their dotted names."""
+    """Yield the dotted name and the values of each array in a group and its subgroups."""
     for name in names_in(group):
         if is_group(group, name):
             yield from arrays_below(group_in(group, name), (*path, name))
@@ -155,7 +157,7 @@ def arrays_below(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, 
 
 
 def attributes_of(group: Any) -> dict[str, Any]:
-    """Return the attributes as JSON types; `a/b` is `b` in the dict `a`.
+    """Return the attributes as JSON types; the attribute `a/b` is the entry `b` of the dict `a`.
 
     Raises:
         LogError: The attributes are damaged.
@@ -203,7 +205,7 @@ def is_group(parent: Any, name: str) -> bool:
 
 
 def _identifier(parent: Any, name: str) -> Any:
-    """Return h5py's lower-level object of a member."""
+    """Return the low-level h5py object of a member."""
     h5py, path = import_extra("h5py", EXTRA), name.encode()
     try:
         if parent.id.links.get_info(path).type != h5py.h5l.TYPE_EXTERNAL:
@@ -214,7 +216,7 @@ def _identifier(parent: Any, name: str) -> Any:
 
 
 def _objects(array: Any, place: str) -> NDArray[Any]:
-    """Return texts, or arrays of different lengths."""
+    """Read an array of strings, or of arrays of different lengths."""
     if import_extra("h5py", EXTRA).check_string_dtype(array.dtype) is None:
         return np.asarray(array[()])
     try:

@@ -1,8 +1,9 @@
-"""Infos as formats store them that have a value in each row.
+"""Infos in the formats that need a value in each row.
 
-Where an environment returned no info, a float is NaN, a text is empty, and another number is NaN
-among floats. The rows without an info and the dtype are stored beside the values, so that they are
-read back unchanged.
+In a row for which the environment returned no info, a float is stored as NaN, and a string as the
+empty string. If integers or flags have such rows, all their values are stored as floats, with NaN
+in these rows. The dtype and the rows without an info are also stored, so that infos are read back
+unchanged.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from mcaprl.recorder.dataset.dataset import Dataset
 
-# Larger integers are not exact as floats.
+# Floats cannot represent larger integers exactly.
 _MAX_EXACT = 2**53
 
 
@@ -24,8 +25,8 @@ class StoredInfo(NamedTuple):
     """An info with a value in each row.
 
     Attributes:
-        values: (F, *shape) numbers, flags or texts.
-        is_missing: (F,) whether the environment returned none.
+        values: (F, *shape) numbers, flags or strings.
+        is_missing: (F,) bool; whether the environment returned no info for the row.
         dtype: Data type of the info.
     """
 
@@ -62,7 +63,7 @@ def masked(
 
     Args:
         values: (F, *shape) stored values.
-        is_missing: (F,) whether there is none.
+        is_missing: (F,) bool; whether the row has no info.
         dtype: Data type of the info; default: that of the values.
     """
     dtype = values.dtype if dtype is None else dtype
@@ -77,7 +78,7 @@ def info_type(text: str) -> np.dtype[Any]:
     """Return the dtype with this name.
 
     Raises:
-        ValueError: It is not a dtype of numbers, flags or text.
+        ValueError: The dtype is unknown, or is not one of numbers, flags or text.
     """
     try:
         dtype = np.dtype(text)
@@ -109,7 +110,7 @@ def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list
 
 
 def _stored(values: Any) -> StoredInfo | str:
-    """Return the info to store, or the reason why it cannot be."""
+    """Return the info to store, or the reason why it cannot be stored."""
     data = np.ma.getdata(values)
     mask = np.ma.getmaskarray(values)
     is_missing = np.zeros(len(data), bool)

@@ -1,8 +1,8 @@
 """Features of a LeRobot dataset: their names, and their values as Arrow columns.
 
-A number is a plain column, a vector a fixed-size list, and an array of two to five dimensions a
-nested list. An image is a struct of the bytes of its file and a name: PNG without loss, or TIFF of
-32-bit floats for depth in meters.
+Numbers are stored as a plain column, vectors as fixed-size lists, and arrays of two to five
+dimensions as nested lists. An image is stored as a struct: the name and the bytes of an image file.
+The file is a lossless PNG, or a TIFF of 32-bit floats for depth in meters.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Feature:
 
 
 def default_features() -> list[Feature]:
-    """Return the features of every dataset."""
+    """Return the features that every LeRobot dataset has."""
     return [Feature("timestamp", "float32", (1,)), *(Feature(n, "int64", (1,)) for n in INDEXES)]
 
 
@@ -137,7 +137,7 @@ def feature_of(name: str, leaf: Leaf, names: Sequence[str] = (), *, video: bool 
         name: Name of the feature.
         leaf: Leaf of the observation or action space.
         names: Names of the elements; empty if unknown.
-        video: Whether images become video.
+        video: Whether images are stored as video.
     """
     if leaf.encoding or _is_depth(leaf):
         shape = leaf.shape if len(leaf.shape) == 3 else (*leaf.shape, 1)
@@ -145,14 +145,15 @@ def feature_of(name: str, leaf: Leaf, names: Sequence[str] = (), *, video: bool 
             return Feature(name, "video", (*shape[:2], 3), list(_HEIGHT_WIDTH_CHANNELS))
         is_depth = leaf.encoding is None
         return Feature(name, "image", shape, list(_HEIGHT_WIDTH_CHANNELS), is_depth=is_depth)
-    # More dimensions than LeRobot has are flattened; the writer refuses them unless it may.
+    # Arrays with more dimensions than LeRobot supports are flattened. The writer only does this if
+    # `lossy` is set.
     shape = leaf.shape if 0 < len(leaf.shape) <= MAX_DIMENSIONS else (leaf.size,)
     labels = list(names) if len(names) == math.prod(shape) and len(shape) == 1 else None
     return Feature(name, str(leaf.dtype), shape, labels)
 
 
 def observation_names(leaves: Sequence[Leaf]) -> list[str]:
-    """Return a unique name of a feature for each leaf of an observation space."""
+    """Return a unique feature name for each leaf of an observation space."""
     found: list[str] = []
     for leaf in leaves:
         words = [re.sub(r"[^A-Za-z0-9_.-]+", "_", word) or "_" for word in leaf.path]
@@ -160,7 +161,7 @@ def observation_names(leaves: Sequence[Leaf]) -> list[str]:
             name = IMAGES + ".".join(words) if words else IMAGE
         else:
             name = ".".join(("observation", *words)) if words else STATE
-            # LeRobot takes the statistics of every name that contains "image" for those of images.
+            # LeRobot expects image statistics for every feature whose name contains "image".
             name = re.sub("image", "img", name, flags=re.IGNORECASE)
         candidate, number = name, 2
         while candidate in found:
@@ -199,7 +200,7 @@ def image_of(name: str, file: bytes | None) -> NDArray[Any]:
 
 
 def _is_depth(leaf: Leaf) -> bool:
-    """Return whether a leaf is an image of depths: 32-bit floats (height, width[, 1])."""
+    """Return whether a leaf is a depth image: 32-bit floats (height, width[, 1])."""
     is_flat = len(leaf.shape) == 2 or (len(leaf.shape) == 3 and leaf.shape[2] == 1)
     is_named = any("depth" in word.lower() for word in leaf.path[-1:])
     return (

@@ -34,7 +34,7 @@ class Files:
         """Read the description and the table of episodes.
 
         Raises:
-            LogError: A file is missing, of another version, or does not fit the others.
+            LogError: A file is missing or of another version, or the files are inconsistent.
         """
         self.path = path
         info = parse_json((path / "meta/info.json").read_bytes())
@@ -65,19 +65,19 @@ class Files:
             raise LogError(f"{path}: the data files and the table of episodes do not agree")
 
     def ranges(self) -> Iterator[tuple[int, int]]:
-        """Yield the first and the last row + 1 of each of LeRobot's episodes."""
+        """Yield the row range [start, stop) of each of LeRobot's episodes."""
         return zip([0, *self.stops[:-1].tolist()], self.stops.tolist(), strict=True)
 
     def values(self, feature: Feature) -> NDArray[Any]:
         """Return the values (N, *shape) of a feature, or the images of a camera.
 
         Raises:
-            LogError: A file is missing or damaged, or the feature does not have this shape.
+            LogError: A file is missing or damaged, or the values do not have the feature's shape.
         """
         return self._video(feature) if feature.dtype == "video" else self._column(feature)
 
     def steps(self) -> dict[str, NDArray[Any]]:
-        """Return the values (N, *shape) of those of `STEPS` that the dataset has."""
+        """Return the values (N, *shape) of each feature in `STEPS` that the dataset has."""
         known = [self.features[name] for name in STEPS if name in self.features]
         return {feature.name: self.values(feature) for feature in known}
 
@@ -139,7 +139,7 @@ class Files:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None) -> Any:
-    """Read a Parquet file, and compare the CRCs that it has.
+    """Read a Parquet file, and check the CRCs of its pages if it has any.
 
     Args:
         path: File.

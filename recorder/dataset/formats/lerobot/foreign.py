@@ -1,4 +1,4 @@
-"""Episodes from a dataset that LeRobot recorded: its frames, and what it does not say."""
+"""Conversion of datasets that LeRobot recorded, which have no final observations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mcaprl.recorder.dataset.formats.lerobot.features import Feature
 from mcaprl.recorder.dataset.formats.lerobot.files import Files
 from mcaprl.recorder.format.metadata import LogMetadata
 
-# LeRobot's own tolerance; 32-bit floats are less precise after half an hour.
+# LeRobot uses the same tolerance. After half an hour, 32-bit floats are less precise than this.
 _TIME_TOLERANCE_S = 1e-4
 _OBSERVATION = "observation"
 
@@ -31,11 +31,11 @@ class _Part:
     """Rows of a dataset that become an episode of T transitions.
 
     Attributes:
-        frames: Indexes (T + 1,) of the rows with its observations.
-        steps: Rows of its transitions.
+        frames: Indexes (T + 1,) of the rows with the episode's observations.
+        steps: Rows with the episode's transitions.
         terminated: Whether the last transition led to a terminal state.
         truncated: Whether the episode was truncated.
-        source: Index of LeRobot's episode.
+        source: Index of the episode of LeRobot that contains these rows.
     """
 
     frames: NDArray[np.int64]
@@ -46,7 +46,7 @@ class _Part:
 
 
 def foreign_dataset(files: Files) -> Dataset:
-    """Return all episodes of a dataset without final observations; warn of what is missing.
+    """Convert a dataset that has no final observations; warn about the missing data.
 
     Raises:
         LogError: There is no observation or no action.
@@ -126,9 +126,9 @@ def _infos(files: Files) -> dict[str, NDArray[Any]]:
 
 
 def _is_kept(files: Files, feature: Feature, *, images: bool = True) -> bool:
-    """Return whether a feature has numbers or images; warn if not.
+    """Return whether a feature has numbers or images that can be read; warn if not.
 
-    Depth in a video is compressed in a way of LeRobot's own.
+    Depth videos cannot be read, because LeRobot compresses them in its own way.
     """
     is_video_of_depth = feature.is_depth and feature.dtype == "video"
     if images and feature.is_image and not is_video_of_depth:
@@ -174,7 +174,11 @@ def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
 
 
 def _stretches(files: Files, ends: NDArray[np.bool_]) -> Iterator[tuple[int, int, int, bool]]:
-    """Yield LeRobot's episodes, divided after each end: its index, rows, and if it is the last."""
+    """Divide LeRobot's episodes after each end in `ends`.
+
+    Yields for each part: the index of LeRobot's episode, the first row, the last row + 1, and
+    whether the part is the last one of this episode.
+    """
     for source, (start, stop) in enumerate(files.ranges()):
         inner = (start + 1 + np.flatnonzero(ends[start : stop - 1])).tolist()
         for first, last in zip([start, *inner], [*inner, stop], strict=True):
@@ -201,7 +205,10 @@ def _step_ns(files: Files) -> int:
 
 
 def _times_ns(files: Files) -> NDArray[np.int64]:
-    """Return the time (N,) of each frame, nanoseconds; two steps lie between two episodes."""
+    """Return the time (N,) of each frame, nanoseconds.
+
+    Each episode starts two step durations after the last frame of the previous episode.
+    """
     seconds = files.times_s()
     numbers = np.concatenate([np.arange(length) for length in files.lengths])
     regular = numbers / files.fps
@@ -223,7 +230,7 @@ def _frame_times(times: NDArray[np.int64], part: _Part, step_ns: int) -> NDArray
 
 
 def _options(files: Files, episode: int) -> str:
-    """Return the texts of an episode's tasks as options of its reset."""
+    """Return the tasks of an episode as the JSON options of its reset; empty if there are none."""
     tasks = list(files.episodes[episode].get("tasks") or ())
     if not tasks:
         return ""
@@ -233,7 +240,7 @@ def _options(files: Files, episode: int) -> str:
 def _values_and_space(
     values: NDArray[Any], *, is_action: bool = False
 ) -> tuple[NDArray[Any], spaces.Space[Any]]:
-    """Return values (N, *shape) in a dtype of a space, and the space."""
+    """Convert values (N, *shape) to a dtype that a space can have; return them and the space."""
     if values.dtype.kind == "b":
         return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
     is_index = values.shape[1:] == (1,) and values.dtype.kind in "iu" and (values >= 0).all()
@@ -253,7 +260,7 @@ def _labels(feature: Feature) -> tuple[str, ...]:
 
 
 def _info_rows(values: NDArray[Any]) -> Any:
-    """Return the info (T + 1, *shape) of the steps' values (T, *shape): there is none at reset."""
+    """Convert the steps' values (T, *shape) to an info (T + 1, *shape); the reset has no info."""
     plain = values[:, 0] if values.shape[1:] == (1,) else values
     rows = np.concatenate([np.zeros((1, *plain.shape[1:]), plain.dtype), plain])
     mask = np.zeros(rows.shape, bool)

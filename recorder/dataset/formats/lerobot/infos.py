@@ -1,8 +1,8 @@
 """Infos in LeRobot datasets.
 
-All infos are in `meta/mcaprl/infos.parquet`, one row for each observation, each with a column of
-values and a column that says where there is one. Numbers that every step has are also features,
-so that LeRobot's users see them.
+All infos are in `meta/mcaprl/infos.parquet`, with one row for each observation. Each info has a
+column of values and a column of flags, which are true where the info is present. Numeric infos that
+are present at every step are also written as features, so that users of LeRobot see them.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def infos_of(dataset: Dataset) -> Infos:
 
 
 def info_features(infos: Infos, frames: NDArray[np.int64]) -> dict[str, Feature]:
-    """Return a feature for each info that is a number at every step, by the info's name.
+    """Return a feature for each numeric info that is present at every step, by the info's name.
 
     Args:
         infos: Infos of the dataset.
-        frames: Rows (N,) of the infos that the steps returned.
+        frames: Row (N,) of the info that each step returned.
     """
     found: dict[str, Feature] = {}
     taken = {PROBABILITY}
@@ -60,7 +60,7 @@ def info_features(infos: Infos, frames: NDArray[np.int64]) -> dict[str, Feature]
 
 
 def write_infos(folder: Path, infos: Infos) -> list[dict[str, Any]]:
-    """Write all infos to a folder, and return what describes them, for `read_infos`."""
+    """Write all infos to a folder, and return their descriptions, which `read_infos` needs."""
     arrow = import_extra("pyarrow", "tables")
     columns, described = {}, []
     for number, (name, values) in enumerate(infos.items()):
@@ -97,7 +97,7 @@ def read_infos(folder: Path, described: Sequence[Mapping[str, Any]]) -> dict[str
 
 
 def _present(values: Any) -> NDArray[np.bool_]:
-    """Return (F,) whether there is an info."""
+    """Return flags (F,): whether the info is present in each row."""
     mask: NDArray[np.bool_] = np.ma.getmaskarray(values).reshape(len(values), -1)
     return np.logical_not(mask.all(axis=1))
 

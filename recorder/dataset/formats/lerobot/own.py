@@ -1,4 +1,4 @@
-"""What the writer stores beside LeRobot's files, so that a dataset is read back unchanged."""
+"""Data that the writer adds to LeRobot's files, so that a dataset is read back unchanged."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Own:
 
     Attributes:
         metadata: Metadata of the log.
-        features: Names of the features of the observation, in the order of its leaves.
-        finals: (E, *shape) final observations by the names of the leaves.
+        features: Feature name of each leaf of the observation, in order.
+        finals: (E, *shape) final observations by leaf name.
         times_ns: Times (T + 1,) of each episode's observations, nanoseconds since the Unix epoch.
         summaries: Fields of each `EpisodeSummary`.
         infos: Infos of all observations.
@@ -46,12 +46,12 @@ class Own:
 
 
 def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> None:
-    """Write what LeRobot has no place for.
+    """Write the data that LeRobot's format cannot store.
 
     Args:
         path: Folder of the dataset.
         dataset: Dataset that is written.
-        observations: Features of the leaves of the observation.
+        observations: Feature of each leaf of the observation.
     """
     arrow = import_extra("pyarrow", "tables")
     folder = path / OWN
@@ -69,7 +69,7 @@ def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> 
     lasts = np.cumsum(dataset.episode_lengths + 1) - 1
     finals = {}
     for leaf, name in zip(leaves_of(dataset.observation_space), names, strict=True):
-        # The final observations of videos are stored without loss.
+        # Final observations are stored without loss, even if the other observations are video.
         kept = feature_of(name, leaf)
         values = np.asarray(leaf.of(dataset.frames)[lasts])
         finals[name] = kept.encode(values.reshape(len(lasts), *kept.shape))
@@ -77,7 +77,7 @@ def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> 
 
 
 def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
-    """Read what the writer stored; None if there is nothing, or if the episodes have changed.
+    """Read what `write_own` stored; None if there is nothing, or if the episodes were changed.
 
     Args:
         path: Folder of the dataset.

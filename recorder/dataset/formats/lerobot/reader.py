@@ -15,17 +15,18 @@ from mcaprl.recorder.dataset.formats.lerobot.foreign import foreign_dataset
 from mcaprl.recorder.dataset.formats.lerobot.own import Own, read_own
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of, nest
 
-# What the values of damaged files raise.
+# Errors that values in damaged files cause.
 _DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OSError)
 
 
 def read(path: Path) -> Dataset:
     """Read a dataset.
 
-    LeRobot stores no observation after the last action of an episode. If the last frame is a
-    terminal one (`next.done`), its observation is also taken for the final one; otherwise the
-    last frame is taken for the final observation, without its action, and the episode is
-    truncated. A warning counts both.
+    LeRobot does not store the observation after the last action of an episode. If `next.done` is
+    set in the last frame, the observation of this frame is repeated as the final observation.
+    Otherwise, the observation of the last frame becomes the final observation, the action of the
+    last frame is left out, and the episode is truncated. A warning states the number of episodes
+    in each of these cases.
 
     Args:
         path: Folder of the dataset.
@@ -48,13 +49,13 @@ def read(path: Path) -> Dataset:
 
 
 def _own_dataset(files: Files, own: Own) -> Dataset:
-    """Return the dataset that was written."""
+    """Return the dataset that the writer of this package wrote."""
     leaves = leaves_of(own.metadata.observation_space)
     action = action_leaf(own.metadata.action_space)
     columns = []
     for leaf, name in zip(leaves, own.features, strict=True):
         values = files.values(files.features[name])
-        # Videos have three equal channels for gray images.
+        # In a video, a gray image has three equal channels.
         shown = values[..., 0] if leaf.encoding == "mono8" else values
         columns.append(shown.reshape(len(values), *leaf.shape))
     steps = files.steps()

@@ -1,8 +1,8 @@
 """Statistics of the features of a LeRobot dataset: for each episode, and for all data.
 
-Arrays have one number for each element of the last dimension. Images have one for each channel, of
-shape (channels, 1, 1), and those of color images are in [0, 1]. They are those of at
-most `_MAX_IMAGES` images of an episode, spread evenly.
+A statistic of an array has one number for each element of the last dimension. A statistic of images
+has one number for each channel, in shape (channels, 1, 1); for color images, the numbers are in
+[0, 1]. Image statistics are computed from at most `_MAX_IMAGES` evenly spaced images per episode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Stats = dict[str, NDArray[Any]]
 
 
 def sampled(feature: Feature, count: int) -> NDArray[np.int64]:
-    """Return the images of an episode that are looked at, spread evenly.
+    """Return the indexes of the evenly spaced images of an episode that the statistics use.
 
     Args:
         feature: Feature of the images.
@@ -42,7 +42,7 @@ def describe(feature: Feature, values: NDArray[Any]) -> Stats:
 
     Args:
         feature: Feature of the values.
-        values: Values; of images, those that `sampled` selects.
+        values: Values of the feature; for images, only those that `sampled` selects.
     """
     channels = values.shape[3] if values.ndim == 4 else 1
     rows = values.reshape(-1, channels if feature.is_image else feature.shape[-1])
@@ -59,9 +59,10 @@ def describe(feature: Feature, values: NDArray[Any]) -> Stats:
 
 
 def pooled(episodes: Sequence[Stats]) -> Stats:
-    """Return the statistics of all data from those of the episodes.
+    """Combine the statistics of the episodes to the statistics of all data.
 
-    The quantiles are the means of the episodes' quantiles, weighted by their numbers of values.
+    Each quantile is the mean of the episodes' quantiles, weighted by the number of values of each
+    episode.
     """
     counts = np.array([episode["count"][0] for episode in episodes], np.float64)
     column = {name: np.stack([e[name] for e in episodes]) for name in NAMES}
@@ -83,7 +84,7 @@ def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
     """Return the statistics (D,) of rows (N, D)."""
     limit = max(_MAX_ELEMENTS // numbers.shape[1], 1)
     few = numbers if len(numbers) <= limit else numbers[_spread(len(numbers), limit)]
-    # Unknown and infinite values have no mean; NumPy warns about them.
+    # NaN and infinite values have no finite mean; NumPy warns about them.
     with np.errstate(all="ignore"):
         quantiles = np.quantile(few, list(QUANTILES.values()), axis=0)
         return {
@@ -96,7 +97,7 @@ def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
 
 
 def _histogram(images: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return how often each channel of images (T, pixels, C) has each level: (C, 256)."""
+    """Count the pixels of each level in each channel of images (T, pixels, C); return (C, 256)."""
     counts = np.zeros((images.shape[2], 256), np.int64)
     for image in images:
         for channel, row in enumerate(counts):
@@ -117,7 +118,7 @@ def _of_levels(counts: NDArray[np.int64]) -> Stats:
         return levels[[int(np.searchsorted(row, rank, side="right")) for row in ends]]
 
     for name, share in QUANTILES.items():
-        # As NumPy does, interpolate between the two values beside the place.
+        # Like NumPy, interpolate between the two values next to this position.
         place = share * (total - 1)
         low, high = at(math.floor(place)), at(math.ceil(place))
         found[name] = low + (place - math.floor(place)) * (high - low)

@@ -19,11 +19,11 @@ class ParquetFiles:
     """Writer of the data files, with one row group for each episode."""
 
     def __init__(self, path: Path, every: list[Feature]) -> None:
-        """Create a writer without a file.
+        """Create a writer; the first episode creates a file.
 
         Args:
             path: Folder of the dataset.
-            every: Features of the data; videos are not in the data files.
+            every: All features of the dataset; videos are not written to the data files.
         """
         self._path = path
         self._stored = [feature for feature in every if feature.dtype != "video"]
@@ -31,7 +31,7 @@ class ParquetFiles:
         self._writer: Any = None
 
     def add_episode(self, columns: dict[str, Any]) -> dict[str, int]:
-        """Write the columns of an episode, and return the place of its file."""
+        """Write the columns of an episode, and return the indexes of its folder and its file."""
         arrow = import_extra("pyarrow", "tables")
         table = arrow.table(columns)
         if self._writer is None or self._file.stat().st_size + table.nbytes > MAX_FILE_BYTES:
@@ -66,10 +66,10 @@ class ParquetFiles:
 
 
 def write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
-    """Write the table of tasks, given the index of each text."""
+    """Write the table of tasks; `tasks` contains the index of each task by its text."""
     arrow = import_extra("pyarrow", "tables")
     table = arrow.table({"task_index": list(tasks.values()), "task": list(tasks)})
-    # LeRobot reads the table with pandas and needs the texts as its index.
+    # LeRobot reads this table with pandas, and needs the task texts as the index of the DataFrame.
     metadata = {b"pandas": json.dumps(_TASKS_IN_PANDAS).encode()}
     parquet = import_extra("pyarrow.parquet", "tables")
     parquet.write_table(table.replace_schema_metadata(metadata), path)
@@ -96,7 +96,7 @@ def write_table(columns: dict[str, Any], path: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON, with NaN and infinities as Python reads them."""
+    """Write JSON; NaN and infinities have the form that Python reads."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"{json.dumps(value, indent=4)}\n")
 

@@ -31,13 +31,13 @@ class VideoWriter:
         max_bytes: int,
         chunk_files: int,
     ) -> None:
-        """Create a writer without a file.
+        """Create a writer; the first episode creates a file.
 
         Args:
             folder: Folder of the dataset.
             feature: Feature of the camera.
             rate: Number of images per second.
-            path: Path of a file in the folder, with places for its numbers.
+            path: Path of a file in the folder, with placeholders for the indexes of the file.
             max_bytes: Size after which the next file begins.
             chunk_files: Number of files in a folder.
         """
@@ -61,7 +61,7 @@ class VideoWriter:
         }
 
     def add_episode(self, images: NDArray[np.uint8]) -> dict[str, Any]:
-        """Write the images of an episode, and return their place for the table of episodes.
+        """Write the images of an episode, and return their position for the table of episodes.
 
         Args:
             images: (T, height, width[, channels]) with one or three channels.
@@ -136,7 +136,7 @@ def read_frames(path: Path, times_s: NDArray[np.float64], tolerance_s: float) ->
             for frame in container.decode(stream):
                 if row == len(times_s):
                     break
-                # An image can be that of several times.
+                # Several times can select the same image.
                 while row < len(times_s) and abs(frame.time - times_s[row]) <= tolerance_s:
                     image = frame.to_ndarray(format="rgb24")
                     if found is None:

@@ -1,8 +1,7 @@
 """Writing of LeRobot datasets, version 3.0.
 
-Each transition is a row. LeRobot has no place for the final observation of an episode, for real
-times and for the fields of an episode's summary: they are in the folder `meta/mcaprl`, which
-LeRobot does not read.
+Each transition is a row. LeRobot's format cannot store final observations, recorded times and
+episode summaries. They are written to the folder `meta/mcaprl`, which LeRobot does not read.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
     Args:
         dataset: Episodes to write.
         path: Empty folder.
-        lossy: Whether what LeRobot cannot hold is left out or converted.
+        lossy: Whether to leave out or convert data that LeRobot cannot store.
         video: Whether images are compressed as H.264 video, which changes their pixels.
 
     Returns:
@@ -72,7 +71,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
 
 
 def frames_per_second(step_duration_ns: int) -> int | float:
-    """Return the rate of a step duration: a whole number where it gives the same duration."""
+    """Return the frame rate: a whole number if it gives exactly this step duration."""
     rate = 1e9 / step_duration_ns
     whole = round(rate)
     return whole if whole and round(1e9 / whole) == step_duration_ns else rate
@@ -88,10 +87,10 @@ def task_of(options: str, metadata: LogMetadata) -> str:
 
 
 def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
-    """Return what will be lost.
+    """Return one sentence for each change that loses data.
 
     Raises:
-        SpaceError: Something will be lost, and `lossy` is not set.
+        SpaceError: Data would be lost, and `lossy` is not set.
     """
     leaves = leaves_of(dataset.observation_space)
     named = zip(features.observation_names(leaves), leaves, strict=True)
@@ -119,7 +118,7 @@ def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
 
 
 def _is_large(dataset: Dataset, leaf: Leaf) -> bool:
-    """Return whether an unsigned leaf has a value that a signed integer does not have."""
+    """Return whether a leaf has a value that does not fit into a signed 64-bit integer."""
     values = dataset.actions if leaf.name == "action" else leaf.of(dataset.frames)
     return bool((values >= 2**63).any())
 
