@@ -43,7 +43,7 @@ def read_images(
 
 
 class _Images:
-    """The topic of an image leaf in a file."""
+    """The topic with the images of one leaf, in one file."""
 
     def __init__(self, reader: McapReader, leaf: Leaf) -> None:
         self.topic = Topic(reader, leaf.topic)

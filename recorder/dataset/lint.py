@@ -1,4 +1,4 @@
-"""Checks that find problems in a dataset that can harm learning."""
+"""Checks for problems in a dataset that can harm learning."""
 
 from __future__ import annotations
 

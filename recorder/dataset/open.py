@@ -45,8 +45,8 @@ def open_logs(
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
-            on disk and reads them when they are indexed. If the log is compressed, this needs an
-            uncompressed copy of the images, which is written once beside the log. `auto` is
+            on disk and reads them when they are indexed. For a compressed log, `mapped` needs an
+            uncompressed copy of the images, which is written once, next to the log. `auto` is
             `mapped` if the images would take more than half of the free memory, else `memory`.
         threads: Number of threads that read chunks of a file.
 

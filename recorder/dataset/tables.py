@@ -1,6 +1,6 @@
 """Conversion of datasets to PyArrow tables. Requires the extra `tables`.
 
-A tensor is an array of more than one dimension: a row of it is not a single number. With
+A tensor is an array of more than one dimension, so each row is a vector or an array. With
 `tensors="columns"`, a tensor becomes one column per element, `observation.<name>` or
 `observation.<index>`; a row of more than MAX_COLUMNS elements, such as an image, becomes a flat
 list. With `tensors="lists"`, each tensor becomes one column of flat fixed-size lists in C order,
@@ -37,14 +37,15 @@ def transition_table(
     *,
     tensors: Tensors = "columns",
 ) -> Any:
-    """Return a table with one row per transition, which contains both of its observations.
+    """Return a table with one row per transition, with its observation and next observation.
 
-    Infos are columns `info.<name>`, those of the next observation; null where there was none.
+    The column `info.<name>` contains the info that came with the next observation; null if there
+    was none.
 
     With `tensors="lists"`, columns share their memory with the dataset where Arrow stores the
-    values in the same way: actions, rewards and probabilities always, observations if they take
-    16 KiB or more per episode on average. Their columns then have one chunk per episode. Flags,
-    images on disk and times are copied.
+    values in the same way. This is always the case for actions, rewards and probabilities.
+    Observations share their memory if they take 16 KiB or more per episode on average; their
+    columns then have one chunk per episode. Flags, images on disk and times are copied.
     """
     arrow = import_extra("pyarrow", "tables")
     import_extra("pyarrow.compute", "tables")
@@ -107,7 +108,7 @@ def field_of(arrow: Any, name: str, array: Any, shape: Sequence[int]) -> Any:
 
 
 def fixed_lists(arrow: Any, values: NDArray[Any]) -> Any:
-    """Return an Arrow array of rows (N, *shape): numbers, or flat lists. Copied only if needed."""
+    """Return rows (N, *shape) as an Arrow array of numbers or flat lists; copy only if needed."""
     flat = arrow.array(np.ascontiguousarray(values).reshape(-1))
     if values.ndim == 1:
         return flat
@@ -157,7 +158,7 @@ def info_columns(
 
 
 def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int, ...]]:
-    """Return the shape of a row of each column of actions and observations, by name."""
+    """Return the row shape of each action and observation column, by column name."""
     shapes = {"action": columns.actions.shape[1:]}
     for name, leaf in zip(observation_names(leaves), leaves, strict=True):
         shapes |= {name: leaf.shape, f"next_{name}": leaf.shape}

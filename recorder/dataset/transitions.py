@@ -36,8 +36,8 @@ class Transitions:
         truncated: (N,) bool.
         behavior_probs: (N,) float32; NaN where unknown.
         episodes: Summaries of the episodes, in order. Their lengths divide the rows into episodes.
-        infos: (F, *shape) masked array of each info by its dotted name: what the environment
-            returned with the observation, masked where it returned none.
+        infos: (F, *shape) masked array of each info by its dotted name. Row k is the info that the
+            environment returned with frame k; it is masked if the environment returned none.
     """
 
     frames: tuple[Frames, ...]
@@ -134,13 +134,14 @@ class TransitionBatch:
 
 
 def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str, Masked]:
-    """Concatenate infos; one that a part lacks is masked there.
+    """Concatenate infos; if a part lacks an info, the rows of this part are masked.
 
     Args:
         parts: Infos by name, and the number of their rows.
 
     Raises:
-        SpaceError: An info has different shapes, or is text and number.
+        SpaceError: An info differs in shape between the parts, or is text in one and numeric in
+            another.
     """
     found: dict[str, Masked] = {}
     for name in dict.fromkeys(name for infos, _ in parts for name in infos):

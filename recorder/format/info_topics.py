@@ -27,7 +27,7 @@ _ENCAPSULATION = int(ENCAPSULATION).to_bytes(4, "little")
 
 
 def flat_infos(info: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the entries of an info and of the dicts in it, with dotted names."""
+    """Yield the entries of an info dict and of its nested dicts, with dotted names."""
     for key, value in info.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
@@ -42,7 +42,7 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
         found = np.array(values)
     except (ValueError, OverflowError):
         return None
-    # NumPy would convert numbers beside text to text, and flags beside numbers to numbers.
+    # If the types are mixed, NumPy would convert numbers to text, and flags to numbers.
     kinds = {np.asarray(value).dtype.kind for value in values}
     if len(kinds) > 1 and not (kinds == {"i", "f"} and _is_exact(found, values)):
         return None
@@ -58,7 +58,7 @@ def _is_exact(found: NDArray[Any], values: Sequence[Any] | NDArray[Any]) -> bool
 
 
 class InfoTopics:
-    """Writer of infos to a log; a topic is announced when its info first comes.
+    """Writer of infos to a log; a topic is announced at the first value of its info.
 
     Attributes:
         refused: Names of the infos that were not written, with the reason.
@@ -66,7 +66,7 @@ class InfoTopics:
     """
 
     def __init__(self, log: LogTopics) -> None:
-        """Announce nothing yet."""
+        """Create a writer that has not announced any topic yet."""
         self._log = log
         self._channels: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {}
         self._topics: set[str] = set()
@@ -76,8 +76,8 @@ class InfoTopics:
     def write(self, infos: Mapping[str, tuple[Sequence[int], NDArray[Any]]]) -> None:
         """Write values (K, *shape) of infos with their log_times (K,), by name.
 
-        A value that does not have the type of the info's first value is not written, and its name
-        is added to `refused`.
+        If values do not have the type of the info's first value, they are not written, and the
+        info's name is added to `refused`.
         """
         messages: list[Message] = []
         for name, (times_ns, values) in infos.items():
@@ -108,7 +108,7 @@ class InfoTopics:
 
 
 def _definition(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[str, str]:
-    """Return the name and the text of the type of an info."""
+    """Return the name and the definition of an info's message type."""
     if dtype.kind == "U":
         return TEXT_TYPE, "string data"
     kind = _TYPES[dtype]
@@ -121,7 +121,7 @@ def _definition(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[str, str]
 
 
 def _fits(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
-    """Return whether values can be stored with this dtype without a change."""
+    """Return whether values can be stored in this dtype without changing them."""
     if values.dtype == dtype:
         return True
     kinds = {values.dtype.kind, dtype.kind}

@@ -1,8 +1,8 @@
-"""Infos of an environment: one topic `/rl/info/<name>` for each, with messages where it is present.
+"""Infos of an environment: each info has a topic `/rl/info/<name>`, which omits missing values.
 
 The messages have the log_time of the observation that the info came with. Scalars are messages of
 std_msgs; an array is `mcaprl_msgs/msg/Info...` with the field `data`, flat. The channel's metadata
-contain the name and the shape of the info.
+contains the name and the shape of the info.
 """
 
 from __future__ import annotations

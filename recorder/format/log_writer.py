@@ -250,7 +250,7 @@ class LogWriter(LogTopics):
         Raises:
             SpaceError: A log cannot contain these spaces; no file is created then.
             OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created; or it cannot be appended to, and is unchanged.
+            LogError: The file cannot be created, or cannot be appended to and stays unchanged.
         """
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
@@ -260,7 +260,8 @@ class LogWriter(LogTopics):
         )
         if self.mcap.untouched:
             self._check_same(strings)
-        # Logs from before schemas named the actions are continued without the names.
+        # The schemas of older logs do not contain the action names. Such logs are continued without
+        # these names.
         is_plain = plain_name in {schema.name for schema in self.mcap.schemas.values()}
         super().__init__(metadata, self.mcap, names_actions=not is_plain)
 

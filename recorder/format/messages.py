@@ -113,7 +113,7 @@ def episode_message(
 
 
 def stored_seed(seed: int | None) -> int:
-    """Return a seed as it is stored: -1 for None; from 2^63 on, it is less by 2^64."""
+    """Convert a seed to a signed integer: -1 for None, and `seed - 2**64` for 2^63 or more."""
     return -1 if seed is None else seed - 2**64 * (seed >= 2**63)
 
 

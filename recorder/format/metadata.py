@@ -86,9 +86,9 @@ class LogMetadata:
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
         success_reasons: Reasons with which an episode succeeds; empty if unknown.
-        view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the camera
-            that follows; `world_m`, `world_x_m` and `world_y_m` are the size and middle of the
-            world; `depth_min_m` and `depth_max_m` limit the colors of depth; `speed_m_s` is the
+        view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
+            camera; `world_m`, `world_x_m` and `world_y_m` are the size and the center of the world;
+            `depth_min_m` and `depth_max_m` are the limits of the depth colors; `speed_m_s` is the
             highest speed.
         step_duration_ns: Simulated time between two records, nanoseconds.
         policy: Name of the first policy; each episode's summary names its own.
@@ -97,8 +97,8 @@ class LogMetadata:
         versions: Versions of the packages that the recording ran with.
         behavior_prob: `ESTIMATED` if the probabilities of the actions were estimated; otherwise
             empty.
-        about: What the dataset of another tool, from which the log was converted, says about
-            itself; JSON types only.
+        about: Description of the source dataset if the log was converted from another tool's
+            format; JSON types only.
     """
 
     observation_space: spaces.Space[Any]

@@ -1,13 +1,13 @@
-"""NumPy archives: our own, with everything that a dataset has, and those of others.
+"""NumPy archives: those of this package, which contain a whole dataset, and those of other tools.
 
-Our own archive has these arrays, for E episodes with N transitions:
+An archive of this package has these arrays, for E episodes with N transitions:
 
     observations              (N, *shape); or arrays `observations/KEY` for the keys of a Dict
     final_observations        (E, *shape), named in the same way
     actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
     episode_lengths           (E,)
     log_time_ns               (N + E,)
-    infos/NAME                (N + E, *shape); `missing_infos/NAME` has the rows without it
+    infos/NAME                (N + E, *shape); `missing_infos/NAME` marks the rows without it
     mcaprl                    JSON text: metadata, summaries and the names of the observations
 
 Other archives have the arrays of `flat.NAMES`. Nothing is unpickled.
@@ -124,9 +124,10 @@ def read(path: Path) -> Dataset:
 
 
 def array_name(leaf: Leaf) -> str:
-    """Return what follows `observations` in the name of a leaf's array.
+    """Return the suffix that follows `observations` in the name of a leaf's array.
 
-    Keys with other characters than letters, digits, `.`, `_` and `-` are named as in the log.
+    If a key has characters other than letters, digits, `.`, `_` and `-`, the suffix contains the
+    leaf's name in the log.
     """
     if all(_PLAIN.fullmatch(key) for key in leaf.path):
         return "".join(f"/{key}" for key in leaf.path)
@@ -134,7 +135,7 @@ def array_name(leaf: Leaf) -> str:
 
 
 def arrays_of(infos: Mapping[str, StoredInfo]) -> dict[str, list[str]]:
-    """Return what follows `infos` in the name of each info's array, and its dtype."""
+    """Return, for each info, its dtype and the suffix that follows `infos` in the array's name."""
     return {
         name: [_info_name(name, number), info.dtype.str]
         for number, (name, info) in enumerate(infos.items())
@@ -144,12 +145,13 @@ def arrays_of(infos: Mapping[str, StoredInfo]) -> dict[str, list[str]]:
 def description_text(
     dataset: Dataset, names: Iterable[str], infos: Mapping[str, Iterable[str]] | None = None
 ) -> str:
-    """Return the metadata and the summaries as JSON, with what names the arrays.
+    """Return JSON with the metadata, the summaries and the names of the arrays.
 
     Args:
         dataset: Dataset to describe.
-        names: What follows `observations` in the name of each leaf's array.
-        infos: What follows `infos` in the name of each info's array, and its dtype; default: none.
+        names: For each leaf, the suffix that follows `observations` in the array's name.
+        infos: For each info, the suffix that follows `infos` in the array's name, and the dtype;
+            default: no infos.
     """
     summaries = [
         {name: getattr(episode.summary, name) for name in SUMMARY} for episode in dataset.episodes
@@ -193,7 +195,7 @@ def _summary(part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]]:
-    """Parse what follows `infos` in the name of each info's array, and its dtype.
+    """Parse `infos` of `description_text`: the suffix of the array's name and the dtype, by info.
 
     Raises:
         LogError: The text is damaged.

@@ -10,8 +10,8 @@ spaces, as `tables.described` writes them.
 and the last observation, `final_observation`. The columns `next_observation` are for other tools:
 they are not read.
 
-The columns `info.<name>` have the infos of each step, and `reset_info.<name>` those of each reset;
-null means that there was none.
+The columns `info.<name>` contain the infos of each step, and `reset_info.<name>` the infos of each
+reset. A null means that the environment returned no info.
 """
 
 from __future__ import annotations
@@ -160,11 +160,11 @@ class _Table:
         self._path = path
         try:
             names = [n for n in parquet.read_schema(path).names if not n.startswith("next_")]
-            # A folder named `key=value` above the file is not a partition.
+            # Do not treat a parent folder named `key=value` as a partition.
             self._table = parquet.read_table(
                 path, columns=names, partitioning=None, page_checksum_verification=True
             )
-        # Names that are not UTF-8 raise a ValueError, as many of PyArrow's errors are.
+        # Names that are not UTF-8 raise a ValueError. Many PyArrow errors are also ValueErrors.
         except (OSError, ValueError, arrow.ArrowException) as error:
             raise LogError(f"{path} cannot be read: {error}") from error
 
@@ -172,7 +172,7 @@ class _Table:
         """Return the log's metadata.
 
         Raises:
-            LogError: The file has none, or it cannot be parsed.
+            LogError: The file has no metadata, or the metadata cannot be parsed.
         """
         found = (self._table.schema.metadata or {}).get(METADATA_NAME.encode())
         if found is None:
@@ -218,7 +218,7 @@ class _Table:
         """Return an info (N, *shape) by the prefix and the name of its column.
 
         Raises:
-            LogError: There is no such column, or its field does not describe it.
+            LogError: There is no such column, or the metadata of its field is damaged.
         """
         column = f"{prefix}.{name}"
         if column not in self._table.column_names:
@@ -231,7 +231,7 @@ class _Table:
             dtype = info_type(described["dtype"].decode())
             shape = [int(size) for size in parse_json(described["shape"])]
             if shape:
-                # The values of a null are there, unlike in `array.flatten()`.
+                # Unlike `array.flatten()`, `array.values` also contains the values of null lists.
                 size = array.type.list_size
                 array = array.values[array.offset * size : (array.offset + len(array)) * size]
             filled = array.fill_null("" if dtype.kind == "U" else False if dtype.kind == "b" else 0)
@@ -258,7 +258,7 @@ def _pyarrow() -> tuple[Any, Any]:
 
 
 def _without_some_infos(columns: Transitions) -> tuple[Transitions, list[str]]:
-    """Return the columns without the infos that a table cannot hold, and why it cannot."""
+    """Return the columns without the infos that a table cannot hold, and a reason for each."""
     problems = {name: info_problem(name, info) for name, info in columns.infos.items()}
     kept = {name: info for name, info in columns.infos.items() if not problems[name]}
     return dataclasses.replace(columns, infos=kept), list(filter(None, problems.values()))
@@ -286,8 +286,9 @@ def _blocks(columns: Transitions) -> Iterator[tuple[int, Transitions]]:
 def _settings(arrow: Any, table: Any) -> dict[str, Any]:
     """Return the settings of the writer.
 
-    A dictionary keeps one NaN for all, and makes columns of many distinct values slower. It makes
-    columns of bytes smaller, because Parquet stores each in four bytes.
+    Dictionary encoding is only used for columns of bytes, strings and episode indexes. It makes
+    columns of bytes smaller, because Parquet stores each byte in four bytes without it. For other
+    columns, it would replace all NaN values by one of them, and many distinct values would be slow.
     """
     small = []
     for field in table.schema:
@@ -312,7 +313,7 @@ def _episodes_with_ends(arrow: Any, columns: Transitions, leaves: Sequence[Leaf]
 
 
 def _info(steps: Masked, resets: Masked, lengths: NDArray[np.int64]) -> Masked:
-    """Return an info (F, *shape): that of the reset, then those of the episode's steps."""
+    """Return an info (F, *shape): for each episode, the row of the reset, then the steps' rows."""
     frames: Masked = np.ma.concatenate([steps, resets])  # type: ignore[no-untyped-call]
     firsts = np.cumsum(lengths + 1) - lengths - 1
     order = np.empty(len(frames), np.int64)
@@ -325,7 +326,7 @@ def _info(steps: Masked, resets: Masked, lengths: NDArray[np.int64]) -> Masked:
 def _with_finals(
     steps: NDArray[Any], finals: NDArray[Any], lengths: NDArray[np.int64]
 ) -> NDArray[Any]:
-    """Return frames: the rows of each episode's steps, and after them its final row."""
+    """Return frames: for each episode, the rows of its steps and then its final row."""
     ends = np.cumsum(lengths) + np.arange(len(lengths))
     frames = np.empty((len(steps) + len(finals), *steps.shape[1:]), steps.dtype)
     is_step = np.ones(len(frames), bool)

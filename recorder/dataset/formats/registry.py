@@ -1,6 +1,7 @@
-"""The formats that are read and written, found by name or by what a path looks like.
+"""The formats that can be read and written, selected by name or recognized by path.
 
-The module of a format has these functions; one that only writes has no `matches` and `read`:
+The module of a format has these functions. A format that can only be written has no `matches` and
+`read`:
 
     matches(path: Path) -> bool                 whether a file or folder is of the format
     read(path: Path) -> Dataset                 all episodes
@@ -28,9 +29,9 @@ class Format(NamedTuple):
 
     Attributes:
         name: Name in `--to` and `--from`.
-        about: What it is, for lists of formats.
-        suffix: Suffix of its files' names; empty if it is a folder.
-        reads: Whether it is read.
+        about: Description of the format, for lists of formats.
+        suffix: Suffix of the file names; empty if the format is a folder.
+        reads: Whether the format can be read.
     """
 
     name: str
@@ -44,7 +45,7 @@ class Format(NamedTuple):
         return import_module(f"mcaprl.recorder.dataset.formats.{self.name}")
 
 
-# Where several formats match a path, the first one reads it.
+# If several formats match a path, the first of them reads it.
 FORMATS = {
     form.name: form
     for form in (
@@ -63,7 +64,7 @@ def format_named(name: str) -> Format:
     """Return a format by its name.
 
     Raises:
-        UnknownNameError: There is no such format; the message lists those that there are.
+        UnknownNameError: There is no such format; the message lists all formats.
     """
     if name not in FORMATS:
         raise UnknownNameError("format", name, list(FORMATS))
@@ -71,7 +72,7 @@ def format_named(name: str) -> Format:
 
 
 def recognized(path: str | Path) -> Format | None:
-    """Return the format that a file, a folder or `FORMAT:NAME` is of; None if none matches."""
+    """Return the format of a file, a folder or `FORMAT:NAME`; None if no format matches."""
     name, colon, _ = str(path).partition(":")
     if colon and name in FORMATS:
         return FORMATS[name]
@@ -112,7 +113,7 @@ def target_format(path: str | Path, name: str | None) -> Format:
 
 
 def target_path(path: str | Path, form: Format) -> Path:
-    """Return the file or folder that a name means, such as `minari:drive/lane-v0`."""
+    """Return the file or folder of a name such as `minari:drive/lane-v0`, or of a path."""
     prefix = f"{form.name}:"
     if str(path).startswith(prefix) and hasattr(form.module, "local_path"):
         local: Path = form.module.local_path(str(path).removeprefix(prefix))
@@ -129,7 +130,7 @@ def read_format(path: str | Path, form: Format) -> Dataset:
         MissingExtraError: The format needs a package that is not installed.
     """
     if not form.reads:
-        raise UsageError(f"{form.name} is written only")
+        raise UsageError(f"{form.name} can only be written, not read")
     source = target_path(path, form)
     if not source.exists():
         raise LogError(f"{path}: no such file or folder")
@@ -147,14 +148,14 @@ def write_format(
     overwrite: bool = False,
     **options: Any,
 ) -> list[str]:
-    """Write a dataset in another format; nothing is at `path` until it is complete.
+    """Write a dataset in another format; `path` only appears when the data is complete.
 
     Args:
         dataset: Episodes to write.
         path: File or folder to create.
         form: Format to write.
-        lossy: Whether what the format cannot hold is left out or converted.
-        overwrite: Whether an existing file or folder is replaced.
+        lossy: Whether to leave out or convert data that the format cannot store.
+        overwrite: Whether to replace an existing file or folder.
         options: Further arguments of the format's `write`.
 
     Returns:

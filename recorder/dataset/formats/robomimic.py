@@ -20,9 +20,9 @@ from mcaprl.recorder.dataset.formats.flat import joined_trees, rows_of_tree
 def read_demos(file: Any, path: Path) -> Dataset:
     """Read all demonstrations, in the order of their numbers.
 
-    A demonstration terminates if its last step is done; otherwise it is truncated. Without
-    `next_obs`, the last step of a truncated one is left out, because its next observation is
-    unknown.
+    A demonstration is terminated if `dones` is set at its last step; otherwise it is truncated. The
+    last step of a truncated demonstration without `next_obs` is left out, because the next
+    observation of this step is unknown.
 
     Args:
         file: Open HDF5 file.
@@ -85,7 +85,7 @@ def _check_follows(here: Any, there: Any, where: str) -> None:
 
 
 def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return an array as bytes, so that NaN equals NaN."""
+    """Return an array as bytes, because two NaN values only compare as equal in this form."""
     return np.frombuffer(array.tobytes(), np.uint8)
 
 

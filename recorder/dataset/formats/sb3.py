@@ -1,8 +1,9 @@
 """Stable-Baselines3's replay buffers, filled as its algorithms fill them.
 
 SB3 stores images with the channels first, actions of a bounded Box scaled to [-1, 1], and rewards
-and float64 actions as float32. It marks the end of an episode in `dones`, and also in `timeouts` if
-the episode was truncated, so that the value of the last observation counts.
+and float64 actions as float32. It marks the end of an episode in `dones`. If the
+episode was truncated, it also marks the end in `timeouts`, so that the learning target includes the
+value of the last observation.
 """
 
 from __future__ import annotations
@@ -42,8 +43,8 @@ def to_buffer(
             `DictReplayBuffer` for a Dict space.
         options: Further arguments of the buffer. The default of `buffer_size` is the number of
             rows that the dataset needs. With `optimize_memory_usage`, SB3 overwrites the final
-            observations, and with `handle_timeout_termination=False` it learns from truncations as
-            from terminations.
+            observations. With `handle_timeout_termination=False`, SB3 treats truncations as
+            terminations.
 
     Raises:
         SpaceError: SB3 does not support a space, or a number is too large for float32.
@@ -56,7 +57,8 @@ def to_buffer(
     if options.pop("n_envs", 1) != 1:
         raise UsageError("n_envs must be 1: all episodes are stored as those of one environment")
     count = len(dataset)
-    # If next observations are the following row's observations, the last one needs a row, too.
+    # With `optimize_memory_usage`, the next observation is the observation of the following row, so
+    # the last next observation needs an additional row.
     needed = count + bool(options.get("optimize_memory_usage"))
     size = options.pop("buffer_size", needed)
     if size < needed:
@@ -67,7 +69,7 @@ def to_buffer(
     stored_space = _converted(observation_space, _sb3_order)
     try:
         buffer = buffer_class(size, stored_space, action_space, device=device, **options)
-    # SB3 raises these if the options exclude each other, or do not exist.
+    # SB3 raises these errors if options exclude each other or do not exist.
     except (AssertionError, NotImplementedError, TypeError, ValueError) as error:
         raise UsageError(f"{buffer_class.__name__}: {error}") from error
     _fill_observations(buffer, dataset)
@@ -88,23 +90,25 @@ def from_buffer(
 ) -> Dataset:
     """Copy the transitions of a replay buffer: one environment after the other, from old to new.
 
-    If the buffer was full, the first episode of an environment lacks its overwritten beginning.
+    If the buffer was full, the beginning of the first episode of each environment is missing,
+    because SB3 has overwritten it.
 
     Args:
         buffer: `ReplayBuffer` or `DictReplayBuffer`.
-        channels_last: Whether images are returned as (height, width, channels), as environments
-            have them, and not as SB3 transposes them.
-        scaled_actions: Whether actions of a bounded Box were scaled to [-1, 1], as SB3's algorithms
-            do. They are scaled back, which rounds them.
-        lossy: Whether a buffer with `handle_timeout_termination=False` is read, in which
-            truncations and terminations are the same: all become terminations. With
-            `optimize_memory_usage`, the buffer has no final observations: each repeats the one
-            before it.
+        channels_last: Whether to return images as (height, width, channels), the order of axes in
+            environments. Otherwise, images keep the order of axes in the buffer.
+        scaled_actions: Whether the actions of a bounded Box in the buffer are scaled to [-1, 1], as
+            SB3's algorithms store them. Such actions are scaled back to the bounds of the Box,
+            which rounds them.
+        lossy: Whether to read a buffer with `handle_timeout_termination=False`, which does not
+            distinguish truncations from terminations: all become terminations. If the buffer also
+            has `optimize_memory_usage`, it has lost the final observations: each becomes a copy of
+            the observation before it.
 
     Raises:
         SpaceError: A log cannot hold a space or dtype of the data.
         LogError: The buffer is empty, or has lost information and `lossy` is not set.
-        UsageError: It is not a replay buffer.
+        UsageError: `buffer` is not a replay buffer of SB3.
     """
     if not isinstance(buffer, import_extra(_MODULE, "online").ReplayBuffer):
         raise UsageError(f"expected a ReplayBuffer of SB3, but this is a {type(buffer).__name__}")
@@ -144,9 +148,10 @@ def _rows_in_order(buffer: Any) -> NDArray[np.int64]:
     """Return the indexes of a buffer's valid rows, from old to new.
 
     Raises:
-        LogError: There are none.
+        LogError: The buffer has no valid rows.
     """
-    # If next observations are shared, the newest one has overwritten the oldest observation.
+    # With `optimize_memory_usage`, the newest next observation has overwritten the oldest
+    # observation.
     oldest = buffer.pos + buffer.optimize_memory_usage if buffer.full else 0
     stop = buffer.pos + buffer.buffer_size if buffer.full else buffer.pos
     if oldest >= stop:
@@ -171,7 +176,8 @@ def _of_environment(
         number: Index of the environment.
         rows: Indexes of the buffer's rows, from old to new.
         space: Space of the observations to return.
-        orders: Order of the axes of each leaf of `space` in the buffer; None if it is the same.
+        orders: Permutation from the axes of each leaf in the buffer to its axes in `space`; None if
+            the order is the same.
         scaled_actions: See `from_buffer`.
     """
     dones, timeouts = (array[rows, number] > 0 for array in (buffer.dones, buffer.timeouts))
@@ -205,14 +211,14 @@ def _stored_observations(
     if not buffer.optimize_memory_usage:
         return here, leaf.of(buffer.next_observations)[rows, number]
     following = stored[(rows + 1) % len(stored)]
-    # After a row that ends an episode is the first observation of the next one.
+    # The row after the end of an episode contains the first observation of the next episode.
     lost = np.flatnonzero(dones[:-1])
     following[lost] = here[lost]
     return here, following
 
 
 def _parts(space: spaces.Space[Any]) -> list[tuple[Leaf, spaces.Space[Any]]]:
-    """Return the leaves of an observation space without nested Dicts, and their spaces."""
+    """Return each leaf and its space; the observation space must not have nested Dicts."""
     parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
     return list(zip(observation_leaves(space), parts, strict=True))
 
@@ -221,7 +227,7 @@ def _check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spa
     """Check that SB3's algorithms can learn from data in these spaces.
 
     Raises:
-        SpaceError: They cannot.
+        SpaceError: SB3 does not support one of the spaces.
     """
     if isinstance(observation_space, spaces.Dict):
         for key, part in observation_space.spaces.items():
@@ -250,7 +256,7 @@ def _check_integers(name: str, space: spaces.Space[Any]) -> None:
 def _converted(
     space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
 ) -> spaces.Space[Any]:
-    """Return an observation space with the axes of its parts in the orders of `order_of`."""
+    """Permute the axes of each part of an observation space as `order_of` returns for the part."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
     order = order_of(space)
@@ -260,12 +266,12 @@ def _converted(
 
 
 def _sb3_order(space: spaces.Space[Any]) -> Order | None:
-    """Return the order in which SB3 stores the axes of an environment's image."""
+    """Return the axis permutation from an environment's image to SB3's; None if not needed."""
     return (2, 0, 1) if _is_image(space) and np.argmin(space.shape or ()) > 0 else None
 
 
 def _environment_order(space: spaces.Space[Any]) -> Order | None:
-    """Return the order in which an environment has the axes of an image that SB3 stored."""
+    """Return the axis permutation from SB3's image to an environment's; None if not needed."""
     if not _is_image(space):
         return None
     channels, height, width = space.shape or ()
@@ -273,7 +279,7 @@ def _environment_order(space: spaces.Space[Any]) -> Order | None:
 
 
 def _stored_order(space: spaces.Space[Any]) -> Order | None:
-    """Return None: the axes stay as SB3 stored them."""
+    """Return None, which means that images keep SB3's order of axes."""
     return None
 
 
@@ -284,7 +290,7 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 
 
 def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
-    """Return rows (N, *shape) with the axes of a row in this order."""
+    """Permute the axes of each row of `values` (N, *shape); None keeps their order."""
     return values if order is None else values.transpose(0, *(axis + 1 for axis in order))
 
 
@@ -318,7 +324,7 @@ def _rounded(name: str, values: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[A
 
 
 def _unscaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
-    """Return actions of an environment for those that SB3 stored.
+    """Convert actions from the form that SB3 stores back to the environment's form.
 
     Raises:
         SpaceError: An action is not in [-1, 1].

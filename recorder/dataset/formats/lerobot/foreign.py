@@ -89,7 +89,7 @@ def foreign_dataset(files: Files) -> Dataset:
 def _observations(
     files: Files,
 ) -> tuple[dict[str, NDArray[Any]], dict[str, spaces.Space[Any]], tuple[str, ...]]:
-    """Return the values and spaces of the observations by key, and the names of the first one."""
+    """Return values and spaces by observation key, and the element names of the first key."""
     values, parts, labels = {}, {}, []
     for key, feature in _observed(files).items():
         values[key], parts[key] = _values_and_space(files.values(feature))
@@ -152,7 +152,7 @@ def _warn_of_steps(files: Files, steps: Mapping[str, Any]) -> None:
 
 
 def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
-    """Divide the rows into episodes; `next.done` and `next.truncated` end one."""
+    """Divide the rows into episodes; `next.done` or `next.truncated` ends an episode."""
     none = np.zeros((sum(files.lengths), 1), bool)
     done = steps.get(features.DONE, none)[:, 0] != 0
     truncated = steps.get(features.TRUNCATED, none)[:, 0] != 0
@@ -176,7 +176,7 @@ def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
 def _stretches(files: Files, ends: NDArray[np.bool_]) -> Iterator[tuple[int, int, int, bool]]:
     """Divide LeRobot's episodes after each end in `ends`.
 
-    Yields for each part: the index of LeRobot's episode, the first row, the last row + 1, and
+    For each part, yield the index of LeRobot's episode, the first row, the last row + 1, and
     whether the part is the last one of this episode.
     """
     for source, (start, stop) in enumerate(files.ranges()):
@@ -251,7 +251,7 @@ def _values_and_space(
 
 
 def _labels(feature: Feature) -> tuple[str, ...]:
-    """Return the names of a vector's elements, from a list or from lists by their kind."""
+    """Return the names of a vector's elements, from a list or from a dict with one list."""
     names = feature.names
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))

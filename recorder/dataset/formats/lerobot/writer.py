@@ -78,7 +78,7 @@ def frames_per_second(step_duration_ns: int) -> int | float:
 
 
 def task_of(options: str, metadata: LogMetadata) -> str:
-    """Return the text of an episode's task: the option `task` of its reset, or the environment."""
+    """Return the text of an episode's task: the reset option `task`, or the environment's id."""
     try:
         task = parse_json(options or "{}").get("task")
     except (ValueError, AttributeError):

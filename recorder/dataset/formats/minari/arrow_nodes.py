@@ -36,12 +36,12 @@ def read_table(folder: Path, form: str) -> Any:
 
 
 def array_at(table: Any, path: tuple[str | int, ...], shape: tuple[int, ...] | None) -> Any:
-    """Return the array of a column or of a part of it.
+    """Return a column, or a nested field of a column, as an array.
 
     Args:
         table: Table of an episode.
         path: Name of the column, then keys of Dicts and indexes of Tuples.
-        shape: Shape of a row; None leaves it as it is stored.
+        shape: Shape of a row; None keeps the stored shape.
 
     Returns:
         An array, or a list of bytes for images that are stored as JPEG.
@@ -67,7 +67,7 @@ def array_at(table: Any, path: tuple[str | int, ...], shape: tuple[int, ...] | N
 
 
 def infos_of(table: Any) -> dict[str, NDArray[Any]]:
-    """Return the infos of an episode by dotted name; those of other types are empty arrays."""
+    """Return the infos of an episode by dotted name; infos of other types are empty arrays."""
     if "infos" not in table.column_names:
         return {}
     return dict(_infos_below(_whole(table["infos"]), ()))
@@ -95,7 +95,7 @@ def _infos_below(struct: Any, path: tuple[str, ...]) -> Iterator[tuple[str, NDAr
             continue
         values = _values(column)
         if values is None:
-            # Text and lists of equal lengths.
+            # The column contains text, or lists of equal lengths.
             values = _plain_array(column.to_pylist())
         shape = (field.metadata or {}).get(b"shape")
         if shape is not None:
@@ -105,7 +105,7 @@ def _infos_below(struct: Any, path: tuple[str, ...]) -> Iterator[tuple[str, NDAr
 
 
 def _plain_array(values: list[Any]) -> NDArray[Any]:
-    """Return an array of lists or text; an empty one if their lengths or types differ."""
+    """Convert lists or strings to an array; it is empty if their lengths or types differ."""
     if any(value is None for value in values):
         return np.empty(0)
     try:
@@ -147,6 +147,6 @@ def _read_file(file: Path, form: str) -> Any:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Return the key of the order of the files `part-0`, `part-1`, ..."""
+    """Return the sort key of a file: its number, for names such as `part-0`, `part-1`, ..."""
     digits = file.stem.rpartition("-")[2]
     return (int(digits) if digits.isdecimal() else 0, file.name)

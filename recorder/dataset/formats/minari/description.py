@@ -30,7 +30,8 @@ OWN = "mcaprl"
 """Key of what Minari has no place for, in the metadata and in each episode."""
 MISSING = "missing_infos"
 """Group of an episode with the rows without an info, in the group `OWN`."""
-# The first version that reads images without JPEG. Minari refuses versions that are newer than it.
+# The first version of Minari that reads images without JPEG. Minari refuses datasets whose version
+# is newer than its own.
 _MINARI_VERSION = "0.5.4"
 _ABOUT = (
     "author",
@@ -76,7 +77,7 @@ def local_path(name: str) -> Path:
     """Return the folder of the local dataset with this id.
 
     Raises:
-        UsageError: It is not an id.
+        UsageError: `name` is not the id of a dataset.
     """
     if not _ID.fullmatch(name):
         raise UsageError(
@@ -87,7 +88,7 @@ def local_path(name: str) -> Path:
 
 
 def options_for(path: Path) -> dict[str, Any]:
-    """Return the id of the dataset that will be at a path, and create its namespaces.
+    """Return the id of a new dataset at a path, and create the Minari namespaces of the id.
 
     Raises:
         UsageError: The name of the folder does not end with a version.
@@ -106,7 +107,7 @@ def options_for(path: Path) -> dict[str, Any]:
 
 
 def data_folder(path: Path) -> Path:
-    """Return the folder with the metadata, in the folder of a dataset."""
+    """Return the folder that contains a dataset's metadata: its folder `data`, or itself."""
     return path / DATA if (path / DATA / FILE).exists() else path
 
 
@@ -194,7 +195,7 @@ def _spaces(raw: dict[str, Any], env_id: str) -> tuple[StoredSpace, spaces.Space
     texts = {role: raw.get(f"{role}_space") for role in ("observation", "action")}
     for role, text in texts.items():
         if text is None:
-            # Datasets of old versions of Minari have the spaces of their environment.
+            # Datasets of old Minari versions contain no spaces: use the spaces of the environment.
             texts[role] = space_to_text(getattr(_registered(env_id), f"{role}_space"))
     observation, action = (space_from_text(str(texts[role]), role) for role in texts)
     return observation, action.space
@@ -215,7 +216,7 @@ def _registered(env_id: str) -> gym.Env[Any, Any]:
 
 
 def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata:
-    """Return the metadata of the log that was written, if its spaces are still those of Minari."""
+    """Return the stored metadata of the log if its spaces equal Minari's, otherwise `found`."""
     strings = raw.get(OWN)
     if not isinstance(strings, dict):
         return found
@@ -232,7 +233,7 @@ def _env_of(raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     try:
         spec = parse_json(raw["env_spec"])
         kwargs = dict(spec.get("kwargs") or {})
-        # It concerns the recording, not the environment.
+        # `render_mode` concerns the recording, not the environment.
         kwargs.pop("render_mode", None)
         return str(spec["id"]), kwargs
     except (KeyError, ValueError, TypeError, AttributeError):
@@ -243,7 +244,7 @@ def _env_spec(metadata: LogMetadata) -> str | None:
     """Return the specification of the environment as JSON; None if there is none."""
     if not metadata.env_id:
         return None
-    # The module that an id names is not imported, because the data may be of others.
+    # The module in the id is not imported, because the data may come from an untrusted source.
     registered = gym.registry.get(metadata.env_id.rpartition(":")[2])
     try:
         spec = copy.deepcopy(registered) if registered else EnvSpec(metadata.env_id)

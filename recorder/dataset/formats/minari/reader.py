@@ -1,6 +1,7 @@
-"""Reading of Minari datasets in all their forms, without Minari.
+"""Reading of Minari datasets in HDF5, Arrow and Parquet form; Minari need not be installed.
 
-Minari cuts episodes of more than 32,767 steps when it reads its Arrow form; here they are whole.
+Minari does not return whole episodes of more than 32,767 steps when it reads its Arrow form. This
+reader does.
 """
 
 from __future__ import annotations
@@ -44,15 +45,15 @@ _OWN_TEXTS = ("reason", "policy", "options")
 
 @dataclass(frozen=True)
 class _Stored:
-    """What is stored of one episode.
+    """Stored data of one episode.
 
     Attributes:
         observations: Array of T + 1 rows, or JPEG files, of each leaf of the observation.
         steps: Arrays of T rows: `actions`, `rewards`, `terminations` and `truncations`.
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
-        own: Arrays that only our writer stores: `behavior_probs` and `log_time_ns`.
-        missing: Rows (T + 1,) without an info and the info's dtype, by its dotted name.
+        own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
+        missing: Flags (T + 1,) of the rows without an info, and the info's dtype, by dotted name.
     """
 
     observations: Sequence[Any]
@@ -85,7 +86,7 @@ def read_episodes(path: Path) -> tuple[LogMetadata, list[EpisodeArrays]]:
     if description.form not in forms:
         raise LogError(f"{path}: unknown data format '{description.form}' of Minari")
     reader = _Reader(path, description)
-    # The file is closed if an episode is refused, too.
+    # `closing` also closes the file if an episode is refused.
     with closing(forms[description.form](data_folder(path), description)) as stored:
         episodes = [reader.episode(index, part) for index, part in enumerate(stored)]
     episodes = reader.with_equal_infos(episodes)
@@ -180,7 +181,7 @@ class _Reader:
             )
 
     def _infos(self, stored: _Stored, count: int) -> dict[str, Any]:
-        """Return the infos with T + 1 rows; those with T rows have none of the reset."""
+        """Return the infos with T + 1 rows; an info of T rows has no value for the reset."""
         found: dict[str, Any] = {}
         for name, values in stored.infos.items():
             is_plain = values.ndim > 0 and values.dtype.kind in "biufU"
@@ -191,7 +192,7 @@ class _Reader:
             rows = np.concatenate([np.zeros((first, *values.shape[1:]), values.dtype), values])
             is_missing, dtype = stored.missing.get(name, (np.arange(count + 1) < first, rows.dtype))
             if len(is_missing) == len(rows):
-                # The length of a text is that of the longest.
+                # A string dtype must have the length of the longest string.
                 dtype = rows.dtype if rows.dtype.kind == "U" else dtype
                 found[name] = masked(rows, is_missing.astype(bool), dtype)
             else:
@@ -205,7 +206,7 @@ class _Reader:
         images = np.empty((len(values), *leaf.shape), np.uint8)
         for row, data in enumerate(values):
             try:
-                # The size is known before the pixels are decoded.
+                # Pillow reads the size of an image before it decodes the pixels.
                 with image_module.open(io.BytesIO(bytes(data)), formats=["JPEG"]) as image:
                     if image.size != (leaf.shape[1], leaf.shape[0]):
                         raise OSError(f"{image.size[0]} x {image.size[1]} pixels")
@@ -216,7 +217,7 @@ class _Reader:
 
 
 def _column(values: NDArray[Any]) -> NDArray[Any]:
-    """Return one value for each step; some datasets have an array of one element for each."""
+    """Return one value per step; some datasets store each value as an array of one element."""
     values = np.asarray(values)
     return values.reshape(len(values)) if values.size == len(values) else values
 

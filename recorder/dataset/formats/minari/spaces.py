@@ -1,7 +1,7 @@
 """Spaces in Minari's JSON text.
 
-Minari's text has no dtype for Discrete; it is written all the same, because Minari ignores it and
-`space_from_text` reads it.
+Minari does not store the dtype of a Discrete space. It is still written here: Minari ignores the
+dtype, and `space_from_text` reads it.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class StoredSpace(NamedTuple):
 
     Attributes:
         space: Space of the log. A Tuple becomes a Dict with the keys `0`, `1`, ...
-        keys: Where Minari stores each leaf of `space`, in order: keys of a Dict as text, indexes of
-            a Tuple as numbers.
+        keys: Path of each leaf of `space` in Minari's files, in order. Keys of a Dict are strings,
+            indexes of a Tuple are integers.
     """
 
     space: spaces.Space[Any]
@@ -66,7 +66,7 @@ def space_from_text(text: str, role: str) -> StoredSpace:
 
 
 def may_be_jpeg(space: spaces.Space[Any], leaf: Leaf) -> bool:
-    """Return whether Minari stores a leaf as JPEG if its JPEG encoding is on."""
+    """Return whether Minari stores a leaf as JPEG in a dataset with JPEG encoding."""
     box = leaf.of(space)
     return (
         isinstance(box, spaces.Box)
@@ -131,7 +131,7 @@ def _leaf_keys(
 
 
 def _ours(plain: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return the description of a space that `space_from_json` reads."""
+    """Convert Minari's description of a space to the form that `space_from_json` reads."""
     members = _members(plain)
     if members is not None:
         parts = [[str(key), _ours(part, f"{where}['{key}']")] for key, part in members]

@@ -1,8 +1,8 @@
 """Writing of Minari datasets in their HDF5 form, without Minari.
 
-Images are stored exactly, not as JPEG. Minari has no place for times, probabilities and some fields
-of an episode's summary: they are in the attribute and the group `mcaprl` of each episode, which
-Minari does not read.
+Images are stored without loss, not as JPEG. Minari's format cannot store times, probabilities and
+some fields of the episode summaries. They are written to the attribute `mcaprl` and the group
+`mcaprl` of each episode, which Minari does not read.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     Args:
         dataset: Episodes to write.
         path: Empty folder.
-        lossy: Whether what Minari cannot hold is left out or converted.
+        lossy: Whether to leave out or convert data that Minari cannot store.
         dataset_id: Id of the dataset; default: the name of the folder.
 
     Returns:
@@ -105,7 +105,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
 
 
 def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
-    # Minari appends to arrays that can grow.
+    # The arrays are resizable, because Minari may append to them.
     group.create_dataset(
         name,
         data=values,
@@ -115,7 +115,7 @@ def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
 
 
 def _put_info(group: Any, name: str, info: StoredInfo) -> None:
-    """Write an info, and which rows are missing; an episode without it has neither."""
+    """Write an info and the flags of its missing rows; nothing if all rows are missing."""
     if info.is_missing.all():
         return
     is_text = info.values.dtype.kind == "U"
@@ -127,7 +127,7 @@ def _put_info(group: Any, name: str, info: StoredInfo) -> None:
         chunks=True if values.size else None,
         maxshape=(None, *values.shape[1:]) if values.size else None,
     )
-    # An info that is missing in another episode is stored as floats in all.
+    # If an info is missing in any episode, all episodes store it as floats.
     if info.is_missing.any() or info.values.dtype != info.dtype:
         _put(group, f"{OWN}/{MISSING}/{name}", info.is_missing)
         group[f"{OWN}/{MISSING}/{name}"].attrs["dtype"] = info.dtype.str
@@ -190,5 +190,5 @@ def _is_attribute(name: str, value: Any) -> bool:
 
 
 def _is_text(text: str) -> bool:
-    """Return whether HDF5 can hold a text."""
+    """Return whether HDF5 can store a string."""
     return not re.search("[\\0\\ud800-\\udfff]", text)
