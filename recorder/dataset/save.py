@@ -74,10 +74,13 @@ def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:
         rows = slice(first, first + STEPS_PER_CHUNK)
         part = {}
         for name, info in columns.infos.items():
-            present = ~np.ma.getmaskarray(info[rows]).reshape(len(info[rows]), -1).any(axis=1)
+            mask = np.ma.getmaskarray(info[rows]).reshape(len(info[rows]), -1)
+            present = ~mask.any(axis=1)
             values = info_array(np.ma.getdata(info[rows])[present])
-            if values is None:
-                raise SpaceError(f"{path}: a log cannot store the info '{name}' of {info.dtype}")
+            if values is None or (mask.any(axis=1) != mask.all(axis=1)).any():
+                what = f"{info.dtype} of shape {info.shape[1:]}"
+                what += ", masked in parts of rows" if values is not None else ""
+                raise SpaceError(f"{path}: a log cannot store the info '{name}': {what}")
             if len(values):
                 part[name] = (columns.log_time_ns[rows][present].tolist(), values)
         topics.write(part)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError
 from mcaprl.recorder.dataset.mapped import Frames, joined, rows_of
 from mcaprl.recorder.format.episode_summary import EpisodeSummary
-from mcaprl.recorder.format.infos import Masked
+from mcaprl.recorder.format.infos import Masked, is_exact, kind_of
 
 STEP_COLUMNS = ("actions", "rewards", "terminated", "truncated", "behavior_probs")
 """The columns with one row per transition."""
@@ -140,16 +140,21 @@ def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str,
         parts: Infos by name, and the number of their rows.
 
     Raises:
-        SpaceError: An info differs in shape between the parts, or is text in one and numeric in
-            another.
+        SpaceError: An info differs in shape or kind (text, flag or number) between the parts, or
+            some of its integers are not exact as floats.
     """
     found: dict[str, Masked] = {}
     for name in dict.fromkeys(name for infos, _ in parts for name in infos):
         present = [infos[name] for infos, _ in parts if name in infos]
-        shape, kinds = present[0].shape[1:], {one.dtype.kind == "U" for one in present}
+        shape, kinds = present[0].shape[1:], {kind_of(one.dtype) for one in present}
         if len(kinds) > 1 or any(one.shape[1:] != shape for one in present):
             raise SpaceError(f"the info '{name}' differs between the parts in shape or kind")
         dtype = np.result_type(*(one.dtype for one in present))
+        # Texts of any lengths are kept.
+        for info in present if kinds == {"number"} else ():
+            values = info.compressed()
+            if not is_exact(values.astype(dtype), values):
+                raise SpaceError(f"the info '{name}' has integers that {dtype} cannot hold")
         every = [
             infos[name].astype(dtype) if name in infos else _nothing(count, shape, dtype)
             for infos, count in parts

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaprl.recorder.columns.cdr import ENCAPSULATION
-from mcaprl.recorder.format.infos import INFO_TOPICS
-from mcaprl.recorder.format.log_writer import LogTopics, Message
+from mcaprl.recorder.format.infos import INFO_TOPICS, is_exact
+from mcaprl.recorder.format.log_writer import LogWriter, Message
 from mcaprl.recorder.format.messages import TEXT_TYPE, text_message
 from mcaprl.texts import encodable
 
@@ -40,44 +42,44 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
     """Return values of one info as an array (K, *shape); None if a log cannot store them."""
     try:
         found = np.array(values)
+        found = found.astype(found.dtype.newbyteorder("="), copy=False)
+        # If the types are mixed, NumPy would convert numbers to text, and flags to numbers.
+        if len({(type(value), np.asarray(value).dtype) for value in values}) > 1 and not all(
+            is_exact(np.asarray(one), np.asarray(value))
+            for one, value in zip(found, values, strict=True)
+        ):
+            return None
     except (ValueError, OverflowError):
         return None
-    # If the types are mixed, NumPy would convert numbers to text, and flags to numbers.
-    kinds = {np.asarray(value).dtype.kind for value in values}
-    if len(kinds) > 1 and not (kinds == {"i", "f"} and _is_exact(found, values)):
-        return None
-    return found if found.dtype in _TYPES or (found.dtype.kind == "U" and found.ndim == 1) else None
-
-
-def _is_exact(found: NDArray[Any], values: Sequence[Any] | NDArray[Any]) -> bool:
-    return all(
-        bool((one == value).all() if isinstance(value, np.ndarray) else one.item() == value)
-        for one, value in zip(found, values, strict=True)
-        if value is not np.nan
-    )
+    if found.dtype.kind == "U":
+        return found if found.ndim == 1 else None
+    # The types of ROS have no arrays without values.
+    return found if found.dtype in _TYPES and (found.size or not len(found)) else None
 
 
 class InfoTopics:
     """Writer of infos to a log; a topic is announced at the first value of its info.
+
+    An appended recording continues the topics of the log.
 
     Attributes:
         refused: Names of the infos that were not written, with the reason.
         warned: Names of the infos for which a warning was given.
     """
 
-    def __init__(self, log: LogTopics) -> None:
-        """Create a writer that has not announced any topic yet."""
+    def __init__(self, log: LogWriter) -> None:
+        """Read which infos the log already has."""
         self._log = log
-        self._channels: dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]] = {}
-        self._topics: set[str] = set()
+        self._channels = _channels_of(log)
+        self._topics = {one.topic for one in log.mcap.channels.values()}
         self.refused: dict[str, str] = {}
         self.warned: set[str] = set()
 
     def write(self, infos: Mapping[str, tuple[Sequence[int], NDArray[Any]]]) -> None:
         """Write values (K, *shape) of infos with their log_times (K,), by name.
 
-        If values do not have the type of the info's first value, they are not written, and the
-        info's name is added to `refused`.
+        If values do not have the type of the info's first value in the log, they are not written,
+        and the info's name is added to `refused`.
         """
         messages: list[Message] = []
         for name, (times_ns, values) in infos.items():
@@ -89,15 +91,20 @@ class InfoTopics:
             elif values.shape[1:] == shape and _fits(values, dtype):
                 data = [_ENCAPSULATION + value.tobytes() for value in values.astype(dtype)]
             else:
-                what = f"{values.dtype} {values.shape[1:]} instead of {dtype} {shape}"
-                self.refused[name] = f"it became {what}"
+                self.refused[name] = (
+                    f"its values are {_described(values.dtype, values.shape[1:])}, and those before"
+                    f" are {_described(dtype, shape)}"
+                )
                 continue
             messages += [(channel, time, each) for time, each in zip(times_ns, data, strict=True)]
         self._log.sink.write_messages(sorted(messages, key=lambda message: message[1]))
 
     def _announce(self, name: str, values: NDArray[Any]) -> None:
         dtype, shape = values.dtype, values.shape[1:]
-        topic = INFO_TOPICS + re.sub(r"[^A-Za-z0-9_/]+", "_", name.replace(".", "/"))
+        topic = INFO_TOPICS + re.sub(r"[^A-Za-z0-9_.]", "_", name).replace(".", "/")
+        if not re.fullmatch(r"\w+(\.\w+)*", name, re.ASCII):
+            # Other names have the same characters; in each log, a name has the same topic.
+            topic += f"_{zlib.crc32(encodable(name).encode()):08x}"
         while topic in self._topics:
             topic += "_"
         self._topics.add(topic)
@@ -116,18 +123,30 @@ def _definition(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[str, str]
         name = {"uint": "UInt", "int": "Int", "float": "Float", "bool": "Bool"}
         word = kind.rstrip("0123456789")
         return f"std_msgs/msg/{name[word]}{kind.removeprefix(word)}", f"{kind} data"
-    count = int(np.prod(shape))
-    return f"mcaprl_msgs/msg/Info{kind.capitalize()}x{count}", f"{kind}[{count}] data"
+    sizes = "".join(f"x{size}" for size in shape)
+    return f"mcaprl_msgs/msg/Info{kind.capitalize()}{sizes}", f"{kind}[{math.prod(shape)}] data"
+
+
+def _channels_of(log: LogWriter) -> dict[str, tuple[int, np.dtype[Any], tuple[int, ...]]]:
+    """Return the channel, the dtype and the shape of each info that a log has, by name."""
+    found = {}
+    for channel in log.mcap.channels.values():
+        if channel.topic.startswith(INFO_TOPICS) and "info" in channel.metadata:
+            kind = log.mcap.schemas[channel.schema_id].data.decode().split()[0].partition("[")[0]
+            dtype = np.dtype(np.str_ if kind == "string" else kind)
+            shape = tuple(json.loads(channel.metadata["shape"]))
+            found[channel.metadata["info"]] = (channel.id, dtype, shape)
+    return found
+
+
+def _described(dtype: np.dtype[Any], shape: tuple[int, ...]) -> str:
+    kind = "text" if dtype.kind == "U" else dtype.name
+    return f"{kind} of shape {shape}" if shape else kind
 
 
 def _fits(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
     """Return whether values can be stored in this dtype without changing them."""
-    if values.dtype == dtype:
-        return True
-    kinds = {values.dtype.kind, dtype.kind}
-    if len(kinds) > 1 and kinds & {"U", "b"}:
+    if "U" in (values.dtype.kind, dtype.kind):
         return False
     with np.errstate(all="ignore"):
-        cast = values.astype(dtype)
-    is_float = cast.dtype.kind == values.dtype.kind == "f"
-    return bool(np.array_equal(cast, values, equal_nan=is_float))
+        return is_exact(values.astype(dtype), values)

@@ -2,7 +2,8 @@
 
 The messages have the log_time of the observation that the info came with. Scalars are messages of
 std_msgs; an array is `mcaprl_msgs/msg/Info...` with the field `data`, flat. The channel's metadata
-contains the name and the shape of the info.
+contains the name and the shape of the info. In the topic, the dots of the name are slashes. Other
+characters than letters, digits and `_` are replaced by `_`, and the name's CRC-32 is appended.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
     """
     channels = [one for one in reader.channels.values() if one.topic.startswith(INFO_TOPICS)]
     found: dict[str, Masked] = {}
-    if not channels:
+    if not channels or not len(times_ns):
         return found
     order = np.argsort(times_ns, kind="stable")
     for topic in sorted({channel.topic for channel in channels}):
@@ -49,6 +50,24 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
     return found
 
 
+def is_exact(stored: NDArray[Any], values: NDArray[Any]) -> bool:
+    """Return whether an array with another dtype has the same values."""
+    kinds = {kind_of(stored.dtype), kind_of(values.dtype)}
+    if len(kinds) > 1:
+        return False
+    if stored.dtype == values.dtype:
+        return True
+    if stored.dtype.kind == values.dtype.kind == "f":
+        return np.array_equal(stored, values, equal_nan=True)
+    # Python compares integers and floats exactly; NumPy would round the integers.
+    return bool(stored.tolist() == values.tolist())
+
+
+def kind_of(dtype: np.dtype[Any]) -> str:
+    """Return `number` for integers and floats, and NumPy's letter of other kinds."""
+    return "number" if dtype.kind in "iuf" else dtype.kind
+
+
 def _read(
     topic: Topic, shape_text: str, times_ns: NDArray[np.int64], order: NDArray[np.int64]
 ) -> Masked:
@@ -57,7 +76,7 @@ def _read(
     if topic.fields["data"].kind == "O":
         values = values.astype(str)
     elif topic.kinds.get("data", "").startswith("bool"):
-        values = values.view(np.bool_)
+        values = values != 0
     try:
         values = values.reshape(len(values), *shape)
     except ValueError as error:

@@ -25,6 +25,7 @@ class EpisodeInfos:
         self._topics = topics
         self._names = None if isinstance(names, bool) else tuple(names)
         self._values: dict[str, tuple[list[int], list[Any]]] = {}
+        self._twice: set[str] = set()
 
     def begin(self, info: Mapping[str, Any]) -> None:
         """Store the info that `reset` returned, in place of those of an earlier episode."""
@@ -38,35 +39,50 @@ class EpisodeInfos:
                 name == one or name.startswith(f"{one}.") for one in self._names
             ):
                 steps, values = self._values.setdefault(name, ([], []))
+                if steps and steps[-1] == step:
+                    self._twice.add(name)
                 steps.append(step)
-                # The environment may change its array later.
-                values.append(value.copy() if isinstance(value, np.ndarray) else value)
+                values.append(_copied(value))
 
     def end(self, length: int, start_ns: int, step_ns: int) -> None:
-        """Write the infos of the episode, and warn of those that a log cannot store.
+        """Write the infos of the episode.
 
         Args:
             length: Number of recorded transitions; infos of later observations are left out.
             start_ns: log_time of the first observation.
             step_ns: Time between two observations, nanoseconds.
         """
-        found, refused = {}, dict[str, str]()
+        found, refused = {}, self._topics.refused
         for name, (steps, values) in self._values.items():
             count = sum(step <= length for step in steps)
             if not count:
                 continue
             array = info_array(values[:count])
-            if array is None:
-                refused[name] = "it is neither number, flag, text nor an array of one shape"
+            if name in self._twice:
+                refused[name] = "two entries of the info have this name"
+            elif array is None:
+                refused[name] = (
+                    "a log stores flags, texts, integers, float32 and float64, and arrays of one"
+                    " shape, without a mixture of these"
+                )
             else:
                 found[name] = ([start_ns + step * step_ns for step in steps[:count]], array)
         self._values.clear()
-        if found:
-            self._topics.write(found)
-        for name, why in (refused | self._topics.refused).items():
+        self._topics.write(found)
+
+    def warn(self) -> None:
+        """Warn once of each info that the log cannot store, after the episode is written."""
+        for name, why in self._topics.refused.items():
             if name not in self._topics.warned:
                 self._topics.warned.add(name)
                 warnings.warn(f"the info '{name}' is not recorded: {why}", stacklevel=5)
+
+
+def _copied(value: Any) -> Any:
+    """Copy arrays and lists, because the environment may change them later."""
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    return [_copied(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:

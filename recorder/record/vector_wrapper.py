@@ -336,6 +336,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             self._learner.write(number, steps, start_ns, step_ns)
         self._columns.end(number, summary, step_ns)
         recording.advance(summary)
+        if self._infos:
+            self._infos[number].warn()
 
 
 # Public import path, for reprs and pickles.

@@ -287,6 +287,8 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
         self._recording.log.write_episodes([summary], log_lines=True)
         self._columns.end(episode.steps, terminated, truncated)
         self._recording.advance(summary)
+        if self._infos is not None:
+            self._infos.warn()
 
 
 # Public import path, for reprs and pickles.

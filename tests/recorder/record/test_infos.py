@@ -128,10 +128,109 @@ def test_a_value_of_another_type_is_left_out(log_path: Path) -> None:
     recorded.step(0)
     env.infos = ({"n": "text"}, {"n": "text"})
     recorded.reset()
-    with pytest.warns(UserWarning, match=r"info 'n' is not recorded: it became"):
+    with pytest.warns(UserWarning, match="its values are text, and those before are int64"):
         recorded.step(0)
     recorded.close()
     assert mcaprl.open(log_path).infos["n"].tolist() == [1, 2, None, None]
+
+
+class Changing(Infos):
+    """Environment whose info is one list, which each step changes."""
+
+    def __init__(self) -> None:
+        super().__init__({"at": [0, 0]}, {}, {})
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.infos[0]["at"][1] += 1
+        return *super().step(action)[:4], self.infos[0]
+
+
+def test_lists_are_copied_before_the_environment_changes_them(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(Changing(), log_path, infos=True)
+    env.reset()
+    for _ in range(2):
+        env.step(0)
+    env.close()
+    assert mcaprl.open(log_path).infos["at"].tolist() == [[0, 0], [0, 1], [0, 2]]
+
+
+def test_numbers_of_several_types_are_stored_if_they_are_exact(log_path: Path) -> None:
+    nan = float("nan")
+    found = record(log_path, {"a": np.uint8(3), "b": 1}, {"a": -5, "b": 0.5}, {"b": nan}).infos
+    assert found["a"].tolist() == [3, -5, None]
+    assert found["b"].dtype == np.float64
+    assert found["b"].tolist()[:2] == [1, 0.5]
+    assert np.isnan(found["b"][2])
+
+
+@pytest.mark.parametrize(
+    "infos",
+    [
+        ({"x": 2**60 + 1}, {"x": 0.5}),
+        ({"x": np.array([2**60 + 1])}, {"x": np.array([0.5])}),
+        ({"x": True}, {"x": 1}),
+        ({"x": np.zeros(0)}, {"x": np.zeros(0)}),
+        ({"x": np.zeros(2)}, {"x": np.zeros(3)}),
+        ({"x": ["two", "texts"]}, {}),
+        ({"x": None}, {"x": 1}),
+        ({"x": 2**70}, {}),
+        ({"x": 1j}, {}),
+    ],
+)
+def test_values_that_a_log_would_change_are_refused(log_path: Path, infos: Any) -> None:
+    with pytest.warns(UserWarning, match="the info 'x' is not recorded: a log stores flags"):
+        assert record(log_path, *infos).infos == {}
+
+
+def test_the_warning_comes_after_the_episode_is_on_disk(log_path: Path) -> None:
+    env = mcaprl.RecordMcap(Infos({"x": None, "y": 1}, {"y": 2}), log_path, infos=True)
+    env.reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match="the info 'x' is not recorded"):
+            env.step(0)
+    env.close()
+    assert mcaprl.open(log_path).infos["y"].tolist() == [1, 2]
+
+
+def test_two_entries_of_one_name_are_refused(log_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"the info 'a\.b' is not recorded: two entries"):
+        assert record(log_path, {"a.b": 1, "a": {"b": 2}}, {"a": {"b": 3}}).infos == {}
+
+
+def test_similar_names_stay_apart_in_any_order(log_path: Path) -> None:
+    record(log_path, {"a b": 1}, {"a b": 2})
+    data = record(log_path, {"a_b": 3, "a-b": 4, "a.b": 5}, {"a b": 6, "a/b": 7}, append=True)
+    assert {name: info.tolist() for name, info in data.infos.items()} == {
+        "a b": [1, 2, None, 6],
+        "a_b": [None, None, 3, None],
+        "a-b": [None, None, 4, None],
+        "a.b": [None, None, 5, None],
+        "a/b": [None, None, None, 7],
+    }
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "kept"),
+    [
+        (1, 2.0, [2, 2]),
+        (1, 0.5, [None, None]),
+        (0.5, 2**60 + 1, [None, None]),
+        (1, "text", [None, None]),
+        ("text", "longer text", ["longer text"] * 2),
+        (np.zeros((2, 3)), np.zeros((3, 2)), [[[None] * 3] * 2] * 2),
+    ],
+)
+def test_appended_infos_have_the_type_of_the_log(
+    log_path: Path, first: Any, second: Any, kept: list[Any]
+) -> None:
+    record(log_path, {"a": first}, {"a": first})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        data = record(log_path, {"a": second}, {"a": second}, append=True)
+    assert data.infos["a"].tolist()[2:] == kept
+    warned = ["the info 'a' is not recorded"] if np.ma.getmaskarray(data.infos["a"]).any() else []
+    assert [str(one.message).split(":")[0] for one in caught] == warned
 
 
 def test_appended_and_rotated_recordings_have_their_infos(tmp_path: Path) -> None:
@@ -159,6 +258,31 @@ def test_an_interrupted_episode_keeps_the_infos_of_its_steps(log_path: Path) -> 
     assert mcaprl.open(log_path).infos["a"].tolist() == [0, 1, 0, 1, 2]
 
 
+def test_a_killed_recording_has_the_infos_of_its_episodes(tmp_path: Path) -> None:
+    path, killed = tmp_path / "log.mcap", tmp_path / "killed.mcap"
+    env = mcaprl.RecordMcap(Infos({"a": 0}, {"a": 1}, {"a": 2, "end": 0.5}), path, infos=True)
+    sizes = []
+    for _ in range(3):
+        env.reset()
+        env.step(0)
+        env.step(0)
+        sizes.append(path.stat().st_size)
+    env.reset()
+    env.step(0)
+    content = path.read_bytes()
+    env.close()
+    # The last length cuts the third episode after its infos and before its steps.
+    for episodes, length in ((3, sizes[2]), (2, sizes[1]), (2, sizes[2] - 100)):
+        killed.write_bytes(content[:length])
+        with pytest.warns(UserWarning, match=f"finished episodes read: {episodes}"):
+            read = mcaprl.open(killed)
+        out = tmp_path / f"recovered-{length}.mcap"
+        mcaprl.recover(killed, out)
+        for found in (read.infos, mcaprl.open(out).infos):
+            assert found["a"].tolist() == [0, 1, 2] * episodes
+            assert found["end"].tolist() == [None, None, 0.5] * episodes
+
+
 @given(rows=st.lists(st.one_of(st.none(), st.floats(allow_nan=False)), min_size=2, max_size=9))
 def test_saved_infos_are_equal(rows: list[float | None], tmp_path_factory: Any) -> None:
     path = tmp_path_factory.mktemp("infos") / "log.mcap"
@@ -183,6 +307,11 @@ def test_datasets_keep_infos_when_divided_and_joined(tmp_path: Path) -> None:
     odd = record(tmp_path / "c.mcap", {"a": "text"}, {"a": "text"})
     with pytest.raises(SpaceError, match="the info 'a' differs"):
         mcaprl.Dataset.concatenate([first, odd])
+    large = record(tmp_path / "d.mcap", {"a": 2**60 + 1}, {"a": 0})
+    half = record(tmp_path / "e.mcap", {"a": 0.5}, {"a": 1.5})
+    assert mcaprl.Dataset.concatenate([first, half]).infos["a"].tolist()[-3:] == [2, 0.5, 1.5]
+    with pytest.raises(SpaceError, match="the info 'a' has integers that float64 cannot hold"):
+        mcaprl.Dataset.concatenate([large, half])
 
 
 def test_the_record_function_records_infos(log_path: Path) -> None:
@@ -215,3 +344,24 @@ def test_vector_environments_record_the_infos_of_each_episode(log_path: Path, mo
         assert np.flatnonzero(~np.ma.getmaskarray(returns)).tolist() == [episode.length]
         assert returns[-1] == episode.total_reward
         assert episode.infos["episode.l"][-1] == episode.length
+
+
+def test_vector_environments_that_are_reset_by_hand_record_infos(log_path: Path) -> None:
+    disabled = gym.vector.AutoresetMode.DISABLED
+    envs = gym.vector.SyncVectorEnv(
+        [lambda: Infos({"a": 0}, {"b": "x"}), lambda: Infos({"a": 5}, {"a": 6}, {"a": 7})],
+        autoreset_mode=disabled,
+    )
+    recorded = mcaprl.RecordVecMcap(envs, log_path, infos=True)
+    recorded.reset()
+    recorded.step(np.array([0, 0]))
+    recorded.reset(options={"reset_mask": np.array([True, False])})
+    recorded.step(np.array([0, 0]))
+    recorded.close()
+    data = mcaprl.open(log_path)
+    found = [(one.infos["a"].tolist(), one.infos["b"].tolist()) for one in data.episodes]
+    assert found == [
+        ([0, None], [None, "x"]),
+        ([0, None], [None, "x"]),
+        ([5, 6, 7], [None, None, None]),
+    ]
