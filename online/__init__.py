@@ -20,6 +20,7 @@ for _package in ("stable_baselines3", "tensorboard"):
         raise MissingExtraError(f"{_package} is not installed: pip install 'mcaprl[online]'")
 
 __all__ = [
+    "FRESH_SEED",
     "SELECTION_SEED",
     "SIM_SETTINGS",
     "VALUES",
@@ -44,7 +45,7 @@ __getattr__ = lazy_attributes(
     {
         "mcaprl.online.agent": ("Agent",),
         "mcaprl.online.curves": ("VALUES", "CurvePoint", "curve_figure", "draw_curves", "read_run"),
-        "mcaprl.online.evaluation": ("SELECTION_SEED", "Scale", "measure_scale"),
+        "mcaprl.online.evaluation": ("FRESH_SEED", "SELECTION_SEED", "Scale", "measure_scale"),
         "mcaprl.online.live": ("LiveTraining",),
         "mcaprl.online.policy": ("OnlinePolicy", "describe_run", "read_policy", "save_policy"),
         "mcaprl.online.presets": ("SIM_SETTINGS",),

@@ -16,17 +16,19 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import TrainingError
 from mcaprl.files import write_atomically
-from mcaprl.online.algorithms import make_model
+from mcaprl.online.algorithms import make_model, own_architecture
 from mcaprl.online.checkpoint import load_checkpoint, save_checkpoint
 from mcaprl.online.config import DQNConfig
 from mcaprl.online.curves import CurvePoint, write_curve
 from mcaprl.online.evaluation import Evaluation, FirstEpisodes, Scale
-from mcaprl.online.frames import StackedVecEnv
+from mcaprl.online.features import normalize_images
+from mcaprl.online.frames import StackedVecEnv, parts_of, parts_of_space
 from mcaprl.online.live import LiveTraining
 from mcaprl.online.policy import describe_run, save_policy
 from mcaprl.online.recording import ActionDescriber, recorded
@@ -41,10 +43,12 @@ from mcaprl.sims.evaluation.rollout import episode_seed
 LOG_INTERVAL = 1_000
 """Number of environment steps between two rows of scalars, and between two progress reports."""
 EVALUATIONS_NAME = "evaluations"
+CENTERING_STEPS = 2_000
+"""Number of random steps, taken before training, that yield the image statistics."""
 
 
 class Agent:
-    """Agent of a run, with its environments.
+    """Agent of one seed, with its training and evaluation environments.
 
     Attributes:
         model: Model of SB3.
@@ -71,7 +75,7 @@ class Agent:
             env_id: Gymnasium id of the environment.
             folder: Existing folder of this seed, RUN/seed-K.
             seed: Seed of the agent.
-            scale: Scale of scores.
+            scale: Mean returns that define the scores 0 and 1.
             record: Log to write; None records neither training nor evaluations.
             resume: Whether to resume from the folder's checkpoint and append to the log, if they
                 exist.
@@ -98,6 +102,9 @@ class Agent:
             self._eval_env = _stacked(eval_env, task.config.frame_stack)
             stacked = _stacked(env, task.config.frame_stack)
             self.model: BaseAlgorithm = make_model(task.algo, task.config, stacked, seed)
+            architecture = own_architecture(task.config, self.model.observation_space)
+            if architecture is not None and task.config.center_images:
+                center_images(self.model, task, seed)
             self._describer = None
             if recorder is not None:
                 self._describer = env.before_step = ActionDescriber(recorder, self.model)
@@ -114,13 +121,14 @@ class Agent:
             env_id,
             task.sim_options,
             task.config.frame_stack,
+            architecture,
         )
 
     def start_from(self, data: Dataset | None, policy: Any) -> None:
         """Start with logged transitions in the replay buffer, with a policy's weights, or both.
 
-        With data, the random steps at the start are omitted. With a policy, the agent uses the
-        final epsilon, and acts for `learning_starts` steps before learning.
+        With data, the agent takes no random steps before learning. With a policy, it explores with
+        the final epsilon from the start, and takes `learning_starts` steps before learning.
 
         Args:
             data: Logged transitions, if any.
@@ -203,7 +211,7 @@ class Agent:
     def _load(self, evaluation: Evaluation) -> None:
         extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
         if best:
-            # Evaluations after the checkpoint are repeated, so this file may exist.
+            # The file may be newer: the evaluations after the checkpoint are repeated.
             write_atomically(self._folder / BEST_NAME, best, TrainingError)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:
@@ -307,12 +315,28 @@ class _BetweenRollouts(_EveryInterval):
         pass
 
 
+def center_images(model: BaseAlgorithm, task: Task, seed: int) -> None:
+    """Set a model's image normalization to the statistics of `CENTERING_STEPS` random steps."""
+    with closing(task.batch(task.config.envs)) as envs:
+        envs.action_space.seed(seed)
+        seen = [envs.reset(seed=seed)[0]]
+        while len(seen) * task.config.envs < CENTERING_STEPS:
+            seen.append(envs.step(envs.action_space.sample())[0])
+    frames = {
+        key: np.concatenate([parts_of(each)[key] for each in seen])
+        for key, space in parts_of_space(envs.single_observation_space).items()
+        if is_image_space(space)
+    }
+    if frames:
+        normalize_images(model.policy, frames, task.config.frame_stack)
+
+
 def _stacked(env: VecEnv, count: int) -> VecEnv:
     return env if count == 1 else StackedVecEnv(env, count)
 
 
 def _logger(folder: Path, done: int) -> Logger:
-    """Return a logger of SB3's scalars to TensorBoard and to a separate CSV for each session."""
+    """Return an SB3 logger that writes scalars to TensorBoard and to one CSV per session."""
     suffix = f"-from-{done}" if done else ""
     formats = [make_output_format(name, str(folder), suffix) for name in ("csv", "tensorboard")]
     return Logger(folder=str(folder), output_formats=formats)

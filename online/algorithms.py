@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from mcaprl.errors import SpaceError, UnknownNameError
-from mcaprl.online.centering import center_images
+from mcaprl.networks import Architecture
 from mcaprl.online.config import (
     A2CConfig,
     DoubleDQNConfig,
@@ -23,8 +23,9 @@ from mcaprl.online.config import (
     PPOConfig,
 )
 from mcaprl.online.double_dqn import DoubleDQN, WarmDQN
+from mcaprl.online.features import NetworkDQNPolicy, inputs_of, policy_arguments, pools_of
 from mcaprl.online.frame_buffer import FrameReplayBuffer
-from mcaprl.online.frames import parts_of_space
+from mcaprl.online.frames import channels_first, parts_of_space
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,19 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     """Create a model with new weights, and seed Python, NumPy and torch."""
     algorithm = find_algorithm(algo)
     last_rate = config.learning_rate * config.final_learning_rate_fraction
+    architecture = own_architecture(config, env.observation_space)
     policy_kwargs: dict[str, Any] = {"net_arch": list(config.hidden)}
+    policy: Any = _policy_name(env.observation_space)
+    if architecture is not None:
+        policy_kwargs = policy_arguments(architecture)
+        if issubclass(algorithm.model_type, DQN):
+            policy = NetworkDQNPolicy
     if algorithm.model_type is not A2C:
         policy_kwargs["optimizer_kwargs"] = {"fused": True}
-    # SB3's classes have no common constructor, so their types do not cover these arguments.
+    # SB3's models share no constructor signature; `Any` hides the arguments from type checks.
     model_type: Any = algorithm.model_type
     model: BaseAlgorithm = model_type(
-        _policy_name(env.observation_space),
+        policy,
         env,
         learning_rate=LinearSchedule(config.learning_rate, last_rate, 1.0),
         policy_kwargs=policy_kwargs,
@@ -97,8 +104,8 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     if _has_images(env.observation_space):
         # Convolutions take 25 % less time in this format; files and results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
-        if config.center_images:
-            center_images(cast(Any, model.policy))
+    if isinstance(config, DoubleDQNConfig):
+        cast(DoubleDQN, model).alpha = config.alpha
     if isinstance(config, DQNConfig) and config.exploration_decay:
         cast(DQN, model).exploration_schedule = ExponentialSchedule(
             config.exploration_initial_eps,
@@ -109,12 +116,30 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
     return model
 
 
+def own_architecture(config: OnlineConfig, space: spaces.Space[Any]) -> Architecture | None:
+    """Return the architecture of this package's network, or None to use SB3's own network.
+
+    Args:
+        config: Settings of the algorithm.
+        space: Space of the stacked observations.
+    """
+    images = inputs_of(channels_first(space))[1]
+    architecture = config.architecture_for(image.shape[2] // config.frame_stack for image in images)
+    adapts_images = images and (config.center_images or architecture.encoder != "nature")
+    if adapts_images or architecture != Architecture(config.hidden, encoder=architecture.encoder):
+        return architecture
+    return None
+
+
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Return arguments for SB3; with images or stacks, the buffer stores each frame once."""
+    """Return SB3's constructor arguments; DQN on images or stacks gets a `FrameReplayBuffer`."""
     arguments = config.arguments()
     if isinstance(config, DQNConfig) and (config.frame_stack > 1 or _has_images(space)):
         extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
         extra["frame_stack"] = config.frame_stack
+        architecture = own_architecture(config, space)
+        if architecture is not None:
+            extra["pools"] = pools_of(channels_first(space), architecture)
         arguments |= {"replay_buffer_class": FrameReplayBuffer, "replay_buffer_kwargs": extra}
     return arguments
 
@@ -125,7 +150,7 @@ def _has_images(space: spaces.Space[Any]) -> bool:
 
 @dataclass(frozen=True)
 class ExponentialSchedule:
-    """Schedule that decays exponentially to `last` with SB3's remaining progress."""
+    """Schedule that multiplies `first` by `factor` at each step, down to the minimum `last`."""
 
     first: float
     last: float

@@ -27,7 +27,7 @@ from mcaprl.online.task import Task
 from mcaprl.runs import broken_checkpoint
 from mcaprl.tensor_files import read_tensors, write_tensors
 
-# NumPy's stubs lack the global generator, from which SB3 draws.
+# SB3 draws from NumPy's global generator; NumPy's type stubs lack `get_bit_generator`.
 _NUMPY_RANDOM: Any = np.random
 _BEST = "best"
 _COUNTERS = (
@@ -51,8 +51,8 @@ def save_checkpoint(
         model: Model between two rollouts.
         task: Task of the run.
         extra: JSON object for `load_checkpoint` to return.
-        best: File of the best policy so far, for `load_checkpoint` to return; empty if there is
-            none.
+        best: Bytes of the best policy's file so far, for `load_checkpoint` to return; empty if
+            there is none.
 
     Raises:
         TrainingError: The file cannot be written.
@@ -116,7 +116,7 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for number, parts in moments.items():
         for name, part in parts.items():
             if part.shape == weights[number].shape:
-                # The memory format has to be that of the weights (convolutions: channels last).
+                # Moments need the memory format of their weights: channels last for convolutions.
                 parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})
@@ -127,7 +127,7 @@ def _buffer_of(model: BaseAlgorithm) -> Any:
 
 
 def _sb3_columns(buffer: ReplayBuffer) -> dict[str, NDArray[Any]]:
-    """Return the filled rows of a buffer of SB3 by name, with one entry per key of a dict."""
+    """Return an SB3 buffer's arrays by name (`name.key` in a dict), without the unfilled rows."""
     columns: dict[str, NDArray[Any]] = {}
     for name, value in vars(buffer).items():
         parts = {f"{name}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {}

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any
 
-from mcaprl.settings import Settings
+from mcaprl.networks import Architecture, NetworkSettings
 
 
 @dataclass(frozen=True)
-class OnlineConfig(Settings):
+class OnlineConfig(NetworkSettings):
     """Settings of all online algorithms; each algorithm adds its own in a subclass.
 
     Raises:
@@ -25,8 +26,6 @@ class OnlineConfig(Settings):
     gamma: float = 0.99
     """discount per step"""
     hidden: tuple[int, ...] = (64, 64)
-    center_images: bool = False
-    """scale the input of the first convolution to [-2, 2] instead of [0, 1]"""
     max_grad_norm: float = 10.0
     """maximum norm of the gradient"""
     eval_interval: int = 5_000
@@ -75,6 +74,8 @@ class DQNConfig(OnlineConfig):
     """epsilon at the end"""
     exploration_decay: float = 0.0
     """factor on epsilon at each step; 0 selects the linear decay"""
+    dueling: bool = False
+    """learn the value of a state separately from the advantages of its actions"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -87,8 +88,13 @@ class DQNConfig(OnlineConfig):
         self._require("target_update_episodes", self.target_update_episodes >= 0, "at least 0")
         self._require_fraction("exploration_fraction", "exploration_initial_eps")
         self._require_fraction("exploration_final_eps", "exploration_decay")
+        self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
         even = max(self.steps_per_update, self.envs) % min(self.steps_per_update, self.envs) == 0
         self._require("steps_per_update", even, f"a multiple or a divisor of envs ({self.envs})")
+
+    def architecture_for(self, channels: Iterable[int]) -> Architecture:
+        """Return the network's architecture, given the channels of each image before stacking."""
+        return replace(super().architecture_for(channels), dueling=self.dueling)
 
     def arguments(self) -> dict[str, Any]:
         """Return arguments of SB3's constructor, except learning rate and networks."""
@@ -104,7 +110,7 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # SB3 never reaches this interval; a callback updates the network after episodes.
+            # SB3 never reaches this interval; a callback counts episodes and updates the network.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.
@@ -115,7 +121,15 @@ class DQNConfig(OnlineConfig):
 
 @dataclass(frozen=True)
 class DoubleDQNConfig(DQNConfig):
-    """Settings of Double DQN, the same as those of DQN."""
+    """Settings of Double DQN: those of DQN, plus alpha."""
+
+    alpha: float = 0.0
+    """weight of CQL's penalty on actions that are not in the replay buffer; 1 keeps a CQL policy"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        self._require("alpha", self.alpha >= 0, "at least 0")
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,10 @@
 
 With `n_steps` n, the target is the sum of n discounted rewards plus gamma^n times that value. SB3's
 replay buffer returns the sum and gamma^n; n is smaller if the episode ends earlier.
+
+With `alpha` above 0, CQL's penalty is added to the loss, as in `offline/algorithms/cql.py`:
+
+    https://arxiv.org/abs/2006.04779    alpha (logsumexp_a Q(s, a) - Q(s, a_buffer))
 """
 
 from __future__ import annotations
@@ -22,8 +26,8 @@ class WarmDQN(DQN):
     """SB3's DQN with an option for pretrained weights.
 
     Attributes:
-        skips_random_steps: Whether the policy fills the buffer before learning starts, instead of
-            random actions. Learning from too few steps destroys the pretraining
+        skips_random_steps: Whether the policy's actions, not random ones, fill the buffer before
+            learning starts. Learning from too few transitions would destroy the pretrained weights
             (https://arxiv.org/abs/2412.07762).
     """
 
@@ -37,7 +41,13 @@ class WarmDQN(DQN):
 
 
 class DoubleDQN(WarmDQN):
-    """SB3's DQN with the Double DQN target; its `.zip` files also load as `DQN`."""
+    """SB3's DQN with the Double DQN target; its `.zip` files also load as `DQN`.
+
+    Attributes:
+        alpha: Weight of CQL's penalty on actions that are not in the replay buffer.
+    """
+
+    alpha = 0.0
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Run gradient steps on batches from the replay buffer."""
@@ -52,8 +62,12 @@ class DoubleDQN(WarmDQN):
                 best = self.q_net(batch.next_observations).argmax(1, keepdim=True)
                 values_t = self.q_net_target(batch.next_observations).gather(1, best)
                 targets = batch.rewards + (1 - batch.dones) * discounts * values_t
-            values = self.q_net(batch.observations).gather(1, batch.actions.long())
+            values_of_all = self.q_net(batch.observations)
+            values = values_of_all.gather(1, batch.actions.long())
             loss = functional.smooth_l1_loss(values, targets)
+            if self.alpha:
+                actions = batch.actions[:, 0].long()
+                loss = loss + self.alpha * functional.cross_entropy(values_of_all, actions)
             self.policy.optimizer.zero_grad()
             torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)

@@ -1,4 +1,4 @@
-"""Evaluation during training in separate environments; random scores 0, and the pilot 1."""
+"""Evaluation during training, in separate environments; random scores 0, the pilot scores 1."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mcaprl.sims.evaluation.pilots import make_pilot
 SELECTION_SEED: Final = 3_000_000
 """Seed of the episodes that select the best checkpoint and form the curve."""
 FRESH_SEED: Final = 1_000_000
-"""Seed of the episodes of the final score; `mcaprl evaluate` uses the same ones."""
+"""Seed of the episodes of the final score, and the default seed of `mcaprl evaluate`."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Scale:
 
 
 def measure_scale(env: gym.Env[Any, Any], *, episodes: int, seed: int) -> Scale:
-    """Evaluate random actions and the pilot on the episodes of a seed."""
+    """Return the mean returns of random actions and of the pilot, on the same episodes."""
 
     def mean_return(policy: Any) -> float:
         score = evaluate(env, [policy], name="", episodes=episodes, seed=seed)
@@ -103,7 +103,7 @@ class Evaluation(EvalCallback):
         self._progress_m: list[float] = []
 
     def resume(self, calls: int, best_mean_return: float) -> None:
-        """Continue after `calls` steps of the training batch."""
+        """Resume after `calls` steps of the training batch, with the best mean return so far."""
         self.n_calls, self.best_mean_reward = calls, best_mean_return
 
     def _on_step(self) -> bool:
@@ -212,7 +212,7 @@ class FirstEpisodes(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
 
 def _rows(values: Any, numbers: NDArray[np.int64]) -> Any:
-    """Copy the numbered rows of an array, or of each array in a dict."""
+    """Return a copy of the rows with these indices, from an array or each array in a dict."""
     if isinstance(values, dict):
         return {key: _rows(part, numbers) for key, part in values.items()}
     return values[numbers]

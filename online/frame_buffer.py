@@ -3,12 +3,14 @@
 SB3's buffers store every observation twice, as the next observation of one step and the observation
 of the following step: 7 GB for 500,000 depth images of 84x84. Here, the next observation is read
 from the following row, and only the last observation of an episode is stored separately. Each frame
-of stacked observations is also stored once.
+of stacked observations is also stored once, and images may be stored at the smaller size to which
+the network averages them.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -25,7 +27,7 @@ _COLUMNS = ("final_of", "ages", "actions", "rewards", "dones", "timeouts")
 
 
 class FrameReplayBuffer(BaseBuffer):
-    """SB3's `ReplayBuffer`, `DictReplayBuffer` and `NStepReplayBuffer` in half the memory.
+    """Replacement for SB3's replay buffers (plain, dict and n-step) that needs half the memory.
 
     The buffer has R rows, each with one step of N environments. *shape is the shape of a single
     frame. In stacks, copies of the oldest stored frame replace overwritten frames.
@@ -54,6 +56,7 @@ class FrameReplayBuffer(BaseBuffer):
         n_steps: int = 1,
         gamma: float = 1.0,
         frame_stack: int = 1,
+        pools: Mapping[str, int] | None = None,
     ) -> None:
         """Reserve the memory; the operating system allocates it as the buffer fills.
 
@@ -67,12 +70,18 @@ class FrameReplayBuffer(BaseBuffer):
             n_steps: Number of rewards in a return.
             gamma: Discount per step.
             frame_stack: k, the number of successive frames in an observation.
+            pools: Factor by which the images of each key are averaged when they are stored.
         """
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = rows = max(buffer_size // n_envs, 1)
         self.n_steps, self.gamma, self.frame_stack = n_steps, gamma, frame_stack
-        self.frame_space = _frame_space(observation_space, frame_stack)
-        parts = parts_of_space(self.frame_space)
+        self._pools = {key: pool for key, pool in (pools or {}).items() if pool > 1}
+        frames = parts_of_space(_frame_space(observation_space, frame_stack))
+        parts = {
+            key: _pooled_space(space, self._pools[key]) if key in self._pools else space
+            for key, space in frames.items()
+        }
+        self.frame_space = parts[WHOLE] if WHOLE in parts else spaces.Dict(parts)
         self.frames = {k: np.zeros((rows, n_envs, *s.shape), s.dtype) for k, s in parts.items()}
         self.newest = {k: np.zeros((n_envs, *s.shape), s.dtype) for k, s in parts.items()}
         self.finals = {k: np.zeros((_FIRST_FINALS, *s.shape), s.dtype) for k, s in parts.items()}
@@ -144,7 +153,7 @@ class FrameReplayBuffer(BaseBuffer):
         self._free = sorted(set(range(slots)) - set(self.final_of[self.final_of >= 0].tolist()))
 
     def _free_slot(self) -> int:
-        """Return a free index of `finals`; if there is none, double the length first."""
+        """Return a free index of `finals`, whose length is doubled first if it is full."""
         if not self._free:
             count = len(next(iter(self.finals.values())))
             self.finals = {
@@ -175,10 +184,11 @@ class FrameReplayBuffer(BaseBuffer):
     def _look_ahead(
         self, rows: NDArray[Any], envs: NDArray[Any]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-        """Sum n rewards, or fewer if the episode or the buffer ends earlier.
+        """Sum n discounted rewards, or fewer if the episode or the buffer ends earlier.
 
         Returns:
-            Last row of each sum, the sum, and gamma to the power of the number of rewards.
+            Row of the last reward in each sum, the sum, and gamma to the power of the number of
+            rewards.
         """
         steps = np.arange(self.n_steps)
         ahead = (rows[:, None] + steps) % self.buffer_size
@@ -225,9 +235,9 @@ class FrameReplayBuffer(BaseBuffer):
     def _places(
         self, rows: NDArray[Any], envs: NDArray[Any], before: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Return the rows of the frames that were stored `before` steps earlier.
+        """Return the rows of the frames that are `before` steps older than the frames in `rows`.
 
-        Rows before the episode are replaced by its first frame.
+        If the episode has no such frame, its oldest frame in the buffer is used.
         """
         oldest = self.pos if self.full else 0
         stored = np.minimum(self.ages[rows, envs], (rows - oldest) % self.buffer_size)
@@ -235,19 +245,20 @@ class FrameReplayBuffer(BaseBuffer):
         return places % self.buffer_size
 
     def _ages_after(self, row: int) -> NDArray[np.int64]:
-        """Return the ages (N,) of the frames that follow a row; see `ages`."""
+        """Return the `ages` (N,) of the frames in the row that follows this one."""
         if not self.size():
             return np.zeros(self.n_envs, np.int64)
         ages = np.minimum(self.ages[row] + 1, self.frame_stack)
         return np.where(self.dones[row] > 0, 0, ages)
 
     def _newest_frames(self, observations: Any) -> dict[str, NDArray[Any]]:
-        """Return the newest frame of each stack."""
+        """Return the newest frame of each stack, in the size in which it is stored."""
         newest = {}
         for key, space in parts_of_space(self.frame_space).items():
             part, axis = parts_of(observations)[key], stack_axis(space)
             count = space.shape[axis]
-            newest[key] = np.take(part, range(-count, 0), axis) if self.frame_stack > 1 else part
+            part = np.take(part, range(-count, 0), axis) if self.frame_stack > 1 else part
+            newest[key] = _pooled(part, self._pools[key]) if key in self._pools else part
         return newest
 
     def _joined(self, frames: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -256,6 +267,21 @@ class FrameReplayBuffer(BaseBuffer):
     def _tensors(self, parts: dict[str, NDArray[Any]]) -> Any:
         tensors = {key: self.to_torch(part, copy=False) for key, part in parts.items()}
         return whole_of(tensors)
+
+
+def _pooled(images: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:
+    """Average images (N, channels, height, width) over `pool` x `pool` pixels, and round."""
+    height, width = (edge // pool * pool for edge in images.shape[-2:])
+    sums = np.zeros((*images.shape[:-2], height // pool, width // pool), np.uint32)
+    for row in range(pool):
+        for column in range(pool):
+            sums += images[..., row:height:pool, column:width:pool]
+    return ((sums + pool**2 // 2) // pool**2).astype(np.uint8)
+
+
+def _pooled_space(space: spaces.Space[Any], pool: int) -> spaces.Box:
+    channels, height, width = cast(spaces.Box, space).shape
+    return spaces.Box(0, 255, (channels, height // pool, width // pool), np.uint8)
 
 
 def _frame_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:

@@ -12,11 +12,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 WHOLE = ""
-"""Key of the only part of observations that are not a dict."""
+"""Key under which `parts_of` returns observations that are not a dict."""
 
 
 def parts_of_space(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def parts_of_space(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def parts_of(observations: Any) -> dict[str, NDArray[Any]]:
-    """Return the parts of observations by key."""
+    """Return observations as a dict of arrays by key; the key of a single array is `WHOLE`."""
     return observations if isinstance(observations, dict) else {WHOLE: observations}
 
 
@@ -35,10 +35,19 @@ def whole_of(parts: dict[str, Any]) -> Any:
 
 
 def stack_axis(space: spaces.Space[Any]) -> int:
-    """Return the axis of one observation along which frames are joined, counted from the end."""
+    """Return the negative index of the axis along which the frames of an observation are joined."""
     if is_image_space(space) and is_image_space_channels_first(cast(spaces.Box, space)):
         return -3
     return -1
+
+
+def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
+    """Return the space as SB3's networks receive it, with image channels first."""
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: channels_first(part) for key, part in space.items()})
+    if is_image_space(space) and not is_image_space_channels_first(cast(spaces.Box, space)):
+        return VecTransposeImage.transpose_space(cast(spaces.Box, space))
+    return space
 
 
 def stacked_space(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
@@ -97,12 +106,12 @@ class FrameMemory:
         return self.stacked()
 
     def begin_one(self, row: int) -> None:
-        """Start a new episode in a row; the newest observation of the row is its first."""
+        """Start a new episode in one row, with the newest observation of that row as its first."""
         for part in self.frames.values():
             part[row] = part[row, -1:]
 
     def ending(self, row: int, last: Any) -> Any:
-        """Return a row's stack with `last` (*shape) instead of its newest observation."""
+        """Return a row's stack, in which `last` (*shape) replaces the newest observation."""
         frames = {key: part[row : row + 1].copy() for key, part in self.frames.items()}
         for key, part in parts_of(last).items():
             frames[key][0, -1] = part
@@ -110,7 +119,7 @@ class FrameMemory:
         return whole_of({key: part[0] for key, part in stack.items()})
 
     def stacked(self) -> Any:
-        """Return the stacks (B, *stacked shape)."""
+        """Return the stored observations as stacks (B, ...) in the format of `stacked_space`."""
         return joined(whole_of(self.frames), self.space)
 
 
@@ -118,7 +127,7 @@ class StackedVecEnv(VecEnvWrapper):
     """Wrapper whose observations are stacks of the last k observations."""
 
     def __init__(self, venv: VecEnv, count: int) -> None:
-        """Wrap environments that reset themselves in the step that ends an episode."""
+        """Stack `count` observations; `venv` must reset in the step that ends an episode."""
         self._memory = FrameMemory(venv.observation_space, count)
         super().__init__(venv, stacked_space(venv.observation_space, count))
 

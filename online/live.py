@@ -1,7 +1,7 @@
 """Live view of training: episodes of one environment, and the learner's values for them.
 
-The view skips episodes, but training skips nothing; its results are bit-identical with and without
-viewers.
+The view skips some episodes, but training runs all of them. The results of training are
+bit-identical with and without viewers.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ TRAINING_LABELS = {
     "steps": "steps of all environments",
     "updates": "updates of the network",
 }
-"""Labels of the numbers in `/rl/training`, by name, the most important first."""
+"""Labels of the metrics in `/rl/training`, by name, the most important first."""
 TRAINING_NAMES = tuple(TRAINING_LABELS)
-"""Names of the numbers in `/rl/training`."""
+"""Names of the metrics in `/rl/training`."""
 WATCHED = 0
 """Index of the environment in the live view."""
 
 
 class LiveTraining:
-    """Live view of a run; it shows one seed after the other."""
+    """Live view of a training run; it shows the seeds one after another."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class LiveTraining:
         Args:
             task: Task of the run.
             port: Port on 127.0.0.1; 0 selects a free one.
-            origins: Origins of web pages that may connect, besides those of known viewers.
+            origins: Origins of other web pages that may connect; known viewers may always connect.
             speed: Simulated seconds per second in the episodes that are shown.
             pace: Limit on the time that is spent on the view.
 
@@ -102,9 +102,10 @@ class LiveTraining:
             self.stream.close()
 
     def _source_of(self, batch: Any) -> Callable[[int | None], object]:
-        """Return a function that provides an environment with the scene of the watched one.
+        """Return a function that maps the last action to the object whose scene is shown.
 
-        The function takes the last action of the watched environment; None after a reset.
+        The action is that of the watched environment, or None after a reset. The function returns
+        None if no scene can be shown.
         """
         single = self._shown.unwrapped
         if isinstance(batch, BatchedEnv) and isinstance(single, VehicleEnv):
@@ -125,7 +126,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     Attributes:
         model: Model of SB3 that trains in these environments; nothing is shown before it is set.
         score: Score of the last evaluation; NaN before the first one.
-        after_forward: Callback after each forward pass of the model for the live view.
+        after_forward: Callback that runs after the live view has run a forward pass of the model.
     """
 
     def __init__(
@@ -137,7 +138,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
     ) -> None:
         """Wrap `env`; `source` returns an object with the scene of the watched environment.
 
-        The argument of `source` is the last action of that environment; None after a reset.
+        The argument of `source` is the last action of that environment, or None after a reset.
         """
         super().__init__(env)
         self.model: BaseAlgorithm | None = None
@@ -211,7 +212,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         }
 
     def _metrics(self, model: BaseAlgorithm) -> dict[str, float]:
-        """Return the numbers of `/rl/training`."""
+        """Return the metrics of `/rl/training`."""
         logged = model.logger.name_to_value
         self._loss = logged.get("train/loss", logged.get("train/value_loss", self._loss))
         self._mean_q = logged.get("train/mean_q", self._mean_q)
@@ -235,7 +236,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             total_reward=self._return_so_far,
             terminated=terminated,
             truncated=truncated,
-            # The stream sets the times.
+            # `LiveStream.end_episode` replaces these times.
             start_time_ns=0,
             end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),
@@ -273,7 +274,7 @@ def _values(model: BaseAlgorithm, action: NDArray[Any]) -> dict[str, Any]:
 
 
 def _row(observations: Any, which: int | slice) -> Any:
-    """Return one environment's part of observations."""
+    """Return the observations at an index or slice of the batch."""
     if isinstance(observations, dict):
         return {key: part[which] for key, part in observations.items()}
     return observations[which]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -19,12 +19,20 @@ from stable_baselines3.common.policies import (
     BasePolicy,
     MultiInputActorCriticPolicy,
 )
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env import VecTransposeImage
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.dqn.policies import CnnPolicy, DQNPolicy, MultiInputPolicy
 
 from mcaprl.errors import PolicyError, SpaceError
-from mcaprl.online.frames import FrameMemory, joined, parts_of, stacked_space
+from mcaprl.networks import Architecture, architecture_of, check_size
+from mcaprl.online.features import NetworkDQNPolicy, inputs_of, policy_arguments
+from mcaprl.online.frames import (
+    FrameMemory,
+    channels_first,
+    joined,
+    parts_of,
+    parts_of_space,
+    stacked_space,
+)
 from mcaprl.online.zip_file import describe_sb3, read_model, write_model
 from mcaprl.recorder.format.spaces import (
     check_actions,
@@ -34,7 +42,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import BEST_NAME
-from mcaprl.tensor_files import check_widths, convolved_features
+from mcaprl.tensor_files import check_widths
 
 FORMAT_VERSION = 1
 _LEAST_IMAGE_FEATURES = 256
@@ -96,7 +104,8 @@ class OnlinePolicy:
         """Return the Q-values (B, A) of all actions, in the order of the action space.
 
         Args:
-            observations: (B, *shape), or (B, k, *shape), oldest first, for a frame stack of k.
+            observations: Observations (B, *shape). If `frame_stack` is k > 1, stacks
+                (B, k, *shape) of successive observations, with the oldest first.
 
         Raises:
             PolicyError: The policy has no Q-values, or the observations do not fit the network.
@@ -106,7 +115,9 @@ class OnlinePolicy:
         return cast(NDArray[np.float32], self._tried(self._outputs, observations))
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float32]:
-        """Return the probabilities (B, A) of all actions; a Q-network's best action has 1.
+        """Return the probabilities (B, A) of all actions.
+
+        With a Q-network, the best action has the probability 1 and all others have 0.
 
         Args:
             observations: Observations as for `q_values`.
@@ -122,7 +133,7 @@ class OnlinePolicy:
         return probabilities
 
     def _predicted(self, observations: Any, deterministic: bool) -> Any:
-        """Return the actions that the network selects for these and the stored observations."""
+        """Return the network's actions for observations, stacked with the stored ones if needed."""
         memory = self._memory
         if memory is not None:
             seen, now = (
@@ -153,7 +164,7 @@ class OnlinePolicy:
 
 
 def save_policy(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Write a model's file, with a description from which it loads without unpickling.
+    """Save a model with a description of its policy, so that it loads without unpickling.
 
     Args:
         path: `.zip` file to replace.
@@ -179,9 +190,15 @@ def describe_run(
     env_id: str,
     env_kwargs: dict[str, Any],
     frame_stack: int = 1,
+    architecture: Architecture | None = None,
 ) -> dict[str, Any]:
-    """Return the description that all policies of a run share, as plain JSON types."""
+    """Return the description that all policies of a run share, as plain JSON types.
+
+    `architecture` is None if the network is one of SB3's.
+    """
+    own = {} if architecture is None else {"architecture": asdict(architecture)}
     return {
+        **own,
         "algo": algo,
         "net_arch": list(hidden),
         "frame_stack": frame_stack,
@@ -218,17 +235,20 @@ def _build(
     frames = int(description.get("frame_stack", 1))
     check_actions(action_space)
     check_elements(frames * sum(leaf.size for leaf in observation_leaves(observation_space)))
-    for widths in _layers(observation_space, frames, description["net_arch"]):
-        check_widths(widths, weights)
     shape = channels_first(stacked_space(observation_space, frames))
-    policy_type: Any = _policy_type(description["network"], shape)
-    network = policy_type(
-        shape,
-        action_space,
-        lambda _: 0.0,
-        net_arch=description["net_arch"],
-        activation_fn=_ACTIVATIONS[description["activation"]],
-    )
+    kind, found = description["network"], description.get("architecture")
+    if found is not None:
+        network = _own_network(kind, architecture_of(found), shape, action_space, weights)
+    else:
+        for widths in _layers(observation_space, frames, description["net_arch"]):
+            check_widths(widths, weights)
+        network = _policy_type(kind, shape)(
+            shape,
+            action_space,
+            lambda _: 0.0,
+            net_arch=description["net_arch"],
+            activation_fn=_ACTIVATIONS[description["activation"]],
+        )
     network.load_state_dict(weights)
     network.set_training_mode(False)
     folder = path.resolve().parent
@@ -246,6 +266,24 @@ def _build(
     )
 
 
+def _own_network(
+    kind: str,
+    architecture: Architecture,
+    space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    weights: dict[str, Any],
+) -> BasePolicy:
+    """Create an SB3 policy with this package's network, after checking the number of weights."""
+    parts, (vectors, images) = parts_of_space(space), inputs_of(space)
+    width = sum(int(np.prod(parts[key].shape)) for key in vectors)
+    check_size(architecture, width, images, int(cast(spaces.Discrete, action_space).n), weights)
+    policy_type: Any = {"q-network": NetworkDQNPolicy, "actor-critic": ActorCriticPolicy}[kind]
+    network: BasePolicy = policy_type(
+        space, action_space, lambda _: 0.0, **policy_arguments(architecture)
+    )
+    return network
+
+
 def _layers(space: spaces.Space[Any], frames: int, net_arch: Any) -> Iterator[list[int]]:
     """Yield the widths of successive layers for each part of the observation.
 
@@ -259,18 +297,10 @@ def _layers(space: spaces.Space[Any], frames: int, net_arch: Any) -> Iterator[li
         if leaf.encoding is None:
             yield from ([leaf.size * frames, *chain] for chain in chains)
         else:
-            # SB3's convolutions end with at least this many features.
-            yield [max(convolved_features(leaf.shape), 1), _LEAST_IMAGE_FEATURES]
+            # SB3's image extractors have at least this many output features.
+            features = Architecture(()).features(leaf.shape)
+            yield [max(features, 1), _LEAST_IMAGE_FEATURES]
             yield from (list(chain) for chain in chains)
-
-
-def channels_first(space: spaces.Space[Any]) -> spaces.Space[Any]:
-    """Return the space as SB3's networks receive it, with image channels first."""
-    if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: channels_first(part) for key, part in space.items()})
-    if is_image_space(space) and not is_image_space_channels_first(cast(spaces.Box, space)):
-        return VecTransposeImage.transpose_space(cast(spaces.Box, space))
-    return space
 
 
 def _policy_type(network: str, space: spaces.Space[Any]) -> type[BasePolicy]:

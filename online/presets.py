@@ -1,8 +1,8 @@
 """Settings of each preset and of each sim.
 
-A preset contains published settings without changes, for a sim with the published rules: images or
-rays, one environment, classic rules. Presets also reproduce faults of the published programs, which
-docs/online.md lists.
+A preset contains published settings without changes. Its sim is set up as published: observations
+are images or rays, there is one environment, and the rules are classic. Presets also reproduce the
+faults of the published programs; docs/online.md lists these faults.
 
     autonomysim-car, autonomysim-drone      https://github.com/nervosys/AutonomySim
     ddqn-racer                              Double DQN on a ray-cast track
@@ -12,8 +12,8 @@ has the command and the scores of four seeds. Important settings are:
 
 - A learning rate that decays to 4 % of its initial value. With a constant learning rate, the policy
   oscillates until the end.
-- `n_steps` 3 for powerline and racer, whose rewards are sparse or late, and an update of the target
-  network only every 4,000 steps, or 2,000 with a shorter horizon.
+- `n_steps` is 3 for powerline and racer, whose rewards are sparse or late. Their target networks
+  are updated only every 2,000 steps (powerline, `gamma` 0.95) or 4,000 steps (racer, 0.98).
 - Checkpoints are compared on separate episodes and the best one is stored, because scores can still
   drop during training.
 """
@@ -49,8 +49,10 @@ _AUTONOMYSIM: Final[dict[str, Any]] = {
     "steps": 500_000,
     "envs": 1,
     "learning_rate": 2.5e-4,
-    # The output layer follows the 512 features of the convolutions directly.
+    # No hidden layers: the output layer follows the 512 features of SB3's `NatureCNN`.
     "hidden": (),
+    "encoder": "nature",
+    "center_images": False,
     "batch_size": 32,
     "buffer_size": 500_000,
     "steps_per_update": 4,
@@ -141,6 +143,40 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
 """Settings that differ from the algorithm's defaults, by the sim's id."""
 
 
+_FROM_IMAGES: Final[dict[str, Any]] = {
+    "learning_rate": 5e-4,
+    "final_learning_rate_fraction": 0.04,
+    "hidden": (256, 256),
+    "batch_size": 64,
+    "learning_starts": 2_000,
+    "eval_interval": 20_000,
+}
+_LANE_IMAGES: Final[dict[str, Any]] = {
+    **_FROM_IMAGES,
+    "dueling": True,
+    "layer_norm": True,
+    "steps": 200_000,
+    "gamma": 0.97,
+    "buffer_size": 100_000,
+    "target_update_interval": 4_000,
+    "exploration_fraction": 0.15,
+}
+IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
+    (SIMS["lane"], "dashboard"): _LANE_IMAGES,
+    (SIMS["lane"], "depth"): {**_LANE_IMAGES, "frame_stack": 4},
+    (SIMS["powerline"], "depth"): {
+        **_FROM_IMAGES,
+        "steps": 240_000,
+        "gamma": 0.95,
+        "n_steps": 3,
+        "buffer_size": 100_000,
+        "target_update_interval": 2_000,
+        "exploration_fraction": 0.15,
+    },
+}
+"""Settings for learning from images, by the sim's id and its argument `observation`."""
+
+
 def find_preset(name: str) -> Preset:
     """Find a preset by its name.
 
@@ -153,17 +189,19 @@ def find_preset(name: str) -> Preset:
 
 
 def settings_for(config_type: type, sim: str, sim_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tuned settings of a sim; for other environments, classic rules or images, none.
+    """Return the tuned settings of a sim; empty for other environments and for classic rules.
 
     Args:
-        config_type: Type of the algorithm's settings; only algorithms with `n_steps` and
-            `buffer_size` have settings here.
+        config_type: Type of the algorithm's settings. For types without `n_steps` or
+            `buffer_size`, the result is empty.
         sim: Short name or Gymnasium id.
         sim_options: Arguments of the environment.
     """
     known = {field.name for field in fields(config_type)}
     default_rules = sim_options.get("rules", "default") == "default"
-    from_vectors = sim_options.get("observation", "state") in ("state", "rays")
-    if not (default_rules and from_vectors and {"n_steps", "buffer_size"} <= known):
+    if not (default_rules and {"n_steps", "buffer_size"} <= known):
         return {}
-    return dict(SIM_SETTINGS.get(SIMS.get(sim, sim), {}))
+    env_id, observation = SIMS.get(sim, sim), sim_options.get("observation", "state")
+    if observation in ("state", "rays"):
+        return dict(SIM_SETTINGS.get(env_id, {}))
+    return dict(IMAGE_SETTINGS.get((env_id, observation), {}))

@@ -34,7 +34,7 @@ def log_paths(record: Path, seeds: range, resume: bool) -> dict[int, Path]:
     """
     if len(seeds) > 1 and record.suffix == ".mcap":
         raise UsageError(
-            f"{len(seeds)} seeds need a folder for one log each; {record} is a file name"
+            f"{len(seeds)} seeds write one log each: choose a folder; {record} is a file name"
         )
     paths = {seed: record / f"seed-{seed}.mcap" for seed in seeds}
     if record.suffix == ".mcap":
@@ -141,11 +141,12 @@ def exploration(model: BaseAlgorithm) -> float:
 def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the probabilities with which the model chose these actions.
 
-    With a Q-network and A actions, each is epsilon / A, plus 1 - epsilon for the greedy action. SB3
-    decides once for all environments whether to explore; the result is the marginal probability.
+    With a Q-network and A actions, the probability of each action is epsilon / A, plus 1 - epsilon
+    for the greedy action. At each step, SB3 explores either in all environments or in none; the
+    result is the marginal probability.
 
     Args:
-        model: Model in training; the actions are for its last observations.
+        model: Model in training, which chose `actions` for its last observations.
         actions: Actions (N,).
     """
     if not isinstance(model, DQN):
@@ -162,7 +163,7 @@ def behavior_probabilities(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArr
 
 
 def _likelihoods(model: BaseAlgorithm, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the probabilities of actions drawn from an actor's distribution."""
+    """Return the probability of each action under the actor's distribution."""
     policy = model.policy
     assert isinstance(policy, ActorCriticPolicy)
     with torch.inference_mode():

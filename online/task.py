@@ -48,7 +48,7 @@ class Task:
 
         Args:
             sim: Short name or Gymnasium id.
-            algo: Key of `ALGORITHMS`; None is Double DQN.
+            algo: Key of `ALGORITHMS`; None selects Double DQN.
             sim_options: Arguments of the environment.
             **settings: Settings that replace the defaults.
 
@@ -80,7 +80,7 @@ class Task:
 
         Args:
             folder: Folder of the run.
-            **settings: Settings that the user repeats; a run with other settings cannot be resumed.
+            **settings: Settings that the user gave again; they must be equal to those of the run.
 
         Raises:
             TrainingError: The folder has no online run.
@@ -110,13 +110,13 @@ class Task:
         return cls(algo, config_type(**{**defaults, **given}), sim, sim_options)
 
     def batch(self, count: int) -> VectorEnv[Any, Any, Any]:
-        """Create a batch of environments that reset in the step that ends their episode."""
+        """Create a batch of environments, each reset in the step that ends its episode."""
         mode = AutoresetMode.SAME_STEP.value
         return make_sims(self.sim, count, autoreset_mode=mode, **self.sim_options)
 
     @property
     def identity(self) -> RunIdentity:
-        """Settings that may not change between a run of this task and its resumption."""
+        """Settings of this task that must not change when a run is resumed."""
         parts = {"algo": self.algo, "sim": self.sim, "sim_options": self.sim_options}
         return RunIdentity({**parts, "config": self.config.to_json()})
 
@@ -130,11 +130,12 @@ def choose_task(
     preset: str | None = None,
     resumed: Path | None = None,
 ) -> Task:
-    """Return the task of a command line.
+    """Return the task that the arguments of a command line describe.
 
     Args:
-        sim: Short name or Gymnasium id; None selects that of the preset or the run.
-        algo: Name of the algorithm; None selects that of the preset or the run.
+        sim: Short name or Gymnasium id; None selects the sim of the preset or run.
+        algo: Name of the algorithm; None selects the algorithm of the preset or run, or else
+            Double DQN.
         sim_options: Arguments of the environment.
         given: Settings of the algorithm.
         preset: Name of published settings.

@@ -46,8 +46,9 @@ class OnlineSummary(RunSummary):
     Attributes:
         best_step: Number of environment steps before the best checkpoint.
         mean_return: Mean return of the best checkpoint on new episodes.
-        score: Mean return, scaled so that random is 0 and pilot is 1; NaN without a pilot.
-        ends: Number of these episodes by the reason for their end.
+        score: Mean return on a scale with the random policy at 0 and the pilot at 1; NaN without a
+            pilot.
+        ends: Number of the new episodes that ended for each reason.
     """
 
     best_step: int
@@ -76,7 +77,8 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of agents to train, one after the other.
         seed: Seed of the first agent; agent k uses seed + k.
-        record: Log of every transition, written during training; with several seeds, a folder.
+        record: Path of a log of every transition, written during training. With several seeds, this
+            is a folder with one log for each seed.
         data: Logged transitions that initialize the replay buffer.
         policy: Trained policy with Q-values whose weights initialize the agents, or a list with one
             policy for each seed.
@@ -92,7 +94,7 @@ def train(
         OutputExistsError: `out` or `record` exists.
         SpaceError: The algorithm does not support these observations or actions.
         PolicyError: The networks of `policy` and the agent differ.
-        TrainingError: `out` cannot be written, is being written by another training, or contains a
+        TrainingError: `out` cannot be written, is in use by another training process, or contains a
             run of another task; or there is no run to resume.
     """
     if seeds < 1 or seed < 0:

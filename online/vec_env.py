@@ -1,7 +1,7 @@
 """Batched Gymnasium environments with the interface of Stable-Baselines3, in one process.
 
 SB3's `DummyVecEnv` steps environments one after the other; `BatchedVecEnv` passes all actions to
-one `gymnasium.vector.VectorEnv` at once; for this package's sims, that is one compiled call.
+one `gymnasium.vector.VectorEnv` at once. This package's sims step in a single compiled call.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ class BatchedVecEnv(VecEnv):
 
     At an episode's end, `infos[i]` contains the entries that SB3 reads: `terminal_observation`,
     `TimeLimit.truncated`, and `episode` with the entries of SB3's `Monitor`. It also contains
-    `reason` and `progress_m` if the environment reports them. At other steps, the dicts are empty.
+    `reason` and `progress_m` if the environment reports them. At other steps, `infos[i]` is
+    empty.
 
     Attributes:
-        before_step: Callback with the actions (N,) before each step.
+        before_step: Callback that receives the actions (N,) before each step, if any.
     """
 
     def __init__(self, env: Any) -> None:
@@ -49,7 +50,7 @@ class BatchedVecEnv(VecEnv):
         self._began_s = time.time()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset of environment i with the seed of episode i in `rollout`."""
+        """Seed the next reset; the seed of environment i is `episode_seed(seed, i)`."""
         if seed is not None:
             self._seeds = [episode_seed(seed, i) for i in range(self.num_envs)]
         return self._seeds

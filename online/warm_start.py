@@ -14,10 +14,16 @@ from stable_baselines3.common.preprocessing import is_image_space
 from torch import nn
 
 from mcaprl.errors import PolicyError, SpaceError, UsageError
-from mcaprl.online.centering import take_plain_weights
+from mcaprl.networks import Convolutions, Trunk
 from mcaprl.online.frame_buffer import FrameReplayBuffer
-from mcaprl.online.frames import joined, parts_of, parts_of_space, stacked_space, whole_of
-from mcaprl.online.policy import channels_first
+from mcaprl.online.frames import (
+    channels_first,
+    joined,
+    parts_of,
+    parts_of_space,
+    stacked_space,
+    whole_of,
+)
 from mcaprl.recorder.dataset.dataset import Dataset
 
 _CHECKED = 64
@@ -27,9 +33,10 @@ _CHECKED = 64
 def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
     """Copy logged transitions into the empty replay buffer of a model.
 
-    The buffer has a column of successive steps for each environment, so the log is split into equal
-    parts; an episode that is split counts as truncated there. If the log has more transitions than
-    the buffer, the last ones are copied.
+    The buffer has a column of successive steps for each environment, so the log is split into one
+    part for each environment, all of equal length. An episode that continues beyond the end of a
+    part counts as truncated at that end. If the log has more transitions than the buffer can store,
+    the last ones are copied.
 
     Args:
         model: Fresh model.
@@ -59,7 +66,7 @@ def fill_buffer(model: BaseAlgorithm, dataset: Dataset) -> int:
 
 
 def _add(buffer: Any, dataset: Dataset, steps: NDArray[np.int64], cut: bool) -> None:
-    """Add one transition of each part of the log."""
+    """Add the transitions `steps`, one from each part of the log, as one row of the buffer."""
     batch = dataset.batch(steps)
     timeouts = (batch.truncated | cut) & ~batch.terminated
     buffer.add(
@@ -95,17 +102,7 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
         )
     stacks = _sample_stacks(space, frames)
     expected = policy.q_values(stacks if frames > 1 else _first_frames(stacks))
-    theirs, ours = _layers(_network_of(policy)), _layers(model.q_net)
-    shapes = [tuple(layer.weight.shape) for layer in theirs]
-    own = [tuple(layer.weight.shape) for layer in ours]
-    if shapes != own:
-        raise PolicyError(
-            f"{policy.name} has layers {_chain(shapes)}, but the agent has {_chain(own)}:"
-            " pass --hidden"
-        )
-    for source, target in zip(theirs, ours, strict=True):
-        target.load_state_dict(source.state_dict())
-    take_plain_weights(model.q_net)
+    _copy_layers(policy, model.q_net)
     model.q_net_target.load_state_dict(model.q_net.state_dict())
     with torch.inference_mode():
         inputs = model.policy.obs_to_tensor(joined(stacks, space))[0]
@@ -115,6 +112,41 @@ def take_weights(model: BaseAlgorithm, policy: Any, space: spaces.Space[Any]) ->
             f"{policy.name} has a network of another architecture (normalized inputs, for example):"
             " with its weights, the agent's network produces other values"
         )
+
+
+def _copy_layers(policy: Any, ours: nn.Module) -> None:
+    """Copy the weights of a policy's network, and its normalization, into an agent's network.
+
+    Raises:
+        PolicyError: The networks differ.
+    """
+    theirs = _network_of(policy)
+    if _weights_of(theirs) != _weights_of(ours):
+        raise PolicyError(
+            f"{policy.name} has layers {_chain(theirs)}, but the agent has {_chain(ours)}:"
+            " pass --hidden, --encoder, --channels, --dueling or --layer-norm"
+        )
+    for source, target in zip(_layers(theirs), _layers(ours), strict=True):
+        target.load_state_dict(source.state_dict())
+    for source, target in zip(_convolutions(theirs), _convolutions(ours), strict=False):
+        target.shift.copy_(source.shift)
+        target.scale.copy_(source.scale)
+    encoder = getattr(policy, "encoder", None)
+    if encoder is not None and encoder.width:
+        _fold_normalization(ours, encoder, getattr(policy, "frame_stack", 1))
+
+
+def _fold_normalization(network: nn.Module, encoder: Any, count: int) -> None:
+    """Fold the normalization (x - shift) / scale of a vector into the layers that receive it.
+
+    W ((x - shift) / scale) + b = V x + c with V = W / scale and c = b - V shift.
+    """
+    trunks = [module for module in network.modules() if isinstance(module, Trunk)]
+    layer = _layers(trunks[0].stems[-1])[0] if trunks else _layers(network)[0]
+    shift, scale = (torch.from_numpy(part).repeat(count) for part in (encoder.shift, encoder.scale))
+    with torch.no_grad():
+        layer.weight /= scale
+        layer.bias -= layer.weight @ shift
 
 
 def _sample_stacks(space: spaces.Space[Any], count: int) -> Any:
@@ -148,19 +180,29 @@ def _network_of(policy: Any) -> nn.Module:
     """Return the module that computes a policy's Q-values."""
     modules = [value for value in vars(policy).values() if isinstance(value, nn.Module)]
     if not modules:
-        raise PolicyError(f"{policy.name} has no network to start from")
+        raise PolicyError(f"{policy.name} has no network to copy weights from")
     return cast(nn.Module, getattr(modules[0], "q_net", modules[0]))
 
 
 def _layers(network: nn.Module) -> list[Any]:
     """Return the layers with weights, from input to output."""
-    return [layer for layer in network.modules() if isinstance(layer, nn.Linear | nn.Conv2d)]
+    kinds = nn.Linear | nn.Conv2d | nn.LayerNorm
+    return [layer for layer in network.modules() if isinstance(layer, kinds)]
 
 
-def _chain(shapes: list[tuple[int, ...]]) -> str:
-    """Format the widths from the input to the output.
+def _convolutions(network: nn.Module) -> list[Convolutions]:
+    return [module for module in network.modules() if isinstance(module, Convolutions)]
 
-    >>> _chain([(256, 12), (6, 256)])
-    '12-256-6'
+
+def _weights_of(network: nn.Module) -> list[tuple[int, ...]]:
+    return [tuple(layer.weight.shape) for layer in _layers(network)]
+
+
+def _chain(network: nn.Module) -> str:
+    """Format the widths of the layers from the input to the output.
+
+    >>> _chain(nn.Sequential(nn.Linear(12, 256), nn.LayerNorm(256), nn.Linear(256, 6)))
+    '12-256-norm-6'
     """
-    return "-".join(str(width) for width in [shapes[0][1], *(shape[0] for shape in shapes)])
+    widths = ["norm" if len(shape) == 1 else str(shape[0]) for shape in _weights_of(network)]
+    return "-".join([str(_weights_of(network)[0][1]), *widths])

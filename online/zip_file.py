@@ -4,7 +4,8 @@ SB3 writes an algorithm as a zip of `data` (JSON in which some values are pickle
 (weights) and more. SB3's loader unpickles; this module reads only the plain values and the weights.
 Files of this package also contain `mcaprl.json`, a full description of the policy, which SB3
 ignores. For files of plain SB3, the description is derived from the names of the weights and from
-the text beside pickled spaces and classes; dict observations are not supported.
+the plain text that SB3 stores with each pickled space or class; dict observations are not supported
+in these files.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from torch import Tensor
 
 from mcaprl.errors import PolicyError, TrainingError
 from mcaprl.files import parse_json, write_atomically
-from mcaprl.online.centering import plain_weights
 
 OWN_NAME = "mcaprl.json"
 _DATA_NAME = "data"
 _MAX_JSON_BYTES = 2**24
 _MAX_EXPANSION = 8
 _WEIGHTS_NAME = "policy.pth"
-# SB3 recreates these; storing them would make the file depend on this package's classes.
+# SB3 recreates these attributes when it loads a model. If they were stored, the file would
+# depend on this package's classes.
 _LEFT_OUT = (
     "replay_buffer_class",
     "replay_buffer_kwargs",
@@ -42,16 +43,15 @@ _KNOWN_KWARGS = {"net_arch", "activation_fn", "optimizer_kwargs", "optimizer_cla
 
 
 def write_model(path: Path, model: BaseAlgorithm, description: dict[str, Any]) -> None:
-    """Save a model for plain SB3, and for loading without unpickling in this package.
+    """Save a model in a file that plain SB3 loads, and that this package loads without unpickling.
 
     Args:
         path: File to replace.
         model: Model of SB3.
-        description: JSON object for `read_model` to return.
+        description: JSON object that `read_model` returns.
     """
     content = io.BytesIO()
-    with plain_weights(model.policy):
-        model.save(content, exclude=_LEFT_OUT)
+    model.save(content, exclude=_LEFT_OUT)
     with zipfile.ZipFile(content, "a") as archive:
         archive.writestr(OWN_NAME, json.dumps(description, indent=2))
     write_atomically(path, content.getvalue(), TrainingError)
@@ -61,8 +61,8 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
     """Read a model's file.
 
     Returns:
-        The description given to `write_model`, which is empty in files of plain SB3; SB3's own
-        data, in which pickled values stay pickled; and the weights by name.
+        The description given to `write_model` (empty for files of plain SB3); SB3's own data, whose
+        pickled values are not unpickled; and the weights by name.
 
     Raises:
         PolicyError: The file is not a model of SB3, or is broken.
@@ -90,35 +90,39 @@ def read_model(path: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Te
 
 
 def _read(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
-    """Read a part of a zip file.
+    """Read a member of a zip file.
 
     Raises:
-        ValueError: The part has more than `most` bytes.
-        KeyError: There is no such part.
+        ValueError: The member has more than `most` bytes.
+        KeyError: There is no such member.
     """
     # `zipfile` reads at most the declared size.
     size = archive.getinfo(name).file_size
     if size > most:
-        raise ValueError(f"'{name}' has {size} bytes, more than the {most} of a real model")
+        raise ValueError(
+            f"'{name}' has {size} bytes, more than the maximum of {most} for a valid model"
+        )
     return archive.read(name)
 
 
 def _check_size(weights: io.BytesIO, most: int) -> None:
-    """Check the declared sizes in a PyTorch file, which is also a zip file.
+    """Check the declared sizes of the members of a PyTorch file, which is a zip file.
 
     Raises:
-        ValueError: Their sum is more than `most` bytes.
+        ValueError: The sum of these sizes is more than `most` bytes.
     """
     if zipfile.is_zipfile(weights):
         with zipfile.ZipFile(weights) as archive:
             size = sum(part.file_size for part in archive.infolist())
         if size > most:
-            raise ValueError(f"its weights have {size} bytes, more than the {most} of a real model")
+            raise ValueError(
+                f"its weights have {size} bytes, more than the maximum of {most} for a valid model"
+            )
     weights.seek(0)
 
 
 def _are_weights(found: object) -> bool:
-    """Return whether an object is a dict of tensors whose elements are all stored."""
+    """Return whether an object is a dict of tensors with enough storage for all their elements."""
     return isinstance(found, dict) and all(
         isinstance(tensor, Tensor)
         and tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
@@ -134,7 +138,8 @@ def describe_sb3(data: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[st
         weights: Weights of the policy by name.
 
     Returns:
-        Description as `save_policy` writes it; the bounds of observations are unknown and infinite.
+        Description as `save_policy` writes it. The bounds of observations are unknown; they are set
+        to 0 and 255 for uint8, else to infinity.
 
     Raises:
         PolicyError: The description cannot be derived without unpickling, or is not supported.

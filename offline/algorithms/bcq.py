@@ -35,7 +35,7 @@ class BCQConfig(DQNConfig):
     """Settings of discrete BCQ: those of DQN, plus those of the behavior clone."""
 
     threshold: float = 0.3
-    """minimum probability relative to the most likely action; 0 is Double DQN, 1 cloning"""
+    """minimum probability relative to the most likely action; 0 is Double DQN, 1 is cloning"""
     logits_penalty: float = 0.01
     """weight of the mean square of the clone's logits"""
 

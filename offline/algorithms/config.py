@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from mcaprl.offline.algorithms.networks import Architecture
+from mcaprl.networks import NetworkSettings
 from mcaprl.offline.batches.buffer import Packing
-from mcaprl.settings import Settings
 
 
 @dataclass(frozen=True)
-class TrainingConfig(Settings):
+class TrainingConfig(NetworkSettings):
     """Settings of all offline algorithms; each algorithm adds its own in a subclass.
 
     The defaults learn lane keeping from 15,000 transitions in half a minute on one CPU core.
@@ -26,10 +25,6 @@ class TrainingConfig(Settings):
     final_learning_rate_fraction: float = 0.02
     weight_decay: float = 0.0
     """weight decay of AdamW"""
-    channels: tuple[int, ...] = (32, 64, 64)
-    """output channels of the three convolutions over images"""
-    layer_norm: bool = False
-    """normalize the hidden layers"""
     normalize: bool = False
     """normalize the network's inputs to mean 0 and standard deviation 1 over the data"""
     held_out: float = 0.05
@@ -42,8 +37,6 @@ class TrainingConfig(Settings):
         super().__post_init__()
         self._require_positive("updates", "batch_size", "log_interval")
         self._require("weight_decay", self.weight_decay >= 0, "at least 0")
-        three = len(self.channels) == 3 and all(count >= 1 for count in self.channels)
-        self._require("channels", three, "three numbers of at least 1")
         self._require("held_out", 0 <= self.held_out < 1, "within [0, 1)")
 
     def learning_rate_at(self, step: int) -> float:
@@ -54,12 +47,7 @@ class TrainingConfig(Settings):
     @property
     def packing(self) -> Packing:
         """Settings for building transitions from the log."""
-        return Packing(frame_stack=self.frame_stack, normalize=self.normalize)
-
-    @property
-    def architecture(self) -> Architecture:
-        """Architecture of the networks."""
-        return Architecture(self.hidden, self.channels, self.layer_norm)
+        return Packing(self.frame_stack, self.normalize, self.center_images)
 
 
 @dataclass(frozen=True)
@@ -82,11 +70,11 @@ class BootstrapConfig(TrainingConfig):
     @property
     def packing(self) -> Packing:
         """Settings for building transitions from the log."""
-        return Packing(self.frame_stack, self.normalize, self.gamma, self.n_steps)
+        return replace(super().packing, gamma=self.gamma, n_steps=self.n_steps)
 
     @property
     def horizon_fraction(self) -> float:
-        """Fraction of an infinite discounted return that values can contain after training.
+        """Fraction of an infinite-horizon return that values can represent after training.
 
         Values start near 0, and each update of the target network adds the rewards of n steps.
         After k updates, the value of a constant reward of 1 is (1 - gamma^(n k)) / (1 - gamma);

@@ -14,13 +14,14 @@ overestimate actions that are not in the log, so they are baselines for CQL.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
+from mcaprl.networks import Architecture
 from mcaprl.offline.algorithms.config import BootstrapConfig
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import (
@@ -31,7 +32,6 @@ from mcaprl.offline.algorithms.losses import (
     q_learning_target,
     temporal_difference_loss,
 )
-from mcaprl.offline.algorithms.networks import Architecture
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
 
@@ -42,7 +42,7 @@ class DQNConfig(BootstrapConfig):
     dueling: bool = False
     """learn the value of a state separately from the advantages of its actions"""
     n_quantiles: int = 1
-    """number of quantiles of the return, whose mean selects actions; 1 learns only the mean"""
+    """number of quantiles of the return, averaged to select actions; 1 learns only the mean"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -50,10 +50,9 @@ class DQNConfig(BootstrapConfig):
         self._require("n_quantiles", self.n_quantiles >= 1, "at least 1")
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
 
-    @property
-    def architecture(self) -> Architecture:
-        """Architecture of the networks."""
-        return replace(super().architecture, dueling=self.dueling)
+    def architecture_for(self, channels: Iterable[int]) -> Architecture:
+        """Return the architecture for images with these numbers of channels in a single frame."""
+        return replace(super().architecture_for(channels), dueling=self.dueling)
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,6 @@ class IQL(Learner):
 
     @torch.no_grad()
     def targets(self, batch: Batch) -> Tensor:
-        """Return r + gamma V(s') (R,)."""
+        """Return the targets (R,) of Q: r + gamma V(s')."""
         v_t = self.models["v"](batch.next_observations).squeeze(1)
         return batch.rewards + batch.discounts * v_t

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mcaprl.networks import Network
 from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.offline.algorithms.losses import allowed_only
 from mcaprl.offline.algorithms.models import Model, TargetNetwork, build_model
-from mcaprl.offline.algorithms.networks import Network
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
@@ -70,6 +70,8 @@ class Learner(ABC):
         self.seeds = tuple(seeds)
         self.step = 0
         self.n_actions = int(buffer.action_space.n)
+        channels = [image.shape[2] for image in buffer.encoder.image_inputs]
+        self.architecture = config.architecture_for(channels)
         states = [np.random.SeedSequence(seed).generate_state(2, np.uint32) for seed in seeds]
         self.samplers = [torch.Generator().manual_seed(int(second)) for _, second in states]
         networks = [self._random_networks(int(first)) for first, _ in states]
@@ -118,7 +120,7 @@ class Learner(ABC):
         size = self.config.batch_size
         rows = torch.cat([self.buffer.sample_rows(size, sampler) for sampler in self.samplers])
         terms = self.losses(self.buffer.batch(rows.to(self.buffer.device)))
-        # Each seed's rows depend only on its own weights, so one sum yields all gradients.
+        # A seed's loss depends only on that seed's weights, so one sum yields all gradients.
         loss = terms["loss"].sum()
         terms = {name: term.detach() for name, term in terms.items()}
         if not math.isfinite(loss.item()):
@@ -203,7 +205,7 @@ class Learner(ABC):
         self.step = step
 
     def _random_networks(self, seed: int) -> dict[str, Network]:
-        buffer, architecture = self.buffer, self.config.architecture
+        buffer, architecture = self.buffer, self.architecture
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             return {
@@ -214,7 +216,7 @@ class Learner(ABC):
             }
 
     def _not_finite(self, seed_means: Sequence[Mapping[str, float]]) -> NotFiniteError:
-        """Return an error that names the first term that is not finite; `loss` is the last."""
+        """Return an error for the first term, in the order of `losses`, that is not finite."""
         for seed, means in zip(self.seeds, seed_means, strict=True):
             for name, value in means.items():
                 if not math.isfinite(value):

@@ -107,7 +107,7 @@ def quantile_regression(z_tm1: Tensor, a_tm1: Tensor, target_tm1: Tensor) -> Ten
     n_quantiles = z_tm1.shape[2]
     _check_shape("target_tm1", target_tm1, (len(z_tm1), n_quantiles))
     tau = (torch.arange(n_quantiles, device=z_tm1.device) + 0.5) / n_quantiles
-    # (B, quantile i, sample j)
+    # The axes of all tensors below are (B, quantile i, sample j).
     quantiles = chosen(z_tm1, a_tm1).unsqueeze(2).expand(-1, -1, n_quantiles)
     samples = target_tm1.unsqueeze(1).expand_as(quantiles)
     weight = (tau.unsqueeze(1) - (quantiles > samples).float()).abs()
@@ -128,7 +128,7 @@ def cross_entropy(logits_tm1: Tensor, a_tm1: Tensor) -> Tensor:
 
 
 def square_penalty(logits_tm1: Tensor) -> Tensor:
-    """Return the mean square (B,) of the logits of allowed actions, which keeps them bounded."""
+    """Return a penalty on large logits: their mean square (B,); masked actions count as 0."""
     return logits_tm1.masked_fill(logits_tm1.isinf(), 0).square().mean(1)
 
 

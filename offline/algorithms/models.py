@@ -1,8 +1,8 @@
-"""Networks of the same shape, one for each of K seeds, trained in parallel; target networks.
+"""K networks of the same shape, one per seed, trained in parallel, and their target networks.
 
-The weights are the rows of one matrix (K, P), a leaf of autograd, so the optimizer, the target
-network and a checkpoint each handle one tensor. Batches contain the rows of all seeds, ordered by
-seed: R = K * B rows.
+The P weights of each network are a row of one matrix (K, P), a leaf of autograd, so the optimizer,
+the target network and a checkpoint each handle one tensor. Batches contain the rows of all seeds,
+ordered by seed: R = K * B rows.
 """
 
 from __future__ import annotations
@@ -16,12 +16,15 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from mcaprl.offline.algorithms.networks import Network
+from mcaprl.networks import Network
 from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
 
 _ALIGNMENT = 16
-"""Number of floats in a vector register; rows padded to it have the same arithmetic for any K."""
+"""Number of floats in a vector register.
+
+Rows of weights are padded to a multiple of it, so that the results of a seed do not depend on K.
+"""
 _ROWS_AT_ONCE = 1024
 
 
@@ -101,7 +104,8 @@ class StackedMLP(Model):
         columns = observations.vector.view(seeds, -1, observations.vector.shape[1]).mT
         count = columns.shape[2]
         if count == 1:
-            # Matrix-vector products round differently for one seed than for several.
+            # Add a second column, because matrix-vector products round differently for one seed
+            # than for several.
             columns = columns.expand(-1, -1, 2)
         parts = self.weights.split_with_sizes(self._sizes, 1)[:-1]
         last = len(parts) // 2 - 1
@@ -120,8 +124,8 @@ def build_model(networks: Sequence[Network]) -> Model:
 class TargetNetwork:
     """Copy of a model that is trained; the copy is updated at intervals.
 
-    Between two updates the outputs are constant. If that is faster than a forward pass for each
-    batch, they are computed for the whole dataset after each update, and then looked up.
+    Between two updates the outputs are constant. They are computed for the whole dataset after each
+    update and then looked up, if this is faster than a forward pass for each batch.
 
     Attributes:
         model: K target networks.
@@ -149,12 +153,12 @@ class TargetNetwork:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the computed outputs, because the weights have changed."""
+        """Drop the computed outputs; needed after each change of the weights."""
         self._table = None
 
     @torch.no_grad()
     def outputs(self, batch: Batch) -> Tensor:
-        """Return the outputs (R, ...) for the batch's states, or next states, without gradient."""
+        """Return the outputs (R, ...) for the states or next states in a batch; no gradient."""
         if not self._use_table:
             return self.model(batch.next_observations if self._next_states else batch.observations)
         if self._table is None:
@@ -165,7 +169,7 @@ class TargetNetwork:
 
 @torch.no_grad()
 def outputs_of_buffer(model: Model, buffer: TransitionBuffer, *, next_states: bool) -> Tensor:
-    """Return the outputs (K * N, ...) of K networks for a buffer's N states, or next states."""
+    """Return the outputs (K * N, ...) of K networks for the N states or next states of a buffer."""
     seeds, parts = len(model.weights), []
     for places in torch.split(buffer.places[int(next_states)], _ROWS_AT_ONCE):
         outputs = model(buffer.observe(places.repeat(seeds)))

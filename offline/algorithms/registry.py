@@ -70,7 +70,7 @@ def _load(entry: EntryPoint) -> type[Learner]:
     """Import the algorithm of an entry point, and check it."""
     try:
         found = entry.load()
-    except Exception as error:  # An import can raise anything.
+    except Exception as error:  # Importing a module can raise any exception.
         raise _broken(entry, f"{type(error).__name__}: {error}") from error
     if not (isinstance(found, type) and issubclass(found, Learner)):
         raise _broken(entry, "it is not a subclass of Learner")

@@ -1,4 +1,4 @@
-"""Course of the lane sim: its path, its streets, and the rails and houses beside them.
+"""Course of the lane sim: its path, its streets, and the rails, barriers and houses beside them.
 
 The path is 1,026 m long. It consists of two squares of about 130 m that share a leg; the first is
 driven clockwise, the second counter-clockwise. Coordinates are right-handed with z up. The sign of
@@ -32,13 +32,18 @@ COURSE = closed_path(CORNERS_M)
 NEXT_TURN: NDArray[np.float64] = np.sign(np.sin(np.roll(COURSE.yaw_rad, -1) - COURSE.yaw_rad))
 """(N,) direction of the turn at the end of each leg: 1 left, -1 right."""
 
+SECOND_SQUARE_M = float(COURSE.along_m[4])
+"""Distance along the path at which the second square begins."""
+
 LANE_HALF_WIDTH_M = 3.5
 RAIL_OFFSET_M = 4.0
 """Distance from the center line to the inner faces of the rails."""
 RAIL_HEIGHT_M = 0.7
 RAIL_THICKNESS_M = 0.12
+BARRIER_HEIGHT_M = 3.0
+"""Height of the barriers, which is above the camera."""
 GROUND_HALF_SIDE_M = 1000.0
-"""Half of the ground's side; the ground extends to the last row of pixels below the horizon."""
+"""Half of the ground's side; large enough to cover the last row of pixels below the horizon."""
 
 CAMERA_FORWARD_M = 0.4
 """Distance of the camera from the middle of the wheelbase, the origin of the car's frame."""
@@ -109,6 +114,22 @@ def rails() -> list[Box]:
         length_m, width_m = x1 - x0 + RAIL_THICKNESS_M, y1 - y0 + RAIL_THICKNESS_M
         boxes.append(Box((x0 + x1) / 2, (y0 + y1) / 2, length_m, width_m, RAIL_HEIGHT_M))
     return boxes
+
+
+def barriers() -> tuple[tuple[Box, ...], tuple[Box, ...]]:
+    """Return the barriers for a car on the first square, and those for a car on the second.
+
+    Both ends of the shared leg are crossings. Barriers close the streets of the other square there,
+    so that the street to take is visible: without them, the shared leg looks the same on both
+    squares, but its end is a right turn on the first square and a left turn on the second.
+    """
+    (x0, y0), (x1, _) = CORNERS_M[:2]
+    aside_m = RAIL_OFFSET_M + RAIL_THICKNESS_M / 2
+    size = (2 * RAIL_OFFSET_M, RAIL_THICKNESS_M, BARRIER_HEIGHT_M)
+    first, second = (
+        tuple(Box(x_m, y0 + side * aside_m, *size) for x_m in (x0, x1)) for side in (1, -1)
+    )
+    return first, second
 
 
 def _overlaps(box: Box, bounds: NDArray[np.float64]) -> bool:

@@ -38,10 +38,14 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     Axes are right-handed with z up; x and y are in meters. Angles are counter-clockwise, so left
     is positive.
 
+    The leg that both squares share looks the same on both, but ends with a right turn on the first
+    square and with a left turn on the second. Barriers, 3 m high, therefore close the streets of
+    the other square at both ends of this leg.
+
     ## Action Space
 
     `Discrete(6)`. Actions 1 to 5 accelerate with 4 (1 - v / 30) m/s^2. The maximum steering angle
-    is 40 degrees at rest and decreases to 70 % of that at 120 km/h; the lateral acceleration is
+    is 40 degrees at rest and decreases to 28 degrees at 120 km/h; the lateral acceleration is
     limited to 9 m/s^2.
 
     | Action | Meaning | Steering |
@@ -79,7 +83,7 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     | Index | Observation | Unit | Limit |
     |---|---|---|---|
-    | 0 to 15 | distance to the next rail or house | see below | 0 to 1 |
+    | 0 to 15 | distance to the next rail, barrier or house | see below | 0 to 1 |
     | 16 | speed | 30 m/s | 0 to 1 |
     | 17 | last steering command, left positive | 50 % | 1 |
     | 18, 19 | path point 20 m ahead: forward, left of the car | 20 m | 4 |
@@ -134,6 +138,8 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
     - In the published code, a collision ends an episode only during the action straight.
     - A decision of one second is too long for corrections: at 15 m/s, any steering action makes
       the car leave the lane.
+    - There are no barriers, so a camera image does not show which street to take at the end of the
+      shared leg.
     - The image encoding uses half of its values for distances of 1 to 2 m.
 
     The car and the town differ from the published ones, and images are downsampled by averaging
@@ -201,7 +207,12 @@ class LaneKeepingEnv(VehicleEnv[LaneFleet, FollowView]):
 
     def scene(self) -> Sequence[Shape]:
         """Return the shapes that change with each step."""
-        return lane_scene.moving_shapes(self.car, self.trail, self.fleet.has_rays)
+        return lane_scene.moving_shapes(
+            self.car,
+            self.trail,
+            has_rays=self.fleet.has_rays,
+            has_barriers=self.fleet.has_barriers,
+        )
 
     def static_frames(self) -> Sequence[Frame]:
         """Return the camera's frame in the car: x right, y down, z along the view."""

@@ -36,7 +36,7 @@ from mcaprl.sims.vehicle.fleet import CAR_INFO, GOING_ON, Fleet
 
 _NAMES = {"state": OBSERVATION_NAMES, "rays": RAY_OBSERVATION_NAMES}
 SPEED = Car._fields.index("speed_m_s")
-"""Index, in a car's row, of the first number that `info` uses."""
+"""Index of the speed in a car's row; `info` uses the values from this index onward."""
 MOTION = slice(2, 4)
 """Indices of speed and steering in the observed state."""
 
@@ -63,6 +63,7 @@ class LaneFleet(Fleet):
         check_name("observation", observation, ("state", "depth", "dashboard", "rays"))
         check_name("start", start, (None, "anywhere", "line"))
         self._classic, self._by_code = rules != "default", rules == "classic-code"
+        self.has_barriers = not self._classic
         self._on_line = start == "line" or (self._classic and start is None)
         super().__init__(
             count,
@@ -111,7 +112,7 @@ class LaneFleet(Fleet):
             self._draws.one(i, self._shares)
             self._start_one(i)
         if self.has_rays:
-            observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1])
+            observe_all_rays(self._cars[i : i + 1], self._rays[i : i + 1], self.has_barriers)
         self._depth_m.pop(i, None)
 
     def begin_all(self, chosen: NDArray[np.int64], randoms: Sequence[np.random.Generator]) -> None:
@@ -122,7 +123,7 @@ class LaneFleet(Fleet):
         start_cars(chosen, *chances, self._cars, self.rewards, self.ends, self._states)
         if self.has_rays:
             seen = np.empty((len(chosen), self._rays.shape[1]), dtype=np.float32)
-            observe_all_rays(self._cars[chosen], seen)
+            observe_all_rays(self._cars[chosen], seen, self.has_barriers)
             self._rays[chosen] = seen
         if self._depth_m:
             for i in chosen.tolist():
@@ -132,7 +133,7 @@ class LaneFleet(Fleet):
         """Advance each car by one decision."""
         self._step()
         if self.has_rays:
-            observe_all_rays(self._cars, self._rays)
+            observe_all_rays(self._cars, self._rays, self.has_barriers)
         if self._depth_m:
             self._depth_m.clear()
 
@@ -194,7 +195,7 @@ class LaneFleet(Fleet):
         """Return the image of car i: (84, 84) distances along each ray, meters."""
         if i not in self._depth_m:
             if self._camera is None:
-                self._camera = CarCamera()
+                self._camera = CarCamera(has_barriers=self.has_barriers)
             self._depth_m[i] = self._camera.image_m(self.car(i))
         return self._depth_m[i]
 

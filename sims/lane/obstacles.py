@@ -1,4 +1,4 @@
-"""Rails and houses of the lane sim: collision test with the car, and distances along rays."""
+"""Obstacles of the lane sim: collision test with the car, and distances along rays."""
 
 from __future__ import annotations
 
@@ -9,19 +9,36 @@ from numpy.typing import NDArray
 
 from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.ray_code import FAR_M
-from mcaprl.sims.lane.course import buildings, rails
+from mcaprl.sims.lane.course import COURSE, SECOND_SQUARE_M, Box, barriers, buildings, rails
 from mcaprl.sims.lane.rules import Car
 
 BODY_LENGTH_M, BODY_WIDTH_M = 4.3, 1.75
 BODY_FORWARD_M = 0.05
 """Distance of the body's center ahead of the middle of the wheelbase."""
 
-BOXES_M: NDArray[np.float64] = np.array(
-    [(box.x_m, box.y_m, box.length_m / 2, box.width_m / 2) for box in (*rails(), *buildings())]
+_FAR_AWAY = Box(1e9, 1e9, 0.0, 0.0, 0.0)
+
+
+def _boxes_m(*barriers: Box) -> list[tuple[float, ...]]:
+    boxes = (*rails(), *buildings(), *barriers)
+    return [(box.x_m, box.y_m, box.length_m / 2, box.width_m / 2) for box in boxes]
+
+
+NO_BARRIERS = 0
+WORLDS_M: NDArray[np.float64] = np.array(
+    [_boxes_m(_FAR_AWAY, _FAR_AWAY), *(_boxes_m(*closed) for closed in barriers())]
 )
-"""(K, 4) x and y of the center of each obstacle, and half of its size along x and y."""
+"""(3, K, 4) x and y of the center of each obstacle, and half of its size along x and y. First axis:
+without barriers; with the barriers for a car on the first square; with those for the second."""
+_LENGTH_M = COURSE.length_m
 _HUGE = 1e12
 """Finite replacement for 1 / 0."""
+
+
+@compiled
+def world_at(along_m: float) -> int:
+    """Return the `WORLDS_M` index of the obstacles for a car at a distance along the path."""
+    return 1 if along_m % _LENGTH_M < SECOND_SQUARE_M else 2
 
 
 @compiled
@@ -35,8 +52,9 @@ def touches(car: Car) -> bool:
     x_m, y_m = car.x_m + BODY_FORWARD_M * cos, car.y_m + BODY_FORWARD_M * sin
     ahead_m, aside_m = 0.5 * BODY_LENGTH_M, 0.5 * BODY_WIDTH_M
     cos_size, sin_size = abs(cos), abs(sin)
-    for i in range(len(BOXES_M)):
-        box = BOXES_M[i]
+    boxes = WORLDS_M[NO_BARRIERS]
+    for i in range(len(boxes)):
+        box = boxes[i]
         dx, dy = box[0] - x_m, box[1] - y_m
         if (
             abs(dx) <= box[2] + ahead_m * cos_size + aside_m * sin_size
@@ -49,15 +67,17 @@ def touches(car: Car) -> bool:
 
 
 @compiled
-def ray_length(x_m: float, y_m: float, angle_rad: float) -> float:
+def ray_length(x_m: float, y_m: float, angle_rad: float, world: int = NO_BARRIERS) -> float:
     """Return the distance from a point to the nearest obstacle in a direction, at most 100 m.
 
-    The slab method is used: a point of the ray is in a box if it is between both pairs of sides.
+    `world` is an index in `WORLDS_M`. The slab method is used: a point is in a box if it is between
+    the left and right sides and between the lower and upper sides.
     """
+    boxes = WORLDS_M[world]
     per_x, per_y = _per_meter(math.cos(angle_rad)), _per_meter(math.sin(angle_rad))
     nearest_m = FAR_M
-    for i in range(len(BOXES_M)):
-        box = BOXES_M[i]
+    for i in range(len(boxes)):
+        box = boxes[i]
         to_x, half_x = (box[0] - x_m) * per_x, box[2] * abs(per_x)
         to_y, half_y = (box[1] - y_m) * per_y, box[3] * abs(per_y)
         enter_m = max(to_x - half_x, to_y - half_y, 0.0)

@@ -92,7 +92,7 @@ def course_point_ahead(
 
 @inlined
 def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the nearest point of the course between two distances along the course.
+    """Return the course point nearest to (x_m, y_m) between two distances along the course.
 
     The result equals that of `paths.project`. The distances must differ by less than
     `LONGEST_LOOK_M`.
@@ -116,7 +116,7 @@ def course_project(x_m: float, y_m: float, from_m: float, to_m: float) -> Projec
 def _on_leg(
     leg: Leg, x_m: float, y_m: float, first_m: float, last_m: float
 ) -> tuple[float, float, float]:
-    """Return the point nearest to (x_m, y_m) on a part of a leg.
+    """Find the point nearest to (x_m, y_m) on a leg, between `first_m` and `last_m` on the leg.
 
     Returns:
         Distance along the leg, squared distance from (x_m, y_m), and the offset of (x_m, y_m) to

@@ -1,4 +1,4 @@
-"""Pilot of the lane sim: pure pursuit that brakes before corners, and a short search."""
+"""Pilot of the lane sim: pure pursuit that brakes before corners; a search if pursuit fails."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from mcaprl.sims.vehicle.pilot import ScriptedPilot
 
 PURSUIT_M = 8.0
 PURSUIT_S = 0.4
-"""The car aims at the path point ahead at a distance of 8 m plus 0.4 s times the speed."""
+"""Lookahead distance along the path: 8 m plus 0.4 s times the speed."""
 CORNER_SPEED_M_S = 7.0
 CORNER_BRAKE_M_S2 = 1.5
 CORNER_EARLY_M = 2.0
-"""The car brakes with at most 1.5 m/s^2 and has the corner speed 2 m before a corner."""
+"""Speed limit: within 2 m of a corner, the corner speed; farther away, the speed from which a
+deceleration of 1.5 m/s^2 reaches the corner speed 2 m before the corner."""
 HORIZON = 12
 """Number of decisions (3 s by default) for which a plan must not end the episode."""
 

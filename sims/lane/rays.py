@@ -11,7 +11,7 @@ from mcaprl.sims.geometry.compiled import compiled
 from mcaprl.sims.geometry.paths import in_body_frame, point_at
 from mcaprl.sims.geometry.ray_code import log_code, ray_name
 from mcaprl.sims.lane.course import COURSE
-from mcaprl.sims.lane.obstacles import ray_length
+from mcaprl.sims.lane.obstacles import NO_BARRIERS, ray_length, world_at
 from mcaprl.sims.lane.rules import MAX_SPEED_M_S, Car, car_at
 
 RAYS_DEG = (0, 10, -10, 20, -20, 30, -30, 45, -45, 60, -60, 90, -90, 135, -135, 180)
@@ -32,10 +32,12 @@ RAY_OBSERVATION_LIMIT = np.array([1] * (RAYS + 2) + [WAY_LIMIT] * 2, dtype=np.fl
 
 
 @compiled
-def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
+def observe_rays(car: Car, observation: NDArray[np.float32], has_barriers: bool) -> None:
     """Write the 20 observed numbers, as listed in "Observation Space" of `LaneKeepingEnv`."""
+    world = world_at(car.along_m) if has_barriers else NO_BARRIERS
     for i in range(RAYS):
-        observation[i] = log_code(ray_length(car.x_m, car.y_m, car.yaw_rad + RAYS_RAD[i]))
+        length_m = ray_length(car.x_m, car.y_m, car.yaw_rad + RAYS_RAD[i], world)
+        observation[i] = log_code(length_m)
     observation[RAYS] = car.speed_m_s / MAX_SPEED_M_S
     observation[RAYS + 1] = 2.0 * car.steering
     x_m, y_m = point_at(COURSE, car.along_m + WAY_M)
@@ -46,18 +48,21 @@ def observe_rays(car: Car, observation: NDArray[np.float32]) -> None:
 
 
 @compiled
-def observe_all_rays(cars: NDArray[np.float64], observations: NDArray[np.float32]) -> None:
+def observe_all_rays(
+    cars: NDArray[np.float64], observations: NDArray[np.float32], has_barriers: bool
+) -> None:
     """Write (N, 20) observations; each of the (N, 10) rows of `cars` begins with a `Car`."""
     for i in range(len(cars)):
-        observe_rays(car_at(cars[i]), observations[i])
+        observe_rays(car_at(cars[i]), observations[i], has_barriers)
 
 
-def ray_lines(car: Car) -> NDArray[np.float64]:
+def ray_lines(car: Car, has_barriers: bool) -> NDArray[np.float64]:
     """Return the rays as segments (16, 2, 2) from the car's center to their ends, meters."""
+    world = world_at(car.along_m) if has_barriers else NO_BARRIERS
     lines = np.empty((RAYS, 2, 2))
     lines[:, 0] = car.x_m, car.y_m
     for line, turn_rad in zip(lines, RAYS_RAD, strict=True):
         angle_rad = car.yaw_rad + turn_rad
-        length_m = ray_length(car.x_m, car.y_m, angle_rad)
+        length_m = ray_length(car.x_m, car.y_m, angle_rad, world)
         line[1] = line[0] + length_m * np.array([math.cos(angle_rad), math.sin(angle_rad)])
     return lines

@@ -44,15 +44,15 @@ MAX_STEERING_RAD = math.radians(40.0)
 MAX_LATERAL_M_S2 = 9.0
 STEERING_CURVE_M_S = (20 / 3.6, 60 / 3.6, 120 / 3.6)
 STEERING_CURVE = (0.9, 0.8, 0.7)
-"""Speeds and values of the knots of the piecewise linear maximum steering, a fraction of 40 deg."""
+"""Knots of the piecewise linear maximum steering angle: speeds, and fractions of 40 degrees."""
 _FALL_1 = (1.0 - STEERING_CURVE[0]) / STEERING_CURVE_M_S[0]
 _FALL_2 = (STEERING_CURVE[0] - STEERING_CURVE[1]) / (STEERING_CURVE_M_S[1] - STEERING_CURVE_M_S[0])
 _FALL_3 = (STEERING_CURVE[1] - STEERING_CURVE[2]) / (STEERING_CURVE_M_S[2] - STEERING_CURVE_M_S[1])
-"""Decrease of that fraction per m/s before each knot."""
+"""Decrease of the maximum steering fraction per m/s, in the interval before each knot."""
 
 BACK_M = 4.0
 AHEAD_M = 8.0
-"""Search window of the nearest path point, relative to the last one."""
+"""Search window for the nearest path point: distances before and after the last one."""
 
 STALL_SPEED_M_S = 1.0
 STALL_TIME_S = 3.0
@@ -111,9 +111,9 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 def slip(steering: float, speed_m_s: float) -> float:
     """Return the sine of the car's slip angle for a steering command at a speed.
 
-    The maximum steering angle falls from 40 degrees at rest to 90 % of that at 20 km/h, 80 % at
-    60 km/h and 70 % at 120 km/h. The slip angle is limited so that the lateral acceleration is at
-    most 9 m/s^2.
+    The maximum steering angle falls from 40 degrees at rest to 36 degrees at 20 km/h, 32 degrees
+    at 60 km/h and 28 degrees at 120 km/h. The slip angle is limited so that the lateral
+    acceleration is at most 9 m/s^2.
     """
     # The curve is convex and consists of straight lines, so it is the maximum of these lines.
     share = max(

@@ -18,13 +18,14 @@ from mcaprl.sims.drawing.scene import Color, Frame, Shape, coarse, cut, raised
 from mcaprl.sims.drawing.shapes import LOOK, TAIL_LAMP, WHITE, car_part
 from mcaprl.sims.geometry.paths import point_at
 from mcaprl.sims.lane import course
-from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M
+from mcaprl.sims.lane.obstacles import BODY_FORWARD_M, BODY_LENGTH_M, BODY_WIDTH_M, world_at
 from mcaprl.sims.lane.rays import ray_lines
 from mcaprl.sims.lane.rules import LOOKAHEADS_M, WHEELBASE_M, Car, wheel_angle
 
 GRASS: Color = (0.36, 0.44, 0.33, 1.0)
 ASPHALT: Color = (0.21, 0.22, 0.24, 1.0)
 YELLOW: Color = (0.93, 0.76, 0.22, 1.0)
+BARRIER: Color = (0.85, 0.35, 0.12, 1.0)
 PAINT: Color = (0.83, 0.18, 0.16, 1.0)
 WALLS: tuple[Color, ...] = (
     (0.80, 0.73, 0.63, 1.0),
@@ -110,24 +111,27 @@ def static_shapes() -> tuple[Shape, ...]:
 
 
 def moving_shapes(
-    car: Car, trail_m: Sequence[tuple[float, ...]], has_rays: bool = False
+    car: Car, trail_m: Sequence[tuple[float, ...]], *, has_rays: bool, has_barriers: bool
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step; include the rays if `has_rays`."""
+    """Return the shapes that change with each step, with rays and barriers if there are any."""
     aims = np.array([point_at(course.COURSE, car.along_m + ahead) for ahead in LOOKAHEADS_M])
     nearest = point_at(course.COURSE, car.along_m)
     link = coarse(np.array([(car.x_m, car.y_m), nearest]))
     wheel_rad = wheel_angle(car.steering, car.speed_m_s)
-    seen = (
+    seen: tuple[Shape, ...] = (
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(aims),
         Shape("offset", "line", LOOK, raised(link, 0.08), size=(0.12, 0.0, 0.0)),
         shapes.steering_arrow(WHEELBASE_M / 2, wheel_rad),
         shapes.label(car.speed_m_s, 2.8),
     )
+    if has_barriers:
+        closed = enumerate(course.barriers()[world_at(car.along_m) - 1])
+        seen = (*seen, *(_upright(f"barrier_{i}", box, BARRIER) for i, box in closed))
     if not has_rays:
         return seen
     frame = shapes.car_frame(car.x_m, car.y_m, car.yaw_rad)
-    return (*seen, *shapes.rays(ray_lines(car), frame, 0.75))
+    return (*seen, *shapes.rays(ray_lines(car, has_barriers), frame, 0.75))
 
 
 def camera_frame() -> Frame:

@@ -18,24 +18,24 @@ from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread, take
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
-"""Indices, in a car's row, of the distance along the path and of its value at the start."""
+"""Indices in a car's row: distance along the path, now and at the start of the episode."""
 LINE_M = 2.0
 """Distance of the start line along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
-"""Minimum distances of random starts from corners; closer, some cars cannot turn in time."""
+"""Minimum distances of random starts after and before corners, so that cars can turn in time."""
 FASTEST_START_M_S = 10.0
 
 _CLEAR_M: NDArray[np.float64] = np.concatenate(
     [[0.0], np.cumsum(np.diff(COURSE.along_m) - AFTER_CORNER_M - BEFORE_CORNER_M)]
 )
-"""(legs + 1,) length of the path before each corner, excluding the parts near corners."""
+"""(legs + 1,) length of the path up to each corner, without the parts that starts avoid."""
 
 
 @compiled
 def start_on_line(shares: NDArray[np.float64]) -> Car:
     """Return a car at rest near the start line.
 
-    Two random numbers from 0 to 1 determine its offset of up to 0.3 m and 0.05 rad.
+    Two random numbers from 0 to 1 set its offset (up to 0.3 m) and heading error (up to 0.05 rad).
     """
     return beside(LINE_M, spread(shares[0], 0.3), spread(shares[1], 0.05), 0.0)
 
@@ -129,6 +129,6 @@ def car_from(options: dict[str, Any]) -> Car:
     if abs(place.offset_m) > LANE_HALF_WIDTH_M:
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {abs(place.offset_m):.1f} m from the path:"
-            f" the lane ends at {LANE_HALF_WIDTH_M} m"
+            f" the lane's edge is at {LANE_HALF_WIDTH_M} m"
         )
     return located(moving(*pose), 0.0, place.along_m, 0.0)

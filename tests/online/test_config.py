@@ -10,7 +10,7 @@ import pytest
 from mcaprl.errors import UnknownNameError, UsageError
 from mcaprl.online.algorithms import ALGORITHMS, find_algorithm
 from mcaprl.online.config import A2CConfig, DoubleDQNConfig, DQNConfig, OnlineConfig, PPOConfig
-from mcaprl.online.presets import SIM_SETTINGS, settings_for
+from mcaprl.online.presets import IMAGE_SETTINGS, SIM_SETTINGS, settings_for
 from mcaprl.online.task import Task
 from mcaprl.settings import field_help
 from mcaprl.sims import SIMS
@@ -87,11 +87,18 @@ def test_every_sim_has_settings_that_are_fields(sim: str) -> None:
     assert DoubleDQNConfig(**settings).steps == settings["steps"]
 
 
+@pytest.mark.parametrize(("sim", "observation"), IMAGE_SETTINGS)
+def test_images_have_settings_that_are_fields(sim: str, observation: str) -> None:
+    settings = settings_for(DoubleDQNConfig, sim, {"observation": observation})
+    assert settings == IMAGE_SETTINGS[sim, observation]
+    assert DoubleDQNConfig(**settings).center_images
+
+
 @pytest.mark.parametrize(
     ("config_type", "sim", "sim_options"),
     [
         (DQNConfig, "CartPole-v1", {}),
-        (DQNConfig, "lane", {"observation": "depth"}),
+        (DQNConfig, "lane", {"observation": "depth", "rules": "classic"}),
         (DQNConfig, "racer", {"rules": "classic"}),
         (PPOConfig, "lane", {}),
     ],

@@ -95,6 +95,14 @@ def test_the_target_by_hand(columns: dict[str, list[float]], target: float) -> N
     assert step_of(model_of(DoubleDQN), **small) == pytest.approx(0.05)
 
 
+def test_the_penalty_by_hand() -> None:
+    # Both actions have the value 0, so the gradient of their cross entropy is -.5 and .5.
+    model = model_of(DoubleDQN)
+    model.alpha = 0.4
+    assert step_of(model, dones=[1.0], rewards=[0.25]) == pytest.approx(0.1 * (0.25 + 0.4 * 0.5))
+    assert model.q_net.rows[0, 1].item() == pytest.approx(-0.1 * 0.4 * 0.5)
+
+
 def test_with_gamma_0_only_the_reward_counts() -> None:
     assert step_of(model_of(DoubleDQN, gamma=0.0), rewards=[0.25]) == pytest.approx(0.025)
 

@@ -183,3 +183,23 @@ def test_half_a_million_depth_images_fit_in_four_gigabytes() -> None:
     arrays = [*buffer.columns().values(), *buffer.frames.values(), buffer.rewards, buffer.dones]
     assert buffer.buffer_size * buffer.n_envs == 500_000
     assert sum(array.nbytes for array in arrays) < 4e9
+
+
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_images_are_stored_at_the_networks_size(frame_stack: int) -> None:
+    """Averages of squares of 2 x 2 pixels, rounded; the odd last row and column are dropped."""
+    frame = spaces.Box(0, 255, (1, 7, 7), np.uint8)
+    one = spaces.Dict({"image": frame, "vector": DICT["vector"]})
+    space = stacked_space(one, frame_stack)
+    arguments: dict[str, Any] = {"frame_stack": frame_stack}
+    whole = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, **arguments)
+    small = FrameReplayBuffer(40, space, ACTIONS, "cpu", 2, **arguments, pools={"image": 2})
+    feed([whole, small], space, 30, 2, 0)
+    assert small.frames["image"].shape == (20, 2, 1, 3, 3)
+    for mine, other in zip(samples(small, 5), samples(whole, 5), strict=True):
+        if other is not None and other.ndim == 4:
+            squares = other[..., :6, :6].double().unflatten(2, (3, 2)).unflatten(4, (3, 2))
+            expected = (squares.mean((3, 5)) + 0.5).floor().numpy()
+        else:
+            expected = other
+        np.testing.assert_array_equal(mine, expected)

@@ -25,7 +25,6 @@ from stable_baselines3.common.envs import FakeImageEnv, SimpleMultiObsEnv
 
 from mcaprl.api.policies import load_policies
 from mcaprl.errors import PolicyError
-from mcaprl.online.centering import center_images
 from mcaprl.online.policy import describe_run, read_policy, save_policy
 from mcaprl.online.zip_file import OWN_NAME
 from mcaprl.runs import BEST_NAME, policy_files
@@ -116,27 +115,6 @@ def test_dict_observations_are_supported(tmp_path: Path) -> None:
     model.save(tmp_path / "sb3.zip")
     with pytest.raises(PolicyError, match="observation space is not a Box"):
         read_policy(tmp_path / "sb3.zip")
-
-
-@pytest.mark.parametrize("multi", [False, True])
-def test_centering_is_folded_into_the_saved_weights(tmp_path: Path, multi: bool) -> None:
-    image = FakeImageEnv(screen_height=36, screen_width=40, n_channels=1, channel_first=False)
-    env = SimpleMultiObsEnv(random_start=False) if multi else image
-    model = DQN("MultiInputPolicy" if multi else "CnnPolicy", env, buffer_size=10, **small())
-    center_images(model.policy)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    path = ours(tmp_path / "ours.zip", model, env)
-    after = model.policy.state_dict()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-    observations = observations_of(env.observation_space)
-    with torch.no_grad():
-        expected = model.q_net(model.policy.obs_to_tensor(observations)[0])
-        plain = DQN.load(path)
-        found = plain.q_net(plain.policy.obs_to_tensor(observations)[0])
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(
-        read_policy(path).q_values(observations), expected, rtol=1e-4, atol=1e-5
-    )
 
 
 def test_networks_are_built_from_the_files_shapes(tmp_path: Path) -> None:

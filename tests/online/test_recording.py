@@ -294,7 +294,7 @@ def test_several_seeds_write_a_file_each(tmp_path: Path) -> None:
         0: tmp_path / "a" / "seed-0.mcap",
         1: tmp_path / "a" / "seed-1.mcap",
     }
-    with pytest.raises(UsageError, match="2 seeds need a folder for one log each"):
+    with pytest.raises(UsageError, match="2 seeds write one log each"):
         log_paths(tmp_path / "a.mcap", range(2), False)
 
 

@@ -19,6 +19,7 @@ from mcaprl.api.policies import load_policy
 from mcaprl.cli import run
 from mcaprl.errors import PolicyError, SpaceError, UsageError
 from mcaprl.offline.algorithms.cql import CQLConfig
+from mcaprl.offline.algorithms.dqn import DQNConfig
 from mcaprl.offline.training.train import train as train_offline
 from mcaprl.online.agent import Agent
 from mcaprl.online.evaluation import Scale
@@ -38,6 +39,7 @@ SHORT: dict[str, Any] = {
     "target_update_interval": 80,
     "envs": 4,
 }
+FAST: dict[str, Any] = {"updates": 10, "log_interval": 10, "gamma": 0.5, "target_interval": 2}
 VECTOR = spaces.Box(-np.inf, np.inf, (2,))
 
 
@@ -167,8 +169,10 @@ def test_images_are_transposed_for_the_buffer(tmp_path: Path) -> None:
         begun.start_from(data, None)
         buffer: Any = begun.model.replay_buffer  # type: ignore[attr-defined]
         frames = buffer.frames[""]
-        assert frames.shape[1:] == (1, 1, 84, 84)
-        np.testing.assert_array_equal(frames[:12, 0, 0], data.observations[..., 0])
+        assert frames.shape[1:] == (1, 1, 42, 42)
+        squares = data.observations.reshape(12, 42, 2, 42, 2)
+        expected = np.floor(squares.mean((2, 4)) + 0.5)
+        np.testing.assert_array_equal(frames[:12, 0, 0], expected)
 
 
 def test_an_agent_starts_from_an_offline_policy(logs: Path, tmp_path: Path) -> None:
@@ -203,22 +207,47 @@ def test_an_agent_continues_from_an_online_policy(tmp_path: Path) -> None:
     assert second.steps == 8
 
 
-def test_weights_for_uncentered_images_are_converted(tmp_path: Path) -> None:
-    short = {**SHORT, "envs": 1, "learning_starts": 40}
-    options = {"observation": "depth"}
-    (summary,) = train(Task.for_sim("lane", None, options, **short), tmp_path / "plain")
-    policy = load_policy(summary.folder / "best_model.zip")
-    task = Task.for_sim("lane", None, options, **short, center_images=True)
+def images_of(task: Task, folder: Path, count: int = 60) -> Path:
+    """Record random steps of a task's sim."""
+    env = mcaprl.make_sim(task.sim, **task.sim_options)
+    with closing(mcaprl.RecordMcap(env, folder / "images.mcap", scene=False)) as recorded:
+        rollout(recorded, EpsilonGreedy(None, 1.0, env.action_space), seed=0, steps=count)
+    return folder / "images.mcap"
+
+
+@pytest.mark.parametrize("frame_stack", [1, 2])
+@pytest.mark.parametrize("observation", ["depth", "dashboard"])
+def test_a_policy_from_images_keeps_its_values(
+    tmp_path: Path, observation: str, frame_stack: int
+) -> None:
+    """The normalization of images and vectors moves into the agent's network."""
+    both: dict[str, Any] = {"hidden": (8, 8), "frame_stack": frame_stack, "layer_norm": True}
+    settings = {**SHORT, **both, "dueling": True, "envs": 1}
+    task = Task.for_sim("lane", None, {"observation": observation}, **settings)
+    config = DQNConfig(**both, **FAST, dueling=True, normalize=True)
+    data = mcaprl.open(images_of(task, tmp_path))
+    train_offline(data, config, tmp_path / "offline", progress=silent)
+    policy = load_policy(tmp_path / "offline")
     with closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun:
-        begun.start_from(None, policy)
+        begun.start_from(data, policy)
+        batch: Any = begun.model.replay_buffer.sample(8)  # type: ignore[attr-defined]
         model: Any = begun.model
-        seen = np.random.default_rng(0).integers(0, 256, (5, 84, 84, 1), dtype=np.uint8)
         with torch.inference_mode():
-            values = model.q_net(model.policy.obs_to_tensor(seen)[0]).numpy()
-            first = model.q_net.features_extractor.cnn[0]
-            centered = first(torch.full((1, 1, 84, 84), 0.5))[0, :, 0, 0]
-        np.testing.assert_allclose(values, policy.q_values(seen), rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(centered, first.bias)
+            values = model.q_net(batch.observations).numpy()
+        assert np.isfinite(values).all()
+
+
+def test_a_policy_of_another_encoder_is_refused(tmp_path: Path) -> None:
+    settings = {**SHORT, "envs": 1, "dueling": False, "layer_norm": False, "frame_stack": 1}
+    task = Task.for_sim("lane", None, {"observation": "depth"}, **settings)
+    data = mcaprl.open(images_of(task, tmp_path))
+    config = DQNConfig(**FAST, hidden=(8,), encoder="nature")
+    train_offline(data, config, tmp_path / "offline", progress=silent)
+    with (
+        closing(Agent(task, "mcaprl/LaneKeeping-v0", tmp_path, 0, Scale(0.0, 1.0))) as begun,
+        pytest.raises(PolicyError, match=r"1-32-64-64-8-6, but .* 1-16-32-8-6: .*encoder"),
+    ):
+        begun.start_from(None, load_policy(tmp_path / "offline"))
 
 
 def test_a_policy_of_another_width_is_refused(logs: Path, tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_a_pose_is_kept() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: the lane ends at 3.5 m"),
+        ({"pose": (50.0, 9.0, 0.0)}, "8.0 m from the path: the lane's edge is at 3.5 m"),
         ({"pose": (50.0, 1.0, 0.0, -1.0)}, "speed_m_s must be 0 to 30, not -1.0"),
     ],
 )

@@ -103,7 +103,8 @@ def test_the_path_point_distinguishes_the_streets_of_a_crossing() -> None:
     observation = np.zeros(20, dtype=np.float32)
     way = []
     for near_m in (125.0, 637.0):
-        observe_rays(located(moving(125.0, 1.0, 0.0, 5.0), 0.0, near_m, 0.0), observation)
+        car = located(moving(125.0, 1.0, 0.0, 5.0), 0.0, near_m, 0.0)
+        observe_rays(car, observation, has_barriers=True)
         way.append(observation[18:].tolist())
     assert way == [[0.25, -0.75], [0.25, 0.75]]
 

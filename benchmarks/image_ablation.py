@@ -1,0 +1,161 @@
+"""Measure which settings matter for learning online from depth images.
+
+    python -m benchmarks.image_ablation FOLDER --sim powerline --steps 80000
+    python -m benchmarks.image_ablation FOLDER --sim lane --observation dashboard --steps 120000
+
+Each variant differs from the sim's default settings in one respect. Every seed of every variant is
+trained and then evaluated on fresh episodes. The table has the mean score over seeds (random 0,
+pilot 1) with its range, and the CPU time of the training. Finished seeds are not repeated, so two
+processes with different `--seeds` share the work on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from mcaprl.files import write_json
+from mcaprl.online import (
+    FRESH_SEED,
+    SELECTION_SEED,
+    Agent,
+    Scale,
+    Task,
+    measure_scale,
+    read_policy,
+)
+from mcaprl.runs import BEST_NAME
+from mcaprl.sims import evaluate, make_sim
+
+MIRRORED: Final = "half of each batch mirrored"
+VARIANTS: Final[dict[str, dict[str, Any]]] = {
+    "default": {},
+    "nature encoder": {"encoder": "nature"},
+    "images not centered": {"center_images": False},
+    "a quarter of the updates": {"steps_per_update": 16},
+    "dueling": {"dueling": True},
+    "not dueling": {"dueling": False},
+    "layer norm": {"layer_norm": True},
+    "no layer norm": {"layer_norm": False},
+    "target network every 1,000 steps": {"target_update_interval": 1_000},
+    "target network every 8,000 steps": {"target_update_interval": 8_000},
+    "n-step 1": {"n_steps": 1},
+    "n-step 3": {"n_steps": 3},
+    MIRRORED: {},
+}
+LANE_MIRROR: Final = (0, 1, 3, 2, 5, 4)
+"""Mirror image of each action of the lane sim."""
+
+
+class MirroredBuffer:
+    """Replay buffer that mirrors every second transition of the lane sim from left to right."""
+
+    def __init__(self, buffer: Any) -> None:
+        """Wrap a buffer."""
+        self._buffer = buffer
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the buffer."""
+        return getattr(self._buffer, name)
+
+    def sample(self, *arguments: Any, **others: Any) -> Any:
+        """Sample a batch; rows 0, 2, 4, ... are mirrored."""
+        batch = self._buffer.sample(*arguments, **others)
+        for observations in (batch.observations, batch.next_observations):
+            _mirror(observations)
+        batch.actions[::2] = torch.tensor(LANE_MIRROR)[batch.actions[::2]]
+        return batch
+
+
+def _mirror(observations: Any) -> None:
+    parts = observations if isinstance(observations, dict) else {"depth": observations}
+    parts["depth"][::2] = parts["depth"][::2].flip(-1)
+    if "motion" in parts:
+        # The numbers are speed, steering angle and direction of the next turn.
+        parts["motion"][::2, 1:] *= -1
+
+
+def differs(variant: str, task: Task, default: Task) -> bool:
+    """Return whether to run a variant: the default, or one whose training differs from it."""
+    if variant == MIRRORED:
+        return task.sim == "lane"
+    return variant == "default" or task.config != default.config
+
+
+def run(variant: str, task: Task, seed: int, folder: Path, scales: tuple[Scale, Scale]) -> None:
+    """Train and evaluate one seed; write FOLDER/result.json."""
+    if (folder / "result.json").exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    began_s = time.process_time()
+    with closing(Agent(task, task.sim, folder, seed, scales[0])) as agent:
+        if variant == MIRRORED:
+            model: Any = agent.model
+            model.replay_buffer = MirroredBuffer(model.replay_buffer)
+        agent.learn(lambda _: None)
+        points = [(point.step, point.score) for point in agent.points]
+    seconds = time.process_time() - began_s
+    with closing(make_sim(task.sim, **task.sim_options)) as env:
+        policy = read_policy(folder / BEST_NAME)
+        score = evaluate(env, [policy], name="", episodes=100, seed=FRESH_SEED)
+    fresh = scales[1].score(score.mean_return)
+    found = {"score": fresh, "curve": points, "cpu_minutes": seconds / 60, "ends": score.ends}
+    write_json(folder / "result.json", found, OSError)
+
+
+def show(folder: Path) -> None:
+    """Print a row for each variant."""
+    for variant in VARIANTS:
+        name = _file_name(variant)
+        found = [
+            json.loads(path.read_text()) for path in sorted(folder.glob(f"{name}/*/result.json"))
+        ]
+        if found:
+            scores = np.array([each["score"] for each in found])
+            minutes = np.mean([each["cpu_minutes"] for each in found])
+            print(
+                f"| {variant} | {scores.mean():.2f} | {scores.min():.2f} to {scores.max():.2f} |"
+                f" {len(scores)} | {minutes:.1f} |"
+            )
+
+
+def _file_name(variant: str) -> str:
+    return variant.replace(" ", "-").replace(",", "")
+
+
+def main() -> None:
+    """Run the variants, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--sim", default="powerline", choices=("powerline", "lane"))
+    parser.add_argument("--observation", default="depth")
+    parser.add_argument("--steps", type=int, default=80_000)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3])
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    options = {"observation": given.observation}
+    folder = given.folder / f"{given.sim}-{given.observation}"
+    default = Task.for_sim(given.sim, None, options, steps=given.steps)
+    with closing(make_sim(given.sim, **options)) as env:
+        selection = measure_scale(env, episodes=default.config.eval_episodes, seed=SELECTION_SEED)
+        fresh = measure_scale(env, episodes=100, seed=FRESH_SEED)
+    for seed in given.seeds:
+        for variant in given.variants:
+            settings = {**VARIANTS[variant], "steps": given.steps}
+            task = Task.for_sim(given.sim, None, options, **settings)
+            if differs(variant, task, default):
+                place = folder / _file_name(variant) / f"seed-{seed}"
+                run(variant, task, seed, place, (selection, fresh))
+    show(folder)
+
+
+if __name__ == "__main__":
+    main()

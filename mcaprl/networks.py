@@ -1,0 +1,403 @@
+"""Networks from observations to one or more numbers per action, for offline and online learning.
+
+image  -> convolutions -> layer -+
+vector -----------------> layer -+-> layers -> outputs
+
+Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
+"Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
+`compact` averages the image to a shorter edge of about 42 pixels and has two small convolutions;
+its update takes a fraction of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, Protocol, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from mcaprl.settings import Settings
+from mcaprl.tensor_files import check_widths
+
+AUTO = "auto"
+"""Setting of the encoder that selects `compact` for images with one channel, else `nature`."""
+_MAX_IMAGES = 10_000
+"""Maximum number of images, evenly spaced, for computing a mean image."""
+_IMAGES_AT_ONCE = 256
+_SMALLEST_VARIANCE = 1e-6
+"""Variance of pixels (0 to 255) up to which images count as equal, because of rounding errors."""
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """Convolutions of an encoder.
+
+    Attributes:
+        channels: Default output channels of the convolutions.
+        kernels: Kernel size and stride of each convolution, in pixels.
+        edge: Approximate length in pixels of an image's shorter edge after average pooling by an
+            integer factor; None for no pooling.
+    """
+
+    channels: tuple[int, ...]
+    kernels: tuple[tuple[int, int], ...]
+    edge: int | None = None
+
+    def pool(self, image_shape: Sequence[int]) -> int:
+        """Return the average-pooling factor for images (height, width, ...); 1 for no pooling."""
+        return 1 if self.edge is None else max(1, round(min(image_shape[:2]) / self.edge))
+
+    def pixels(self, image_shape: Sequence[int]) -> int:
+        """Return the number of pixels after the last convolution; 0 if the image is too small."""
+        pool, count = self.pool(image_shape), 1
+        for edge in image_shape[:2]:
+            left = edge // pool
+            for kernel, stride in self.kernels:
+                left = (left - kernel) // stride + 1 if left >= kernel else 0
+            count *= left
+        return count
+
+
+ENCODERS: Final[dict[str, Encoder]] = {
+    "nature": Encoder((32, 64, 64), ((8, 4), (4, 2), (3, 1))),
+    "compact": Encoder((16, 32), ((4, 4), (3, 2)), edge=42),
+}
+
+
+def choose_encoder(name: str, widths: Sequence[int], channels: Iterable[int]) -> str:
+    """Return the encoder that a setting selects.
+
+    Args:
+        name: Setting: `auto` or a key of `ENCODERS`.
+        widths: Output channels of the convolutions, or empty. If given, `auto` selects the encoder
+            with the same number of convolutions.
+        channels: Number of channels of each image, before frames are stacked.
+    """
+    if name != AUTO:
+        return name
+    if widths:
+        counts = {len(encoder.kernels): key for key, encoder in ENCODERS.items()}
+        return counts[len(widths)]
+    return "compact" if all(count == 1 for count in channels) else "nature"
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Architecture of a network.
+
+    Attributes:
+        hidden: Widths of the fully connected hidden layers; each input has its own first layer.
+        channels: Output channels of the convolutions over each image; empty selects those of the
+            encoder.
+        layer_norm: Whether the hidden layers are normalized before each ReLU
+            (https://arxiv.org/abs/1607.06450).
+        dueling: Whether outputs are the sum of a value and of advantages with mean 0, computed by
+            separate last hidden layers (https://arxiv.org/abs/1511.06581).
+        encoder: Key of `ENCODERS`.
+    """
+
+    hidden: tuple[int, ...]
+    channels: tuple[int, ...] = ()
+    layer_norm: bool = False
+    dueling: bool = False
+    encoder: str = "nature"
+
+    @property
+    def all_channels(self) -> tuple[int, ...]:
+        """Output channels of the convolutions."""
+        return self.channels or ENCODERS[self.encoder].channels
+
+    def features(self, image_shape: Sequence[int]) -> int:
+        """Return how many features the convolutions output for an image (height, width, ...)."""
+        return ENCODERS[self.encoder].pixels(image_shape) * self.all_channels[-1]
+
+
+def architecture_of(found: Mapping[str, Any]) -> Architecture:
+    """Return the architecture that a file describes.
+
+    Args:
+        found: JSON object with the fields of `Architecture`.
+    """
+    lists = {key: tuple(value) for key, value in found.items() if isinstance(value, list)}
+    return Architecture(**{**found, **lists})
+
+
+@dataclass(frozen=True)
+class NetworkSettings(Settings):
+    """Settings of all algorithms with networks; each algorithm adds its own in a subclass.
+
+    Raises:
+        UsageError: A setting is outside its range.
+    """
+
+    encoder: str = AUTO
+    """convolutions over images: nature, compact, or auto (compact for images with one channel)"""
+    channels: tuple[int, ...] = ()
+    """output channels of the convolutions; by default, nature has 32,64,64 and compact 16,32"""
+    center_images: bool = True
+    """subtract the mean image, and divide by the standard deviation of all pixels"""
+    layer_norm: bool = False
+    """normalize the hidden layers"""
+
+    def __post_init__(self) -> None:
+        """Validate the settings."""
+        super().__post_init__()
+        known = (AUTO, *ENCODERS)
+        self._require("encoder", self.encoder in known, f"one of {', '.join(known)}")
+        encoders = ENCODERS.values() if self.encoder == AUTO else [ENCODERS[self.encoder]]
+        counts = {len(encoder.kernels) for encoder in encoders}
+        fits = len(self.channels) in counts and all(count >= 1 for count in self.channels)
+        allowed = f"{' or '.join(map(str, sorted(counts)))} numbers of at least 1"
+        self._require("channels", fits or not self.channels, allowed)
+
+    def architecture_for(self, channels: Iterable[int]) -> Architecture:
+        """Return the network's architecture, given the channels of each image before stacking."""
+        encoder = choose_encoder(self.encoder, self.channels, channels)
+        return Architecture(self.hidden, self.channels, self.layer_norm, encoder=encoder)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageInput:
+    """Shape and normalization of one camera's images: (pixels - shift) / scale.
+
+    Attributes:
+        shape: (height, width, channels).
+        shift: (height, width, channels) float32, from 0 to 255; None is all zeros.
+        scale: Divisor of the shifted pixels.
+    """
+
+    shape: tuple[int, ...]
+    shift: NDArray[np.float32] | None = None
+    scale: float = 255.0
+
+    def stacked(self, count: int) -> ImageInput:
+        """Return the input for `count` images that are stacked along the channel axis."""
+        height, width, channels = self.shape
+        shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
+        return replace(self, shape=(height, width, channels * count), shift=shift)
+
+    def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
+        """Return the input with the mean image as shift and the standard deviation as scale.
+
+        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale,
+        so pixels that hardly change stay small.
+        """
+        used = np.linspace(0, len(images) - 1, min(len(images), _MAX_IMAGES)).astype(np.int64)
+        total = np.zeros(self.shape)
+        squares = 0.0
+        for rows in np.split(used, range(_IMAGES_AT_ONCE, len(used), _IMAGES_AT_ONCE)):
+            pixels = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
+            total += pixels.sum(0)
+            squares += float(np.square(pixels).sum())
+        mean = total / len(used)
+        variance = squares / (len(used) * mean.size) - float(np.square(mean).mean())
+        scale = math.sqrt(variance) if variance > _SMALLEST_VARIANCE else self.scale
+        return replace(self, shift=mean.astype(np.float32), scale=scale)
+
+
+class Inputs(Protocol):
+    """Observations as network inputs."""
+
+    @property
+    def vector(self) -> Tensor:
+        """Joined vectors (B, V), float32; V is 0 if there are only images."""
+
+    @property
+    def images(self) -> tuple[Tensor, ...]:
+        """Tensors (B, height, width, channels), uint8 or float32, one per camera."""
+
+
+class Trunk(nn.Module):
+    """Layers before the head of a network; they map observations to features (B, width).
+
+    Attributes:
+        width: Number of features.
+    """
+
+    def __init__(
+        self, vector_width: int, images: Sequence[ImageInput], architecture: Architecture
+    ) -> None:
+        """Build the layers, with random weights; `vector_width` is 0 if there is no vector."""
+        super().__init__()
+        layer_norm = architecture.layer_norm
+        shared = architecture.hidden
+        # The last hidden layer of a dueling network is part of its head.
+        shared = shared[:-1] if architecture.dueling else shared
+        self.stems = nn.ModuleList()
+        width = 0
+        for image in images:
+            convolutions = Convolutions(image, architecture)
+            layers, stem_width = _layers(convolutions.n_features, shared[:1], layer_norm)
+            self.stems.append(nn.Sequential(convolutions, *layers))
+            width += stem_width
+        if vector_width:
+            layers, stem_width = _layers(vector_width, shared[:1], layer_norm)
+            self.stems.append(nn.Sequential(*layers))
+            width += stem_width
+        layers, self.width = _layers(width, shared[1:], layer_norm)
+        self.body = nn.Sequential(*layers)
+
+    def forward(self, observations: Inputs) -> Tensor:
+        """Map observations to features."""
+        inputs = [*observations.images, observations.vector]
+        features = [stem(part) for stem, part in zip(self.stems, inputs, strict=False)]
+        joined = features[0] if len(features) == 1 else torch.cat(features, 1)
+        return cast(Tensor, self.body(joined))
+
+
+class Network(Trunk):
+    """Network that maps observations to outputs (B, *output_shape)."""
+
+    def __init__(
+        self,
+        vector_width: int,
+        images: Sequence[ImageInput],
+        output_shape: tuple[int, ...],
+        architecture: Architecture,
+    ) -> None:
+        """Build the layers, with random weights.
+
+        `vector_width` is 0 if there is no vector; `output_shape` is (A, ...) for A actions.
+        """
+        super().__init__(vector_width, images, architecture)
+        self.output_shape = output_shape
+        self.head: nn.Module = make_head(self.width, output_shape, architecture)
+
+    def forward(self, observations: Inputs) -> Tensor:
+        """Map observations to outputs."""
+        return cast(Tensor, self.head(super().forward(observations))).view(-1, *self.output_shape)
+
+
+class Convolutions(nn.Module):
+    """Convolutions of an encoder: images (B, height, width, channels) to features (B, n_features).
+
+    An image is averaged over squares of pixels first, unless it has the averaged size already.
+
+    Attributes:
+        shift: Tensor (channels, height, width) that is subtracted from the averaged pixels.
+        scale: Divisor of the shifted pixels.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, image: ImageInput, architecture: Architecture) -> None:
+        """Build the convolutions for an image input."""
+        super().__init__()
+        encoder = ENCODERS[architecture.encoder]
+        self._pool = encoder.pool(image.shape)
+        # Not persistent, because the normalization of all observations is saved separately.
+        self.register_buffer("shift", self._shift_of(image), persistent=False)
+        self.register_buffer("scale", torch.tensor(image.scale), persistent=False)
+        layers: list[nn.Module] = []
+        depth = image.shape[2]
+        for width, (kernel, stride) in zip(architecture.all_channels, encoder.kernels, strict=True):
+            layers += [nn.Conv2d(depth, width, kernel_size=kernel, stride=stride), nn.ReLU()]
+            depth = width
+        self.layers = nn.Sequential(*layers, nn.Flatten())
+        self.n_features = architecture.features(image.shape)
+
+    def normalize(self, image: ImageInput) -> None:
+        """Set shift and scale to those of an image input of the same shape."""
+        self.shift.copy_(self._shift_of(image))
+        self.scale.fill_(image.scale)
+
+    def store_normalization(self) -> None:
+        """Make shift and scale part of the state dict."""
+        self.register_buffer("shift", self.shift)
+        self.register_buffer("scale", self.scale)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Map images to features."""
+        pixels = images.permute(0, 3, 1, 2).float()
+        if pixels.shape[2:] != self.shift.shape[1:]:
+            pixels = self._averaged(pixels)
+        return cast(Tensor, self.layers((pixels - self.shift) / self.scale))
+
+    def _averaged(self, pixels: Tensor) -> Tensor:
+        """Average squares of pixels; this takes a fifth of the time of torch's average pooling."""
+        pool = self._pool
+        height, width = (edge // pool * pool for edge in pixels.shape[-2:])
+        rows = pixels[..., 0:height:pool, :]
+        for row in range(1, pool):
+            rows = rows + pixels[..., row:height:pool, :]
+        sums = rows[..., 0:width:pool]
+        for column in range(1, pool):
+            sums = sums + rows[..., column:width:pool]
+        return sums / pool**2
+
+    def _shift_of(self, image: ImageInput) -> Tensor:
+        shift = np.zeros(image.shape, np.float32) if image.shift is None else image.shift
+        return self._averaged(torch.from_numpy(shift).permute(2, 0, 1).contiguous())
+
+
+class DuelingHead(nn.Module):
+    """Head with separate streams for the state value and advantages: Q = V + A - mean(A)."""
+
+    def __init__(
+        self, n_inputs: int, hidden: tuple[int, ...], output_shape: tuple[int, ...], norm: bool
+    ) -> None:
+        """Build the two streams."""
+        super().__init__()
+        self.output_shape = output_shape
+        layers, width = _layers(n_inputs, hidden, norm)
+        self.advantages = nn.Sequential(*layers, _linear(width, output_shape))
+        layers, width = _layers(n_inputs, hidden, norm)
+        self.value = nn.Sequential(*layers, _linear(width, (1, *output_shape[1:])))
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map features to flat outputs."""
+        advantages = cast(Tensor, self.advantages(features)).view(-1, *self.output_shape)
+        value = cast(Tensor, self.value(features)).view(-1, 1, *self.output_shape[1:])
+        return (value + advantages - advantages.mean(1, keepdim=True)).flatten(1)
+
+
+def check_size(
+    architecture: Architecture,
+    vector_width: int,
+    images: Sequence[ImageInput],
+    n_outputs: int,
+    weights: Mapping[str, Tensor],
+) -> None:
+    """Check that a file has enough weights for a network, before the network is created.
+
+    Raises:
+        ValueError: The file has fewer weights, or no network has this architecture.
+    """
+    if architecture.encoder not in ENCODERS:
+        raise ValueError(f"encoder {architecture.encoder!r} is not supported")
+    if images:
+        check_widths(architecture.all_channels, weights)
+    widths = [architecture.features(image.shape) for image in images]
+    for width in [*widths, *([vector_width] if vector_width else [])]:
+        check_widths([width, *architecture.hidden, n_outputs], weights)
+
+
+def make_head(
+    n_inputs: int, output_shape: tuple[int, ...], architecture: Architecture
+) -> nn.Module:
+    """Return the layers from the features of a `Trunk` to flat outputs."""
+    if not architecture.dueling:
+        return _linear(n_inputs, output_shape)
+    return DuelingHead(n_inputs, architecture.hidden[-1:], output_shape, architecture.layer_norm)
+
+
+def _layers(
+    n_inputs: int, widths: tuple[int, ...], layer_norm: bool
+) -> tuple[list[nn.Module], int]:
+    """Return fully connected layers with ReLU, and the number of their outputs."""
+    layers: list[nn.Module] = []
+    for width in widths:
+        norm = [nn.LayerNorm(width)] if layer_norm else []
+        layers += [nn.Linear(n_inputs, width), *norm, nn.ReLU()]
+        n_inputs = width
+    return layers, n_inputs
+
+
+def _linear(n_inputs: int, output_shape: tuple[int, ...]) -> nn.Linear:
+    return nn.Linear(n_inputs, torch.Size(output_shape).numel())

@@ -1,0 +1,128 @@
+"""This package's networks as parts of SB3's policies, saved in plain `.zip` files of SB3.
+
+SB3's own features extractors are used unless a setting asks for another encoder of images, for
+dueling networks or for layer normalization. The networks are those of offline learning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.dqn.policies import DQNPolicy, QNetwork
+from torch import Tensor, nn
+
+from mcaprl.networks import ENCODERS, Architecture, Convolutions, ImageInput, Trunk, make_head
+from mcaprl.online.frames import parts_of, parts_of_space
+
+
+class Parts(NamedTuple):
+    """Batch of observations as `Trunk` receives it: one joined vector, and images."""
+
+    vector: Tensor
+    images: tuple[Tensor, ...]
+
+
+class NetworkFeatures(BaseFeaturesExtractor):
+    """Layers of a `Trunk` as a features extractor of SB3.
+
+    The network receives all images, channels first, and the other parts joined as one vector. The
+    normalization of the images is saved with the weights.
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], architecture: Architecture) -> None:
+        """Build the layers, with random weights."""
+        parts = parts_of_space(observation_space)
+        vectors, images = inputs_of(observation_space)
+        trunk = Trunk(sum(int(np.prod(parts[key].shape)) for key in vectors), images, architecture)
+        super().__init__(observation_space, trunk.width)
+        self.trunk = trunk
+        self._vectors = vectors
+        self._images = [key for key in parts if key not in vectors]
+        for convolutions in self.convolutions:
+            convolutions.store_normalization()
+
+    @property
+    def convolutions(self) -> list[Convolutions]:
+        """Convolutions of each image."""
+        return [module for module in self.modules() if isinstance(module, Convolutions)]
+
+    def forward(self, observations: Any) -> Tensor:
+        """Map preprocessed observations to features."""
+        parts = cast(Mapping[str, Tensor], parts_of(observations))
+        images = tuple(parts[key].permute(0, 2, 3, 1) for key in self._images)
+        vectors = [parts[key].flatten(1) for key in self._vectors]
+        first = next(iter(parts.values()))
+        vector = torch.cat(vectors, 1) if vectors else first.new_empty(len(first), 0)
+        return cast(Tensor, self.trunk(Parts(vector, images)))
+
+
+class NetworkDQNPolicy(DQNPolicy):
+    """SB3's policy of DQN, whose last layers may be those of a dueling network."""
+
+    def make_q_net(self) -> QNetwork:
+        """Create a network with random weights."""
+        network = super().make_q_net()
+        architecture = self.features_extractor_kwargs["architecture"]
+        head = make_head(
+            network.features_dim, (int(cast(spaces.Discrete, self.action_space).n),), architecture
+        )
+        network.q_net = nn.Sequential(head).to(self.device)
+        return network
+
+
+def policy_arguments(architecture: Architecture) -> dict[str, Any]:
+    """Return the `policy_kwargs` with which an SB3 policy uses this package's network."""
+    return {
+        "net_arch": [],
+        "features_extractor_class": NetworkFeatures,
+        "features_extractor_kwargs": {"architecture": architecture},
+        # `Convolutions` normalize the images.
+        "normalize_images": False,
+    }
+
+
+def inputs_of(space: spaces.Space[Any]) -> tuple[list[str], list[ImageInput]]:
+    """Return the keys of vectors in a channels-first space, and an `ImageInput` for each image."""
+    vectors, images = [], []
+    for key, part in parts_of_space(space).items():
+        if is_image_space(part):
+            channels, height, width = part.shape
+            images.append(ImageInput((height, width, channels)))
+        else:
+            vectors.append(key)
+    return vectors, images
+
+
+def pools_of(space: spaces.Space[Any], architecture: Architecture) -> dict[str, int]:
+    """Return the factor of the network's average pooling for the images of each key."""
+    vectors, images = inputs_of(space)
+    keys = [key for key in parts_of_space(space) if key not in vectors]
+    encoder = ENCODERS[architecture.encoder]
+    return {key: encoder.pool(image.shape) for key, image in zip(keys, images, strict=True)}
+
+
+def normalize_images(
+    policy: nn.Module, frames: Mapping[str, NDArray[np.uint8]], stack: int
+) -> None:
+    """Set a policy's image normalization to the mean and standard deviation of images.
+
+    Args:
+        policy: Policy of SB3 with this package's networks.
+        frames: Images (N, height, width, channels) by key, in the order of the space.
+        stack: Number of successive images that the network receives.
+    """
+    shapes = {key: (*part.shape[1:], 1)[:3] for key, part in frames.items()}
+    inputs = [
+        ImageInput(shapes[key]).normalized_to(part).stacked(stack) for key, part in frames.items()
+    ]
+    for module in policy.modules():
+        if isinstance(module, NetworkFeatures):
+            for convolutions, image in zip(module.convolutions, inputs, strict=True):
+                convolutions.normalize(image)
