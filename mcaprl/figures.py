@@ -73,7 +73,7 @@ def save_png(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Convert a figure to SVG: replace `INK` by the text color, and `PALE` by `--pale`."""
+    """Convert a figure to SVG with the page's colors: text color for `INK`, `--pale` for `PALE`."""
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     _make_literal(figure)
@@ -93,6 +93,6 @@ def _make_literal(figure: Any) -> None:
     """Turn off formulas in all texts of a figure, escape control characters, and shorten lines."""
     for text in figure.findobj(import_extra("matplotlib.text", "report").Text):
         text.set_parse_math(False)
-        # Matplotlib aligns lines, each of which may be long.
+        # A text may have several lines, each of which may be too long.
         lines = printable(text.get_text()).split("\n")
         text.set_text("\n".join(shortened(line, _MAX_LABEL) for line in lines))

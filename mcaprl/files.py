@@ -91,7 +91,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     try:
         mode = path.lstat().st_mode
     except OSError:
-        # Nothing is there, or the folder cannot be read; creating the file reports the latter.
+        # There is no file, or its folder is unreadable, which creating the file will report.
         return
     if stat.S_ISLNK(mode):
         raise OutputExistsError(f"{path} is a symbolic link: choose the path of a regular file")
@@ -121,7 +121,7 @@ def locked_file(path: Path) -> Iterator[None]:
         with file:
             if not try_lock(file.fileno()):
                 raise LogError(_TAKEN.format(path))
-            # A writer that has just finished may have replaced the file before its lock was free.
+            # A writer may have replaced the file before this lock was acquired: try again.
             if is_at(file.fileno(), path):
                 yield
                 return
@@ -133,7 +133,7 @@ def open_at_once(path: Path) -> int:
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Return whether an open file or folder is identical to the one at a path."""
+    """Return whether a descriptor and a path refer to the same file or folder."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except (FileNotFoundError, NotADirectoryError):
@@ -164,7 +164,7 @@ def work_folder(path: Path, *, concurrent: bool = False) -> Iterator[Path]:
         try:
             if descriptor >= 0 and not try_lock(descriptor):
                 raise LogError(_TAKEN.format(path))
-            # A writer that has just finished may have removed the folder before its lock was free.
+            # A writer may have removed the folder before this lock was acquired: try again.
             if descriptor >= 0 and not is_at(descriptor, folder):
                 continue
             _empty(folder)
@@ -283,7 +283,7 @@ def replacing_folder(
                     os.fsync(opened.fileno())
             _check_folder(path, overwrite=overwrite)
             if path.exists():
-                # Two moves, between which neither folder is at `path`: both are complete.
+                # Between these two moves, nothing is at `path`, but both folders are complete.
                 os.rename(path, work / f"{path.name}.old")
             os.rename(unfinished, path)
     except OSError as error:
@@ -300,7 +300,7 @@ def _check_folder(path: Path, *, overwrite: bool) -> None:
 
 
 def _move(source: Path, path: Path, *, overwrite: bool) -> None:
-    """Move a complete file to its target atomically, unless another writer has locked it."""
+    """Move a complete file to its target atomically, unless another writer has locked `path`."""
     if not overwrite:
         # Unlike a rename, a link does not replace a file that was created in the meantime. Some
         # file systems have no links.
@@ -323,7 +323,7 @@ def write_atomically(
 
 
 def size_of(path: Path) -> int:
-    """Return the bytes of a file, or of all files in a folder."""
+    """Return the size in bytes of a file, or of all files in a folder."""
     if not path.is_dir():
         return path.stat().st_size
     return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())

@@ -13,8 +13,8 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
 
     Args:
         package: Name of the package.
-        sources: Names that each module defines, by the module's full name; the name of a
-            submodule is the submodule itself.
+        sources: Public names that each module defines, by the module's full name. If a name
+            is also the module's name, as `torch` in `mcaprl.torch`, it refers to the module.
     """
     modules = {name: module for module, names in sources.items() for name in names}
 

@@ -44,7 +44,7 @@ class Table:
 
     Attributes:
         columns: Names of the columns; all empty for a table without a header.
-        rows: One cell for each column.
+        rows: Rows, each with one cell per column.
     """
 
     columns: Sequence[str]
@@ -79,7 +79,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Section:
-    """Section of a page; its non-empty parts appear in this order."""
+    """Section of a page; it shows its non-empty fields in the order of their definition."""
 
     title: str
     text: str = ""

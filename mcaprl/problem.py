@@ -10,7 +10,7 @@ from typing import Literal, Protocol, TypeVar
 
 Severity = Literal["problem", "note"]
 LISTED = 10
-"""Number of findings of one kind that are listed; the others are counted."""
+"""Maximum number of listed findings of one kind; further ones are only counted."""
 # Descriptions contain texts from the file, so the number of kinds must be limited, too.
 _MAX_KINDS = 100
 _OTHERS = "other findings"
@@ -50,7 +50,7 @@ class Problem:
 
 
 class Finding(Protocol):
-    """Anything with a description of what was found."""
+    """Defect or note with a description; `Shortlist` accepts any such object."""
 
     @property
     def what(self) -> str:
@@ -70,7 +70,7 @@ class Shortlist(list[F]):
         self.extend(found)
 
     def append(self, finding: F) -> None:
-        """Store or count a finding."""
+        """Count a finding, and store it if it is one of the first of its kind."""
         kind = _NUMBER.sub("#", finding.what)
         if kind not in self._counts and len(self._counts) >= _MAX_KINDS:
             kind = _OTHERS
@@ -89,7 +89,7 @@ class Shortlist(list[F]):
         return self._counts.total()
 
     def rest(self) -> list[Problem]:
-        """Return one problem for each kind with unlisted findings; it states their number."""
+        """Return one problem for each kind with unlisted findings; it states how many there are."""
         return [
             Problem(f"{count - LISTED} more findings of the kind: {kind}", "not listed")
             for kind, count in self._counts.items()

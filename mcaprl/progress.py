@@ -25,11 +25,11 @@ from mcaprl.texts import printable
 Advance = Callable[[int], None]
 """Function called with the amount of completed work."""
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
-"""Function of a description and a total that opens a progress bar and yields an `Advance`."""
+"""Context manager that shows a progress bar, given its text and total; yields an `Advance`."""
 FIRST_LINE_S: Final = 5.0
 """Time until the first line of progress if stderr is not a terminal."""
 LINE_INTERVAL_S: Final = 30.0
-"""Time between two of these lines."""
+"""Time between two lines of progress if stderr is not a terminal."""
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Files on other machines, by fsspec: parts of a file are fetched when they are needed.
 
-A remote file has a local file of the same size, which is empty at first. Parts are fetched in
-blocks and stored there, so readers map the local file as any other.
+Each remote file has a sparse local file of the same size. Fetched blocks are written to it, so
+readers can memory-map it like any local file.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from mcaprl.files import write_atomically
 CACHE_VARIABLE = "MCAPRL_CACHE"
 """Environment variable with the folder in which fetched parts are kept for later commands."""
 BLOCK_BYTES = 2**16
-# Blocks closer than this are fetched by one request; longer ranges are divided among requests.
+# Blocks at most `_LEAST_GAP` apart are fetched together; ranges above `_MOST_BYTES` are divided.
 _LEAST_GAP, _MOST_BYTES = 2 * BLOCK_BYTES, 8 * 2**20
 
 Range = tuple[int, int]
-"""First byte, and first byte after the range."""
+"""Half-open range (start, stop) of byte positions."""
 
 
 def is_url(name: object) -> bool:
@@ -81,7 +81,7 @@ class RemoteFile:
                 file.truncate(self.size)
 
     def fetch(self, ranges: Iterable[Range]) -> None:
-        """Fetch the parts of these ranges that are missing, with several requests side by side.
+        """Fetch the missing blocks of these byte ranges, with concurrent requests.
 
         Raises:
             LogError: The file cannot be reached, has changed, or its server ignores ranges.
@@ -102,8 +102,8 @@ class RemoteFile:
             for (start, stop), part in zip(pieces, parts, strict=True):
                 if len(part) != stop - start:
                     raise LogError(
-                        f"cannot read {self.url}: bytes {start} to {stop} were asked for, but"
-                        f" {len(part)} bytes came: the file has changed, or its server ignores"
+                        f"cannot read {self.url}: bytes {start} to {stop} were requested, but"
+                        f" {len(part)} bytes arrived: the file has changed, or its server ignores"
                         " ranges; download it first"
                     )
             with self.local.open("rb+") as file:
@@ -126,7 +126,7 @@ class RemoteFile:
             raise LogError(f"{self.url} has changed while it was read: open it again")
 
     def _runs(self, missing: NDArray[np.bool_]) -> Iterator[Range]:
-        """Yield ranges of missing blocks; those with small gaps between them are joined."""
+        """Yield the byte ranges of missing blocks; merge ranges with small gaps between them."""
         blocks = np.flatnonzero(missing)
         if not len(blocks):
             return
@@ -138,7 +138,7 @@ class RemoteFile:
 
 
 class RemotePath(type(Path())):  # type: ignore[misc]
-    """Path of the local file of a remote one; as text it is the URL."""
+    """Path of the local copy of a remote file; `str` returns the URL."""
 
     remote: RemoteFile | None = None
 
@@ -159,7 +159,7 @@ class RemotePath(type(Path())):  # type: ignore[misc]
         return str(super().__str__())
 
     def __reduce__(self) -> Any:
-        """Open the file again in another process."""
+        """Pickle the URL, so that another process opens the file again."""
         return super().__reduce__() if self.remote is None else (RemotePath.of, (self.remote.url,))
 
 
@@ -168,7 +168,7 @@ def as_path(name: str | Path, *, whole: bool = False) -> Path:
 
     Args:
         name: Path, or URL.
-        whole: Whether all of a remote file is fetched, for readers that do not ask for parts.
+        whole: Whether all of a remote file is fetched, for readers that do not call `fetch`.
 
     Raises:
         LogError: The remote file cannot be read.
@@ -204,7 +204,7 @@ def find_remote(url: str) -> list[RemotePath]:
 
 
 def upload(path: str | Path, url: str) -> None:
-    """Copy a file to a URL. It appears under its name when it is complete.
+    """Copy a file to a URL; the name of the copy ends with `.part` until it is complete.
 
     Args:
         path: Local file.
@@ -244,7 +244,7 @@ def check_upload(url: str) -> None:
     """Check that a URL can be written to, before anything is recorded.
 
     Raises:
-        UsageError: The name is no URL, or the protocol can only be read.
+        UsageError: The name is not a URL, or the protocol can only be read.
         MissingExtraError: The package for the URL's protocol is not installed.
     """
     if not is_url(url):
@@ -268,7 +268,7 @@ def system_of(url: str) -> tuple[Any, str]:
 
 
 class _Errors:
-    """Context in which errors of file systems, which are of many types, become LogErrors."""
+    """Context manager that converts every error of a file system to a LogError."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -290,13 +290,13 @@ def _divided(start: int, stop: int) -> list[Range]:
 
 
 def _version_of(facts: dict[str, Any]) -> str:
-    """Return what differs between two versions of a file, as far as the server says it."""
+    """Return an identifier of a file's version: the ETags and times that the server reports."""
     names = ("ETag", "etag", "mtime", "LastModified", "last_modified", "created", "generation")
     return " ".join(str(facts[name]) for name in names if facts.get(name) is not None)
 
 
 def _folder_of(url: str, version: str) -> tuple[Path, bool]:
-    """Return a folder for a remote file, and whether it outlasts this process."""
+    """Return the local folder for a remote file, and whether the folder outlives this process."""
     name = hashlib.sha256(f"{url} {version}".encode()).hexdigest()[:24]
     kept = os.environ.get(CACHE_VARIABLE)
     if kept:

@@ -31,7 +31,7 @@ CURVE_NAME = "curve.csv"
 POLICY_NAME = "policy.json"
 BEST_NAME = "best_model.zip"
 Curve = dict[str, NDArray[np.float64]]
-"""Columns of a curves file by name."""
+"""Columns of a `metrics.csv` or `curve.csv` by name."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class RunSummary:
         seed: Seed K.
         steps: Number of gradient updates (offline) or environment steps (online) of all sessions.
         resumed_at: Number of steps of earlier sessions; 0 for a new run.
-        seconds: Wall time of this session. Seeds that are trained in parallel share it.
+        seconds: Wall time of this session, the same for all seeds that are trained in parallel.
     """
 
     folder: Path
@@ -61,14 +61,14 @@ class RunIdentity:
 
     Attributes:
         parts: Algorithm (`algo`), settings (`config`) and source of experience as plain JSON types.
-        other_data: Whether the part `data`, a fingerprint, may differ.
+        other_data: Whether `parts["data"]`, the fingerprint of the data, may differ.
     """
 
     parts: dict[str, Any]
     other_data: bool = False
 
     def check_same(self, found: Mapping[str, Any], where: Path) -> None:
-        """Check that the identity in a file is the same.
+        """Check that the identity in a file is equal to this one.
 
         Args:
             found: Identity in the file; it may have further parts.
@@ -102,8 +102,8 @@ def locked_run(folder: Path, resume: bool) -> Iterator[None]:
 
     Raises:
         OutputExistsError: `folder` is a file.
-        TrainingError: Another training is writing the folder, it cannot be created, or there is no
-            run to resume.
+        TrainingError: Another training is using the folder, the folder cannot be created, or
+            contains no run to resume.
     """
     if resume:
         run_to_resume(folder)
@@ -130,7 +130,7 @@ def open_run(folder: Path, identity: RunIdentity, resume: bool, **source: Any) -
     Args:
         folder: Folder of the run.
         identity: Identity of the run.
-        resume: Whether the folder contains this run, which may have ended before its first write.
+        resume: Whether to continue the run in the folder, even if it ended before its first write.
         **source: Further entries of `config.json`.
 
     Raises:
@@ -236,7 +236,7 @@ def read_curves(run: Path, name: str) -> list[Curve]:
 
 
 def _leftovers(folder: Path) -> list[Path] | None:
-    """Return the files of a run that ended early; None if the folder contains anything else."""
+    """Return the files of a run without a checkpoint; None if the folder contains other files."""
     if not folder.exists():
         return []
     if not folder.is_dir():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,14 +66,3 @@ def check_widths(widths: Sequence[int], weights: Mapping[str, Tensor]) -> None:
     needed = max((first * second for first, second in itertools.pairwise(widths)), default=0)
     if needed > present:
         raise ValueError(f"a layer has {needed} weights, more than the {present} in the file")
-
-
-def convolved_features(image_shape: Iterable[int], channels: int = 64) -> int:
-    """Return how many features Nature DQN's convolutions output; 0 if the image is too small.
-
-    Args:
-        image_shape: (height, width, ...) of the image.
-        channels: Output channels of the last convolution.
-    """
-    height, width, *_ = (max((((size - 8) // 4 - 3) // 2) - 1, 0) for size in image_shape)
-    return height * width * channels

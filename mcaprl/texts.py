@@ -1,4 +1,4 @@
-"""Formatting of numbers and of foreign texts for display."""
+"""Formatting of numbers, and of texts from files or users, for display."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def printable(text: object) -> str:
 
 
 def encodable(text: str) -> str:
-    """Return a text that UTF-8 can encode: halves of surrogate pairs are escaped."""
+    """Return a text that UTF-8 can encode: lone surrogates are escaped."""
     return text.encode(errors="backslashreplace").decode()
 
 

@@ -1,4 +1,4 @@
-"""Datasets of PyTorch: transitions and sequences of logs, in memory or as a stream.
+"""PyTorch datasets: transitions and sequences from logs, in memory or as a stream.
 
 loader = mcaprl.torch.TransitionDataset("logs/").loader(256, shuffle=True)
 stream = mcaprl.torch.TransitionStream("logs/", batch_size=256)     # for data beyond the memory

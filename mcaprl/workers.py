@@ -65,7 +65,7 @@ def run_workers(
         Exception: The task of a worker raised it.
     """
     context = multiprocessing.get_context("spawn")
-    # Only this process holds the other end of this pipe, so the end closes with the process.
+    # Only this process has the write end `held`, so the pipe closes when this process ends.
     ours, held = context.Pipe(duplex=False)
     processes = []
     open_pipes: dict[Connection, int] = {}
@@ -98,7 +98,7 @@ def run_workers(
     finally:
         held.close()
         for messages in open_pipes:
-            # Empty the pipe: a worker that waits for room in it would not end.
+            # Drain the pipe: a worker that is blocked on a full pipe would not end.
             with suppress(EOFError, OSError):
                 while True:
                     messages.recv_bytes()

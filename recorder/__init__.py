@@ -1,15 +1,15 @@
-"""The log: recording it, reading it, and what viewers show of it.
+"""Recording and reading of logs, and their display in viewers.
 
-    environment  -> wrapper -> rows, display        -> log_writer -> mcap_writer -> file
-    environments -> vector_wrapper -> vector_rows   -> log_writer -> mcap_writer -> file
-    dataset      -> save                            -> log_writer -> mcap_writer -> file
-    file -> mcap_reader -> reader -> dataset -> statistics, tables
-                        -> check
-    bag -> bags -> mapping -> dataset                                                 (convert)
+    environment  -> wrapper -> step_rows, display   -> log_writer -> writer -> file
+    environments -> vector_wrapper -> vector_rows   -> log_writer -> writer -> file
+    dataset      -> save                            -> log_writer -> writer -> file
+    file -> reader -> log_reader -> dataset -> statistics, tables
+                   -> check
+    bag -> bags -> mapping -> dataset                                 (convert)
     damaged file -> salvage -> valid_copy -> whole_episodes -> file   (recover)
 
-`chunks`, `message_rows`, `schema` and `messages` are the codec of both directions, `spaces` and
-`metadata` say what is in a log, `scene` and `layout` what a viewer makes of it.
+`chunks`, `message_rows`, `schema` and `messages` encode and decode logs. `spaces` and `metadata`
+describe the contents of a log. `scene` and `layout` define what viewers show.
 """
 
 from mcaprl.lazy import lazy_attributes

@@ -23,7 +23,7 @@ from mcaprl.sims.spec import SimCatalog, SimSpec
 SIMS: Final = SimCatalog((lane.SPEC, racer.SPEC, powerline.SPEC, highway.SPEC))
 """Gymnasium id of each sim by short name, including sims of installed packages."""
 
-# Recorders read the module from this attribute.
+# Name of the attribute that stores the module to import for an environment; read by recorders.
 _ENV_MODULE: Final = "env_module"
 
 
@@ -79,7 +79,7 @@ def make_sims(
 
 
 def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
-    """Set `env_module`, so that logs name the module that registers the environments."""
+    """Store the module part of `env_id` in the environments, so that recorders can log it."""
     module = env_id.rpartition(":")[0]
     for env in envs:
         if module and not hasattr(env.unwrapped, _ENV_MODULE):
@@ -87,7 +87,7 @@ def _set_module(envs: Iterable[gym.Env[Any, Any]], env_id: str) -> None:
 
 
 def _resolve(name: str) -> tuple[str, SimSpec | None]:
-    """Return the Gymnasium id for a name, and the sim's `SimSpec`; None if there is no such sim."""
+    """Return the Gymnasium id for a name, and the `SimSpec` of this id (None if no sim has it)."""
     env_id = SIMS.get(name, name)
     is_known_to_gymnasium = env_id in gym.registry or ":" in env_id
     return env_id, SIMS.find(env_id, loads=not is_known_to_gymnasium)

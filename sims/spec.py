@@ -61,7 +61,7 @@ class SimSpec:
             )
 
     def make_pilot(self, env: gym.Env[Any, Any]) -> Any:
-        """Return a scripted policy for an unwrapped environment of a sim that has a pilot."""
+        """Return the sim's scripted policy for an unwrapped environment; requires a pilot."""
         pilot: Any = self.pilot
         if isinstance(pilot, str):
             module, _, attribute = pilot.partition(":")
@@ -92,7 +92,7 @@ class SimCatalog(Mapping[str, str]):
         return self._spec(name).env_id
 
     def __iter__(self) -> Iterator[str]:
-        """Iterate over the names of the built-in sims, then over the other names."""
+        """Iterate over the names of the built-in sims, then over those of other packages' sims."""
         return iter([*self._specs, *(name for name in _installed() if name not in self._specs)])
 
     def __len__(self) -> int:
@@ -108,7 +108,7 @@ class SimCatalog(Mapping[str, str]):
 
         Args:
             env_id: Gymnasium id.
-            loads: If no registered sim has the id, whether to import the sims of other packages. A
+            loads: Whether to import the sims of other packages if no registered sim has the id. A
                 failed import causes a warning.
         """
         specs = self._specs

@@ -29,8 +29,8 @@ class Annotation:
     Attributes:
         out: Path of the copy.
         steps: Number of steps of the log.
-        topics: Topic of each policy.
-        scene: Episodes and steps that the scene was added to; None without a scene.
+        topics: Topic of each policy's values, by the policy's path.
+        scene: Numbers of episodes and steps that the scene was added to; None without a scene.
     """
 
     out: Path
@@ -56,14 +56,14 @@ def annotate(
 ) -> Annotation:
     """Copy a log, and add values of policies or the scene of the sim to each step.
 
-    With a mapping, the copy is the log that `convert` writes.
+    With a mapping, `file` is a bag, which is first converted to a log, as `convert` does.
 
     Args:
         file: Path of the log.
         out: Path of the copy.
         policy: Path of a trained run, or several paths.
         gamma: Discount of the TD errors; None for the discount of the run.
-        scene: Whether to step the sim again and add its scene.
+        scene: Whether to repeat the logged actions in the sim and add its scene.
         camera: Whether to add metric depth images to the scene.
         sim: Short name or Gymnasium id to use instead of the logged one.
         trust_env: Whether to import the module that the logged id names, and to pass the logged

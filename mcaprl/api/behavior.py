@@ -26,13 +26,13 @@ def estimate_behavior(
 ) -> BehaviorEstimate:
     """Estimate the probability of each logged action under the policy that took it.
 
-    Most robots do not log these probabilities, but the estimators by importance weights need them.
-    A classifier of the actions is fitted to all other parts of the episodes, and calibrated on
-    episodes that it was not trained on.
+    Most robots do not log these probabilities, but estimators with importance weights need them.
+    The episodes are split into folds. A classifier predicts the actions of one fold; it is trained
+    on the episodes of the other folds, and calibrated on some of these that are held out.
 
     Args:
         data: Dataset, file, folder or glob of logs, or several of them; actions are discrete.
-        folds: Number of parts of the episodes; each part is predicted from the others.
+        folds: Number of folds of the episodes; each one is predicted from the others.
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
         threads: Number of threads of PyTorch and of the reader.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mcaprl.recorder.mapping.summary import MappingReport
 
 _SHOWN = 5
-"""Number of transitions of a dry run."""
+"""Number of transitions that a dry run shows."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Conversion:
 
     Attributes:
         dataset: Transitions that were read.
-        report: What the mapping found and left out; None without a mapping.
-        out: Path of what was written; None if nothing was.
-        lost: One sentence for each thing that the target's format cannot hold.
+        report: Summary of the data that the mapping used and dropped; None without a mapping.
+        out: Path of the written file or folder; None if nothing was written.
+        lost: One sentence for each kind of data that the target format cannot store.
     """
 
     dataset: Dataset
@@ -79,10 +79,10 @@ def convert(
             databases, or ROS 1 bags.
         out: Path of the log or dataset; None to write none.
         mapping: Mapping file, or its keys and values; see docs/bags.md.
-        source_format: Name of the format of `source`; default: what it looks like.
+        source_format: Name of the format of `source`; default: detected from the path.
         to: Name of the format to write; default: a log if `out` ends with .mcap, otherwise the
             format with the suffix of `out`.
-        lossy: Whether what the format cannot hold is left out or converted.
+        lossy: Whether data that the format cannot store may be dropped or converted.
         trust_code: Whether the mapping may name a Python function, which is imported.
         overwrite: Whether an existing file or folder is replaced.
         upload: URL to which the written file is copied when it is complete.
@@ -102,7 +102,7 @@ def convert(
     if upload is not None:
         check_upload(upload)
         if out is None or (form is not None and not form.suffix):
-            raise UsageError("upload copies one file: the target is a folder, or there is none")
+            raise UsageError("upload copies one file: choose a file, not a folder, as the output")
     dataset, report = _read(source, mapping, source_format, trust_code)
     lost: list[str] = []
     if out is not None and form is not None:
@@ -124,7 +124,7 @@ def _read(
 
 
 def suggest_mapping(bag: Paths) -> str:
-    """Return a commented mapping file to begin with, from the topics and rates of a bag.
+    """Return a commented draft of a mapping file, based on the topics and rates of a bag.
 
     Args:
         bag: MCAP files, rosbag2 folders and databases, or ROS 1 bags.
@@ -143,7 +143,7 @@ def suggest_mapping(bag: Paths) -> str:
 
 
 def _plain(observation: Any, k: int) -> Any:
-    """Return an observation as JSON types; an image as its shape and mean."""
+    """Return observation k of a batch as JSON types; a text describes each image."""
     if isinstance(observation, dict):
         return {name: _plain(part, k) for name, part in observation.items()}
     row = observation[k]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Paths = str | Path | Sequence[str | Path]
 """A file, a folder or a glob of logs, or several of them."""
 MAPPING_NAME = "mapping.json"
-"""Copy of the mapping in the folder of a run that learned by it."""
+"""Name of the mapping's copy in the folder of a run that was trained with it."""
 Data = Dataset | Paths
 """A dataset, or paths of logs."""
 MappingFile = str | Path | Mapping[str, Any]
@@ -48,9 +48,9 @@ def open_data(
             dataset of another tool; see docs/formats.md. With a mapping: MCAP files of any writer,
             rosbag2 folders and databases, or ROS 1 bags.
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
-            rewards and ends; see docs/bags.md. None for logs of this package.
+            rewards and episode ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
-        format: Name of the other tool's format; default: what the path looks like.
+        format: Name of the other tool's format; default: detected from the path.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
             key. The dataset's observation space contains only these. An empty sequence reads no
             observations. Actions, rewards and end flags are always read. Default: all keys.
@@ -88,14 +88,14 @@ def open_data(
 
         one = _only(data)
         if one is None:
-            raise UsageError(f"several paths are for logs; pass one dataset of format {other.name}")
+            raise UsageError(f"only logs may have several paths: pass one {other.name} dataset")
         return read_format(one, other)
     assert mapping is not None
     return mapped(data, mapping, trust_code=trust_code).dataset
 
 
 def _only(data: Paths) -> str | Path | None:
-    """Return the path if there is exactly one."""
+    """Return the path if there is exactly one, else None."""
     if isinstance(data, str | Path):
         return data
     return data[0] if len(data) == 1 else None
@@ -142,7 +142,7 @@ def opened(
 
 
 def named(data: Data) -> str:
-    """Return the name of data for tables.
+    """Return the text by which tables identify the data.
 
     >>> named("lane.mcap"), named(["a.mcap", "b.mcap"])
     ('lane.mcap', 'a.mcap, b.mcap')

@@ -16,23 +16,23 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
     """Join logs into one log.
 
     The episodes of the new log are in the order of their times. The logs must be finished, and have
-    the same spaces, environment, names and step duration; other metadata that differ are empty in
-    the new log. A message that several logs have at the same time with the same bytes is written
-    once.
+    the same spaces, environment, names of observations and actions, and step duration. Other
+    metadata fields are empty in the new log if they differ. A message that several logs contain
+    with the same time and bytes is written once.
 
     Args:
         logs: Two or more logs: files, folders or globs.
         out: Path of the new log.
-        shift: Whether the times of a log whose episodes overlap with those of an earlier one are
-            moved to after the end of the earlier ones. Times inside of its messages move too.
+        shift: Whether a log whose episodes overlap in time with those of earlier logs is delayed
+            until they have ended. The timestamps inside its messages are delayed, too.
         overwrite: Whether an existing file is replaced.
 
     Raises:
         UsageError: There are fewer than two logs.
         OutputExistsError: `out` exists.
         SpaceError: The spaces differ.
-        LogError: A log cannot be read, other metadata differ, or episodes of two logs overlap in
-            time and `shift` is not set.
+        LogError: A log cannot be read; the environment, names or step duration differ; or episodes
+            of two logs overlap in time and `shift` is not set.
     """
     return merge_logs(logs, out, shift=shift, overwrite=overwrite)
 
@@ -48,8 +48,8 @@ def split(
 ) -> list[Edited]:
     """Copy the episodes of a log to several logs, each episode to one of them.
 
-    A message belongs to the episode during or after which it was logged. Messages that are valid
-    in several parts, such as the static scene, are in each of them.
+    A message belongs to the episode during or after which it was logged. Messages that remain valid
+    for later episodes, such as the static scene, are copied to each new log that needs them.
 
     Args:
         log: Path of the log.
@@ -71,7 +71,7 @@ def filter(expression: str, log: str | Path, out: str | Path, *, overwrite: bool
     """Copy the episodes for which an expression is true to a new log.
 
     The expression is a condition such as `"length > 100 and reason != 'crash'"`. It can use
-    numbers, texts, operators, and these columns of the table of episodes: `episode` (its index,
+    numbers, strings, operators, and these columns of the table of episodes: `episode` (its index,
     from 0), `length`, `total_reward`, `terminated`, `truncated`, `reason`, `policy`, `epsilon`,
     `seed` (NaN if there was none), `options`, `start_s` (time since the start of the first
     episode) and `duration_s`.
@@ -101,22 +101,23 @@ def slice(
 ) -> Edited:
     """Copy the part of a log between two steps or times to a new log.
 
-    An episode that the part begins or ends within becomes a shorter episode. If its beginning is
+    An episode that is only partly in the range becomes a shorter episode. If its beginning is
     missing, its steps are numbered from 0, and it has no seed. If its end is missing, it is
     truncated with the reason `interrupted`.
 
     Args:
         log: Path of the log; with `time`, of any finished MCAP file.
         out: Path of the new log.
-        steps: First transition of the part, and the first one after it, counted from 0 over all
-            episodes. None as a bound is the start or end of the log.
-        time: Bounds in seconds since the first message of the log, like `steps`.
+        steps: Half-open range (start, stop) of transitions, counted from 0 over all episodes. None
+            as a bound is the start or end of the log.
+        time: Half-open range (start, stop) in seconds since the first message of the log. None as
+            a bound is the start or end of the log.
         overwrite: Whether an existing file is replaced.
 
     Raises:
-        UsageError: Not exactly one of `steps` and `time` is given, or nothing is in the part.
+        UsageError: Not exactly one of `steps` and `time` is given, or the range is empty.
         OutputExistsError: `out` exists.
-        NoEpisodesError: The part has no whole transition.
+        NoEpisodesError: The range has no complete transition.
         LogError: The log cannot be read, or is not finished.
     """
     return slice_log(log, out, steps=steps, time=time, overwrite=overwrite)

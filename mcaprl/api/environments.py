@@ -77,7 +77,7 @@ def _check_needs_no_trust(dataset: Dataset, path: Path, sim: str | None) -> None
 
 
 def check_episode(dataset: Dataset, episode: int | None, path: Path) -> None:
-    """Check that a log has an episode.
+    """Check that a log has an episode with this index; None is accepted.
 
     Raises:
         UsageError: The log has fewer episodes.

@@ -31,8 +31,9 @@ class LogEstimates:
         gamma: Discount of all values.
         epsilon: Probability of a random action of the evaluated policies.
         behavior_return: Mean discounted return of the logged episodes.
-        behavior_interval: 95 % interval of that mean.
-        behavior_calibration: Number of actions that `behavior_prob` implies; None if unknown.
+        behavior_interval: 95 % confidence interval of that mean.
+        behavior_calibration: Number of actions, estimated as the mean of 1 / `behavior_prob`, to
+            compare with the action space; None if unknown.
         behavior_estimate: Quality of the estimated `behavior_prob`; None if it was not estimated
             for this evaluation.
         coverage: Mean probability of the logged actions under each policy.
@@ -87,8 +88,8 @@ def estimate(
         data: Dataset, file, folder or glob of logs, or several of them.
         gamma: Discount of the returns.
         epsilon: Probability of a random action instead of the policy's.
-        updates: Number of gradient steps of the model that FQE, DR and WDR use, and upper limit of
-            those for the behavior probabilities.
+        updates: Number of gradient steps of the model that FQE, DR and WDR use. The classifier
+            that estimates the behavior probabilities uses at most 2,000 of them.
         estimate_behavior: Whether the behavior probabilities are estimated from the actions, as by
             `mcaprl.estimate_behavior`, instead of taken from the logs.
         seed: Seed of the model and of the resampling.
@@ -146,7 +147,7 @@ def estimate(
 
 
 def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Load the policies; return a dict from the names for tables to the policies."""
+    """Load the policies, and return them by their names for tables; random is None."""
     shown = policy_names(names)
     found: dict[str, StochasticPolicy | None] = {}
     for name in dict.fromkeys(names):

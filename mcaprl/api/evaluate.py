@@ -171,7 +171,7 @@ def evaluate(
 
 
 def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
-    """Return the named policies, and random and the pilot."""
+    """Return the policies to evaluate by name: the named ones, random and the pilot."""
     found = {name: policies_of(name, env) for name in dict.fromkeys(names)}
     for name in SCRIPTED:
         if name not in found:
@@ -233,7 +233,7 @@ def _write_report(
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return the learning curves of the names that refer to a run folder or a seed folder.
+    """Return the learning curves of the runs among the names: run folders or seed folders.
 
     Online runs are compared in one figure; an offline run has one figure for each term of its loss.
     """
@@ -257,7 +257,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
 
 
 def _run_folder(path: Path) -> Path | None:
-    """Return the run folder of a run, of a seed, or of a file of a seed."""
+    """Return the run folder that is, or contains, the path; None if there is none."""
     of_seed = [seed.parent for seed in (path, path.parent) if seed.name.startswith("seed-")]
     for folder in (path, *of_seed):
         if any(any(folder.glob(f"seed-*/{name}")) for name in ("curve.csv", "metrics.csv")):

@@ -48,7 +48,8 @@ class LogInfo:
         observations: Observation space.
         actions: Action space.
         action_counts: Number of times each action was taken, by its name.
-        behavior_prob: Number of actions that `behavior_prob` implies; None if unknown.
+        behavior_prob: Number of actions, estimated as the mean of 1 / `behavior_prob`, to compare
+            with the action space; None if unknown.
         behavior_estimated: Whether `behavior_prob` was estimated, not logged by the policy.
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
@@ -56,7 +57,7 @@ class LogInfo:
         storage: Storage of the columns: memory or files.
         problems: Defects of the logs, and warnings of the reader.
         findings: Defects and notes of `lint`.
-        moments: Steps with the most surprising annotations.
+        moments: Annotated steps with the largest TD errors or policy disagreements.
     """
 
     sources: tuple[Path, ...]
@@ -98,7 +99,7 @@ class LogInfo:
         return {name: value for name, value in facts.items() if name != "sources"}
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the names and texts of the facts."""
+        """Return the name and the formatted value of each fact."""
         low, high = self.return_range
         found, origin = self.behavior_prob, "estimated, " if self.behavior_estimated else ""
         return [
@@ -238,8 +239,9 @@ def check(
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
-    With a mapping, the bag is read by it; values that are missing, too old or far from the named
-    actions are problems.
+    With a mapping, the bag is read by the mapping. A problem is reported if many steps have missing
+    or outdated values, are in episodes that are too short, or have commands far from every named
+    action.
 
     Args:
         data: File, folder or glob of logs, or several of them. A path without logs is

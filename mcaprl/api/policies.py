@@ -34,7 +34,7 @@ class TrainedPolicy(Policy, Protocol):
     """Loaded policy with NumPy inputs and outputs; B is the batch size, A the number of actions.
 
     A policy that stacks k > 1 frames stores the observations of its last k calls of `act` since
-    `begin`; the other methods accept (B, k, *shape), oldest frame first.
+    `begin`. Its other methods accept stacks (B, k, *shape) with the oldest frame first.
     """
 
     @property
@@ -135,7 +135,7 @@ def policies_of(name: str, env: gym.Env[Any, Any]) -> list[Policy | None]:
     Raises:
         UnknownNameError: There is no such policy.
         UsageError: The sim has no pilot.
-        PolicyError: The path contains no policy, or one with other spaces.
+        PolicyError: The path contains no policy, or a policy whose spaces differ from `env`'s.
     """
     if name == "random":
         return [None]
@@ -195,7 +195,7 @@ def is_policy(path: Path) -> bool:
 
 
 def _existing(name: str, others: Sequence[str]) -> Path:
-    """Return a name as an existing path; otherwise, raise an error that lists runs beside it."""
+    """Return a name as a path if it exists; otherwise, raise an error that lists nearby runs."""
     path = Path(name)
     if path.exists():
         return path

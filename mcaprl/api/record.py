@@ -55,7 +55,7 @@ class _Request:
     """One file to record; its fields are the arguments of `record`.
 
     Attributes:
-        first_episode: Number of the first episode, which determines its seed.
+        first_episode: Number of the first episode; an episode's seed depends on its number.
     """
 
     sim: str
@@ -116,7 +116,7 @@ def record(
         sim_options: Other arguments of the environment.
         scene: Whether topics that only viewers use are recorded.
         camera: Whether metric depth images are recorded.
-        infos: Whether the infos of the environment are recorded, or the names of those that are.
+        infos: Whether the infos of the environment are recorded, or the names of infos to record.
         compression: Compression of chunks: `zstd`, `lz4` or `none`.
         overwrite: Whether existing logs are replaced.
         append: Whether the episodes are added to an existing file.
@@ -190,7 +190,7 @@ def _check_request(request: _Request, envs: int) -> None:
 
 
 def _files(out: Path) -> list[Path]:
-    """Return the written files: one file, its parts, or the shards in a folder."""
+    """Return the written files: one file, its rotated parts, or the shards in a folder."""
     if out.is_file():
         return [out]
     return sorted(out.glob("*.mcap") if out.is_dir() else out.parent.glob(f"{out.stem}-*.mcap"))
@@ -214,7 +214,7 @@ def _record_file(
                 seed=request.seed,
                 episodes=request.episodes,
                 steps=request.steps,
-                # Appended episodes have the same seeds as in a single recording.
+                # Continue the numbering: appended episodes have the seeds of one longer recording.
                 first_episode=request.first_episode + recorder.episodes,
                 on_action=set_probability,
                 on_episode=on_episode,
@@ -261,7 +261,7 @@ def _record_shards(
             out=whole.out / f"shard-{number:02d}.mcap",
             episodes=None if whole.episodes is None else end - start,
             steps=None if whole.steps is None else end - start,
-            # If steps are counted, the number of episodes of the other shards is unknown.
+            # With `steps`, the number of episodes is unknown: reserve 2**20 numbers per shard.
             first_episode=start if whole.episodes is not None else number << 20,
         )
         for number, (start, end) in enumerate(
@@ -271,7 +271,7 @@ def _record_shards(
     ]
     with locked_folder(whole.out):
         old = _replaceable(whole.out, overwrite=whole.overwrite)
-        # An invalid request fails before anything is replaced.
+        # A trial recording lets an invalid request fail before any file is replaced.
         with work_folder(shards[0].out) as trial, closing(make_sim(sim, **options)) as env:
             behavior = _behavior(whole, env)
             _recorder(replace(shards[0], out=trial / "trial.mcap"), env, behavior).close()

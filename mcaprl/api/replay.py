@@ -56,7 +56,7 @@ class LiveAddress:
     """Address at which viewers connect.
 
     Attributes:
-        app_url: Address that opens Foxglove and connects it.
+        app_url: URL that opens Foxglove and connects it to the server.
         url: Address of the server, for any viewer of the Foxglove protocol.
         layout: Path of the layout to import.
     """
@@ -234,7 +234,7 @@ def render(
     if movie is not None:
         step_ns = float(np.median(np.diff(one.log_time_ns)))
         shown, images_per_s = shown_steps(one.length, speed * 1e9 / step_ns)
-        # The sim renders steps only.
+        # Images between two steps can be drawn from a scene, but not by the sim.
         parts = parts_of_step(images_per_s) if has_scene else 1
         images = draw(shown, parts) if has_scene else draw(shown)
         with progress(f"drawing {movie}", (len(shown) - 1) * parts + 1) as advance:

@@ -63,10 +63,10 @@ def train(
         threads: Number of threads of PyTorch and of the reader.
         device: `cpu` or `cuda`.
         resume: Whether training continues from the checkpoints in `out`.
-        follow: Whether episodes that another process adds to the logs are used.
+        follow: Whether episodes that another process adds to the logs meanwhile are also used.
         other_data: Whether `resume` accepts checkpoints trained on other data.
-        mapping: Mapping of another robot's bag, which is stored in `out`; see `open`. Paths then
-            have no weights.
+        mapping: Mapping of a ROS bag or another log, see `open`; the mapping is copied to `out`.
+            With a mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
@@ -107,7 +107,7 @@ def train(
         growing, weights = None, None
         if mapping is not None and not isinstance(data, Dataset):
             if follow:
-                raise UsageError("follow needs logs, not a bag with a mapping")
+                raise UsageError("follow is for logs; a bag with a mapping cannot be followed")
             dataset = open_data(as_names(data), mapping=mapping, trust_code=trust_code)
         elif isinstance(data, Dataset):
             if follow:
@@ -127,7 +127,7 @@ def train(
             seed=seed,
             weights=weights,
             resume=resume,
-            # The logs have grown since the checkpoints were trained.
+            # With `follow`, the logs have grown since the checkpoints, so the data may differ.
             other_data=other_data or follow,
             follow=growing,
             device=device,
@@ -181,7 +181,7 @@ def train_online(
         sources: Logs that fill the replay buffer, and at most one policy whose weights initialize
             the agents.
         resume: Whether training continues from the checkpoints in `out`.
-        live: Whether viewers can connect during training, which shows one episode after the other.
+        live: Whether viewers can connect during training, and watch one episode after the other.
         live_speed: Simulated seconds per second in the episodes that are shown.
         port: Port on 127.0.0.1 for viewers; 0 for any free port.
         allow_origin: Origin, or several, of web pages that may connect, besides pages on this
@@ -251,7 +251,7 @@ def train_online(
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
-    """Open the logs among the sources as one dataset, and load the policies of the run, if any."""
+    """Return the logs in `sources` as one dataset, and the policies of its run; None if absent."""
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")

@@ -1,1 +1,1 @@
-"""Reading of any robot's bag: its topics as columns of fields."""
+"""Reader for bags of any robot: each field of a topic becomes a column."""

@@ -1,4 +1,4 @@
-"""A bag: topics with messages, whatever format and encoding they have."""
+"""A bag: topics and their messages, in any supported format and encoding."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Stream(NamedTuple):
 
     Attributes:
         log_time_ns: (N,) log_time of each message.
-        columns: Column of each field by its dotted path: (N,) numbers, (N, K) numbers of arrays
-            of equal length, otherwise (N,) objects: texts, bytes, lists.
+        columns: Column of each field by its dotted path: (N,) numbers, (N, K) numbers if all
+            values are arrays of K numbers, otherwise (N,) objects (strings, bytes or lists).
     """
 
     log_time_ns: NDArray[np.int64]
@@ -37,7 +37,7 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """Facts of a topic.
+    """Description of a topic.
 
     Attributes:
         name: Name of the topic.
@@ -74,7 +74,7 @@ class Bag(Protocol):
 
     @property
     def topics(self) -> Mapping[str, TopicInfo]:
-        """Facts of each topic by name."""
+        """Description of each topic by name."""
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """Return the (N,) log_times of a topic, in file order."""
@@ -88,7 +88,7 @@ class Bag(Protocol):
             topic: Name of the topic.
             fields: Dotted paths of fields; `publish_time` is the time of publication in
                 nanoseconds.
-            rows: Positions of the messages in `times`, in the order to return; default: all.
+            rows: Indices into `times` of the wanted messages, in output order; default: all.
 
         Raises:
             LogError: A message cannot be read.
@@ -100,7 +100,7 @@ class Bag(Protocol):
 
 
 class _Topic:
-    """A topic of all files of a bag."""
+    """One topic of a bag, joined from all files."""
 
     def __init__(self, name: str, sources: Sequence[TopicSource]) -> None:
         self.name = name
@@ -112,7 +112,7 @@ class _Topic:
         if len(self._given) == 1:
             return list(self._given)
         used = [each for each in self._given if len(each.times_ns)] or list(self._given[:1])
-        # Files of a split bag follow each other in time.
+        # The files of a split bag cover successive time ranges: sort them by their first messages.
         return sorted(used, key=lambda each: each.times_ns[0] if len(each.times_ns) else 0)
 
     @cached_property
@@ -166,7 +166,7 @@ class _Topic:
         return Stream(times_ns, columns)
 
     def _messages(self, rows: NDArray[np.int64] | None) -> Iterator[tuple[int, Any]]:
-        """Yield time of publication and decoded message, in the order of `rows`."""
+        """Yield publication time and decoded message of each row, in the order of `rows`."""
         assert self._decoder is not None, "a topic with a problem is not read"
         if rows is None:
             yield from self._rising(np.arange(len(self.times_ns)), self._decoder)
@@ -191,7 +191,7 @@ class _Topic:
 
 
 class _Infos(Mapping[str, TopicInfo]):
-    """Facts of each topic by name; a topic's definition is parsed when it is asked for."""
+    """Mapping from topic name to description; each definition is parsed at its first access."""
 
     def __init__(self, topics: Mapping[str, _Topic]) -> None:
         self._topics = topics
@@ -207,7 +207,7 @@ class _Infos(Mapping[str, TopicInfo]):
 
 
 class _FileBag:
-    """A bag of files."""
+    """Bag that consists of one or more open files."""
 
     def __init__(self, files: Sequence[McapFile | RosbagFile], opened: ExitStack) -> None:
         self._opened = opened
@@ -246,12 +246,12 @@ class _FileBag:
 def open_bag(data: str | Path | Sequence[str | Path]) -> Bag:
     """Open a bag: MCAP files, rosbag2 folders and databases, and ROS 1 bags.
 
-    Files that rosbag2 compressed as a whole are decompressed to a temporary folder. Topics that
-    cannot be read have a `problem`; the others can be read nevertheless.
+    Files that rosbag2 compressed as a whole are decompressed to a temporary folder. If a topic
+    cannot be read, its `problem` is not empty; all other topics can still be read.
 
     Args:
-        data: A file, a folder, a glob, or a sequence of these; topics of several files are joined
-            in the order of time.
+        data: A file, a folder, a glob, or a sequence of these. If several files have a topic, the
+            file whose first message is the earliest comes first.
 
     Raises:
         LogError: A file is missing, damaged, or not a bag.

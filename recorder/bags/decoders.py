@@ -1,4 +1,4 @@
-"""Decoders of messages to objects, and columns of their fields."""
+"""Decoders of messages to objects, and conversion of their fields to columns."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class ProtobufDecoder:
             ) from error
 
     def _collect(self, descriptor: Any, prefix: str, parents: tuple[str, ...]) -> None:
-        """Collect the leaf fields and enum constants; a type within itself is left out."""
+        """Collect the leaf fields and enum constants; skip a message type nested in itself."""
         for field in descriptor.fields:
             path = f"{prefix}{field.name}"
             inner = field.message_type
@@ -149,7 +149,7 @@ class JsonDecoder:
     """Decoder of JSON objects, with a JSON schema or without."""
 
     def __init__(self, schema: bytes) -> None:
-        """List the fields of the schema; without one they are unknown."""
+        """Collect the fields of the JSON schema; without a schema, the fields are unknown."""
         self.fields, self.constants = dict[str, str](), dict[str, int]()
         try:
             found = json.loads(schema) if schema.strip() else {}
@@ -230,7 +230,7 @@ def column_of(values: Sequence[Any], kind: str) -> NDArray[Any]:
 
 
 def _vectors(values: Sequence[Any]) -> NDArray[Any]:
-    """Return arrays of numbers of one length as (N, K), all others as objects."""
+    """Return arrays of K numbers as one (N, K) array, and all other values as objects."""
     try:
         arrays = [np.asarray(value) for value in values]
     except (ValueError, TypeError):

@@ -49,7 +49,8 @@ def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
         return [_open(path, "", opened)]
     metadata = _metadata(path)
     if str(metadata.get("compression_mode") or "").lower() == "message":
-        # Each message is compressed, which only the reader of folders undoes.
+        # Messages are compressed one by one; `RosbagFile` decompresses them only if it opens the
+        # folder instead of a file.
         folder = RosbagFile(path)
         opened.callback(folder.close)
         return [folder]
@@ -60,17 +61,17 @@ def open_files(path: Path, opened: ExitStack) -> list[McapFile | RosbagFile]:
 
 
 def _files_of(folder: Path, metadata: dict[str, Any]) -> tuple[list[Path], str]:
-    """Return the files of a folder and its ROS distribution.
+    """Return the bag files of a folder, and the ROS distribution that its metadata names.
 
-    Files that `metadata.yaml` lists come first, in its order. A recorder that was killed leaves no
-    metadata, or a file that is not listed yet.
+    Files that `metadata.yaml` lists come first, in the listed order. If the recorder was killed,
+    `metadata.yaml` is missing or does not list all files.
     """
     listed = metadata.get("relative_file_paths") or []
     first = [folder / Path(str(name)).name for name in listed]
     first = [path for path in first if path.exists()]
     kinds = (*_KINDS, *(f"{kind}{_COMPRESSED}" for kind in _KINDS))
     rest = sorted(path for path in folder.iterdir() if path.name.endswith(kinds))
-    # A compressed file and its original may both be there.
+    # A compressed file and its original may both exist; only one of them is opened.
     known = {_plain_name(path) for path in first}
     for path in rest:
         if _plain_name(path) not in known:

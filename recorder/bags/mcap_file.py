@@ -29,7 +29,7 @@ class McapFile:
 
     Attributes:
         path: Path of the file.
-        topics: Topics by name, one source for each channel with messages.
+        topics: Sources of each topic by its name, one source for each channel.
     """
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
@@ -97,13 +97,13 @@ class _McapTopic:
             return None
         try:
             return dict(topic.read(list(fields), rows))
-        # Arrays of different lengths become objects.
+        # Arrays of different lengths cannot form a column; they are decoded one by one.
         except LogError:
             return None
 
     @cached_property
     def _columnar(self) -> Topic | None:
-        """The topic as columns; None if its type has none, or the topic has several channels."""
+        """Columnar reader of the topic; None if it cannot be used or there are several channels."""
         try:
             found = Topic(self._reader, self._channel.topic)
         except LogError:
@@ -112,9 +112,9 @@ class _McapTopic:
 
 
 def _is_column(kind: str) -> bool:
-    """Return whether a field is read as a column: a number, a text, or an array of numbers.
+    """Return whether a field is read as a column: a number, string, time or array of numbers.
 
-    Bytes stay bytes, and lists of texts or messages stay lists.
+    Messages with other fields, such as bytes and lists of strings, are decoded one by one.
     """
     element, bracket, _ = kind.partition("[")
     if bracket:

@@ -1,4 +1,4 @@
-"""Decoding of ROS messages by the definitions in a bag, or else by those of a distribution."""
+"""Decoder of ROS messages, with definitions from a bag or else from a ROS distribution."""
 
 from __future__ import annotations
 

@@ -24,14 +24,14 @@ class RosbagFile:
 
     Attributes:
         path: Path of the file or folder.
-        topics: Topics by name, one source for each connection.
+        topics: Sources of each topic by its name, one source for each connection.
     """
 
     def __init__(self, path: Path, *, distribution: str = "") -> None:
         """Open a bag.
 
         Raises:
-            LogError: The bag is damaged, or of an unknown form.
+            LogError: The bag is damaged, or its format is unknown.
         """
         self.path = path
         is_ros1 = path.suffix == ".bag"
@@ -71,7 +71,7 @@ class _RosbagTopic:
         encoding = "ros1" if is_ros1 else "cdr"
         text = found.data.encode()
         self.definition = Definition(connection.msgtype, encoding, known, text, distribution)
-        # The position of the next message of the running pass over the file, and the pass.
+        # The current pass over the messages, and the position of its next message.
         self._next = 0
         self._pass: Iterator[tuple[Connection, int, bytes]] = iter(())
 
@@ -86,7 +86,7 @@ class _RosbagTopic:
             for _, time_ns, data in self._pass:
                 self._next += 1
                 if self._next > row:
-                    # Databases before Jazzy and ROS 1 bags store no time of publication.
+                    # ROS 1 bags and rosbag2 databases before Jazzy store no publication time.
                     yield RawMessage(time_ns, data)
                     break
 

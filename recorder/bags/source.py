@@ -51,7 +51,7 @@ class TopicSource(Protocol):
         """(N,) log_times in file order."""
 
     def raw(self, rows: NDArray[np.int64]) -> Iterator[RawMessage]:
-        """Yield the messages at positions (K,), which rise and are distinct."""
+        """Yield the messages at the positions `rows` (K,), which are distinct and ascending."""
 
     def columns(
         self, fields: Sequence[str], rows: NDArray[np.int64] | None

@@ -56,7 +56,7 @@ def written_state(path: Path) -> WrittenState:
 
 
 def finished_state(reader: McapReader) -> WrittenState:
-    """Return the state in which the writer of a finished file left it.
+    """Return the state of a finished file, from which a writer can append to it.
 
     Raises:
         CorruptLogError: The file is damaged or not finished, or has messages outside of chunks.

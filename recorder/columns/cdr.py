@@ -96,7 +96,10 @@ class MessageType:
 
     @cached_property
     def dtypes(self) -> dict[str, np.dtype[Any]]:
-        """Dtype of each top-level field; `object` for all but numbers, arrays and times."""
+        """Dtype of each top-level field.
+
+        The dtype is `object` for all fields except numbers, arrays of numbers, and times.
+        """
         return {name: _dtype_of(description) for name, description in self._fields.items()}
 
     @cached_property
@@ -121,12 +124,12 @@ class MessageType:
             raise CorruptLogError(str(error)) from error
 
     def known_layout(self, length: int, wanted: Collection[str]) -> Layout | None:
-        """Return the layout that was found last for this message length; None if there is none."""
+        """Return the latest layout for messages of this length; None if there is none."""
         return self._layouts.get((length, *wanted))
 
     def layout(self, example: bytes, wanted: Collection[str]) -> Layout | None:
         """Return the layout of an example message; None if the message has no layout."""
-        # Building a new layout takes as long as decoding a few messages.
+        # Layouts are cached: building one takes as long as decoding a few messages.
         key = (len(example), *wanted)
         known = self._layouts.get(key)
         if known is None or not known.fits(np.frombuffer(example, known.dtype)):
@@ -161,7 +164,7 @@ class MessageType:
             case Nodetype.NAME if name is not None and what in TIME_TYPES:
                 walk.take_time(name, wanted)
             case Nodetype.NAME:
-                # Names are composed only where a wanted path may be.
+                # Build the paths of nested fields only if a wanted path is among them.
                 within = wanted if any(each.startswith(f"{path}.") for each in wanted) else ()
                 for inner, found in self._definitions.types[what][1]:
                     self._pass(walk, found, f"{path}.{inner}" if within else path, within)
@@ -211,7 +214,7 @@ class _Walk:
         self.position += count * dtype.itemsize
 
     def take_time(self, name: str, wanted: Collection[str]) -> None:
-        """Skip a time; record its two parts as one field, and as fields if they are wanted."""
+        """Skip a time; record it as one field, and also record `sec` and `nanosec` if wanted."""
         self.position += -(self.position - ENCAPSULATION_BYTES) % 4
         start, self.position = self.position, self.position + 8
         if self.position > len(self._data):
@@ -223,7 +226,7 @@ class _Walk:
                 self._fields[f"{name}.{part}"] = (code, start + 4 * number)
 
     def take_texts(self, name: str, count: int) -> None:
-        """Skip an array of strings; record it as one field with a part for each string."""
+        """Skip an array of strings; record it as one structured field with one item per string."""
         start, codes, offsets = self.position, [], []
         for _ in range(count):
             size = self.length()
@@ -281,7 +284,7 @@ _parsed = lru_cache(maxsize=64)(MessageType)
 
 
 def clear_types() -> None:
-    """Drop all parsed types, so that a benchmark measures a first opening."""
+    """Clear the cache of parsed types, so that a benchmark includes the time of parsing."""
     _parsed.cache_clear()
     definitions_of.cache_clear()
 

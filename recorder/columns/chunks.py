@@ -18,7 +18,8 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.columns.checksum import crc32
 from mcaprl.recorder.columns.message_rows import RECORD_HEADER_BYTES
 
-# 32 KB of zstd data can decompress to 1 GiB; ordinary writers stay below this limit.
+# This limits memory: 32 KB of zstd data can decompress to 1 GiB. Ordinary writers write smaller
+# chunks.
 MAX_CHUNK_BYTES = 256 * 2**20
 
 _CHUNK_START = struct.Struct("<BQQQQII")
@@ -27,21 +28,21 @@ _INDEX_START, _INDEX_MAP_ENTRY = struct.Struct("<QQQQI"), struct.Struct("<HQ")
 _INDEX_MIDDLE, _INDEX_END = struct.Struct("<QI"), struct.Struct("<QQ")
 _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # A record of numbers is most similar to the records just before it, so a small hash table is faster
-# than the one of zstd level 1 and finds more matches. The low bits of floats are noise, which the
-# fast strategy stores uncompressed if a target length is set. Files are 2 to 9 % larger than at
-# level 1, are written in 20 to 50 % less time, and are read in 33 to 50 % less.
+# than the table of zstd level 1 and finds more matches. The low bits of floats are random; the fast
+# strategy stores them uncompressed if a target length is set. Compared with level 1, files are 2 to
+# 9 % larger, are written in 20 to 50 % less time, and are read in 33 to 50 % less time.
 SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
-# Images resemble images far back in the chunk, and their bytes are not noise.
+# Images are similar to images much earlier in the chunk, and their bytes are not random.
 LONG_RECORDS = _ZSTD(1)
 # Messages of different lengths are mostly display messages. They repeat so much that a slower
 # search halves their size.
 MIXED_RECORDS = _ZSTD(12)
-# Few long messages, such as a static scene, are written once: a fifth smaller, in a tenth of a
-# second.
+# Long messages that are rare, such as a static scene, use a higher level: it takes 0.1 s and makes
+# them a fifth smaller.
 RARE_RECORDS = _ZSTD(16)
-# Longer messages are mostly images.
+# Messages that are longer than this are mostly images.
 LONG_MESSAGE_BYTES = 2**11
-# Messages of `MIXED_RECORDS` that are longer on average are rare.
+# Messages of different lengths use `RARE_RECORDS` if their mean size is larger than this.
 RARE_MESSAGE_BYTES = 2**14
 
 
@@ -65,7 +66,7 @@ class Compressors:
         short: Compressor for short messages of one length.
         long: Compressor for long messages.
         mixed: Compressor for short messages of different lengths.
-        rare: Compressor for few long messages that are no images.
+        rare: Compressor for rare long messages that are not images.
     """
 
     def __init__(self, compression: str) -> None:
@@ -90,7 +91,7 @@ class ChunkHeader(NamedTuple):
     Attributes:
         start_time: Smallest log_time of the messages, nanoseconds.
         end_time: Largest log_time of the messages, nanoseconds.
-        uncompressed_bytes: Length of the records.
+        uncompressed_bytes: Uncompressed length of the records.
         crc: CRC-32 of the records; 0 if there is none.
         compression: `zstd`, `lz4` or empty.
         data: Position of the compressed records in the file.
@@ -183,15 +184,14 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
     try:
         start_time, end_time, offset, length, map_bytes = _INDEX_START.unpack_from(content)
         middle = _INDEX_START.size + map_bytes
-        pairs = list(_INDEX_MAP_ENTRY.iter_unpack(content[_INDEX_START.size : middle]))
+        offsets = dict(_INDEX_MAP_ENTRY.iter_unpack(content[_INDEX_START.size : middle]))
         index_bytes, name_bytes = _INDEX_MIDDLE.unpack_from(content, middle)
         name = middle + _INDEX_MIDDLE.size
         compression = str(content[name : name + name_bytes], "utf-8")
         compressed_bytes, raw_bytes = _INDEX_END.unpack_from(content, name + name_bytes)
     except (struct.error, UnicodeDecodeError) as error:
         raise CorruptLogError("a chunk_index record is damaged") from error
-    offsets = dict(pairs)
-    if len(offsets) < len(pairs):
+    if len(offsets) * _INDEX_MAP_ENTRY.size < map_bytes:
         raise CorruptLogError("a chunk_index record has several indexes of one channel")
     # Positional arguments: keywords take twice as long.
     return ChunkIndex(
@@ -234,7 +234,7 @@ class Scratch:
         """Return `size` bytes of memory, which the next call reuses."""
         self.kept = _NOTHING
         if len(self._memory) < size:
-            # Release the old memory first.
+            # Release the old memory first, so that both are never allocated at once.
             self._memory = np.empty(0, np.uint8)
             self._memory = np.empty(size, np.uint8)
         return self._memory.data[:size]

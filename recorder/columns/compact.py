@@ -32,11 +32,11 @@ from mcaprl.recorder.columns.records import contents_of, map_file, records_of
 from mcaprl.recorder.columns.summary import Summary
 
 SMALL_CHUNK_BYTES = 2**16
-"""Chunks with fewer bytes of records are merged."""
+"""Chunks with fewer bytes of uncompressed records than this are merged."""
 _MERGED_BYTES = 2**20
 # Saving fewer chunks than this is not worth the time of rewriting the file.
 _MIN_CHUNKS_SAVED = 8
-# If each avoided chunk costs more copied bytes than this, copying takes longer than readers save.
+# Maximum number of bytes to copy for each chunk saved. Copying more takes longer than readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
 # If one of these records is between two listed chunks, the summary omits a chunk.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
@@ -103,7 +103,7 @@ def groups_of(chunks: Iterable[ChunkIndex]) -> list[list[ChunkIndex]]:
 
 
 def _kinds(chunks: Iterable[ChunkIndex]) -> dict[int, int]:
-    """Number the kinds of channels: channels that share a chunk get the same number."""
+    """Return a kind number for each channel; channels that share a chunk have the same number."""
     kinds: dict[int, int] = {}
     for ids in {tuple(chunk.message_index_offsets) for chunk in chunks}:
         connected = {kinds.get(channel_id, channel_id) for channel_id in ids}

@@ -25,13 +25,13 @@ from mcaprl.recorder.columns.records import RECORD_HEADER
 
 # If the messages of a chunk have more different lengths than this, they are decoded one by one.
 _MAX_LENGTHS = 16
-# Maximum number of layouts for a message length; messages of other layouts are decoded singly.
+# Maximum number of layouts for each message length; the remaining messages are decoded one by one.
 _MAX_LAYOUTS = 8
 
 Columns = dict[str, NDArray[Any]]
-"""Arrays of one length by field name; strings are `str` objects, arrays of strings are lists."""
+"""Arrays of equal length by field name, with strings as `str` and arrays of strings as lists."""
 Rows = slice | NDArray[np.int64]
-"""Rows of a column."""
+"""Selection of rows of a column."""
 
 
 class Decoder:
@@ -66,7 +66,10 @@ class Decoder:
         messages: MessageRange,
         scratch: Scratch | None = None,
     ) -> Columns:
-        """Return columns with `count` rows and the dtypes and shapes of the first message."""
+        """Return empty columns of `count` rows for the wanted fields.
+
+        The first message determines the dtypes and shapes.
+        """
         records = self._reader.records_of(messages, scratch)
         example = self._values(records, messages.index[0], wanted)
         return {
@@ -105,7 +108,7 @@ class Decoder:
             if self._put_alike(columns, records, index[alike], rows[alike]):
                 index, rows, lengths = index[~alike], rows[~alike], lengths[~alike]
                 continue
-            # Two strings may change places, so that layouts differ and lengths do not.
+            # Layouts can differ at equal length, for example if two strings are swapped.
             for _ in range(_MAX_LAYOUTS):
                 alike = self._like_first(records, index, lengths == length, columns)
                 if not alike.any() or not self._put_alike(
@@ -122,7 +125,7 @@ class Decoder:
         among: NDArray[np.bool_],
         wanted: Collection[str],
     ) -> NDArray[np.bool_]:
-        """Return which of some messages of equal length have the layout of the first."""
+        """Return a mask of the messages in `among` with the same layout as the first of them."""
         alike = np.zeros(len(index), bool)
         places = np.flatnonzero(among)
         if len(places):
@@ -156,7 +159,7 @@ class Decoder:
         self, records: memoryview, index: NDArray[Any], wanted: Collection[str]
     ) -> NDArray[Any] | None:
         """Return the messages as one structured array; None if their layouts differ."""
-        # Most messages have the layout of earlier ones.
+        # Try the layout of earlier messages first, because most messages have it.
         known = self.type.known_layout(self._length(records, index), wanted)
         found = None if known is None else self._laid_out(records, index, known)
         if found is not None:
@@ -181,7 +184,7 @@ class Decoder:
         try:
             rows = gather(records, index, dtype)
         except CorruptLogError:
-            # The last messages may be shorter than this layout.
+            # The layout may extend beyond the end of the chunk if the last messages are shorter.
             return None
         are_valid = are_messages(rows, self.channel.id) and bool(
             (rows["log_time"] == index["log_time"]).all()
@@ -209,7 +212,7 @@ class Decoder:
         }
 
     def _lists_of_texts(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return arrays of strings, which have a part for each string, as lists."""
+        """Convert structured values, with one item per string, to lists of strings."""
         texts = [self._texts(values[part]) for part in values.dtype.names or ()]
         lists = np.empty(len(values), object)
         lists[:] = [[text[row] for text in texts] for row in range(len(values))]
@@ -217,7 +220,7 @@ class Decoder:
 
     def _texts(self, values: NDArray[Any]) -> list[str]:
         try:
-            # Often all strings are equal.
+            # Often all strings are equal: decode only the first.
             if (values == values[0]).all():
                 return [bytes(values[0]).decode()] * len(values)
             return [text.decode() for text in values.tolist()]
@@ -246,7 +249,7 @@ def _value_at(message: Any, path: str) -> Any:
 
 
 def _as_array(value: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return a value as an array; a list of strings or messages becomes its only element."""
+    """Return a value as an array; wrap a list of strings or messages in a 0-d object array."""
     if not isinstance(value, list):
         return np.asarray(value, dtype)
     found = np.empty((), object)

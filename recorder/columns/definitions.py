@@ -1,4 +1,4 @@
-"""Definitions of ROS types: those of a file, or else those of a ROS distribution."""
+"""Definitions of ROS types, from a file or else from a ROS distribution."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mcaprl.errors import LogError
 
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
-# Definitions of a service's events may lack those of its request and response. The events can be
-# read nevertheless if they contain neither, which is the default of ROS.
+# The definition of a service event may lack the definitions of the request and the response. By
+# default, ROS leaves both out of the event; such an event is read without their definitions.
 _EVENT, _PARTS = "_Event", ("_Request", "_Response")
 _UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
 _IDL_LINE = "=" * 80 + "\n"
@@ -56,7 +56,7 @@ class Definitions:
 
     @cached_property
     def _store(self) -> Typestore:
-        """Store whose generated code decodes messages; generating takes milliseconds."""
+        """Type store that generates the code for decoding messages, which takes milliseconds."""
         store = get_typestore(Stores.EMPTY)
         new = {key: found for key, found in self.types.items() if key not in store.fielddefs}
         store.register(new)
@@ -103,7 +103,7 @@ def definitions_of(
                 found = _UNKNOWN
             if found is None:
                 what = "its definition" if each == name else f"the definition of nested type {each}"
-                raise LogError(f"{name}: {what} is missing and not known")
+                raise LogError(f"{name}: {what} is missing, and the ROS distribution lacks it")
             types[each] = found
             for field, description in found[1]:
                 _refuse_wide(name, field, description)
@@ -114,13 +114,14 @@ def definitions_of(
 def leaf_kinds(types: Mapping[str, Any], name: str, prefix: str = "") -> dict[str, str]:
     """Return the kind of each leaf field of a type by its dotted path.
 
-    Kinds are `float64`, `string`, `float32[36]`, `uint8[]` and so on; `time` for times and
-    durations, whose two parts are leaves as well; and the type's name for arrays of messages.
+    Kinds of numbers, strings and arrays are, for example, `float64`, `string`, `float32[36]` and
+    `uint8[]`. Times and durations have the kind `time`; their fields `sec` and `nanosec` are leaf
+    fields as well. The kind of an array of messages is, for example, `geometry_msgs/msg/Point[]`.
 
     Args:
         types: Definitions of the type and all nested ones; see `Definitions.types`.
         name: Full name of the type.
-        prefix: Path of the type's value with a final dot.
+        prefix: Path of the field that has this type, with a final dot; empty at the top level.
     """
     found = {}
     for field, description in types[name][1]:
@@ -158,7 +159,7 @@ def _parsed(name: str, text: str, encoding: str) -> dict[str, Any]:
             return dict(get_types_from_msg(text, name))
         if not text.startswith(f"{_IDL_LINE}IDL: "):
             return dict(get_types_from_idl(text))
-        # Several definitions, each after a line with its name.
+        # The text contains several definitions, each preceded by a line with the type name.
         parts = [part.split("\n", 1)[1] for part in text.split(_IDL_LINE) if part.strip()]
         return {key: found for part in parts for key, found in get_types_from_idl(part).items()}
     # The library raises errors of many types when a definition does not parse.
@@ -170,7 +171,7 @@ def _refuse_wide(name: str, field: str, description: Any) -> None:
     kind, what = description
     if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         kind, what = what[0]
-    # `get_types_from_msg` takes the word for a message.
+    # `get_types_from_msg` parses `wstring` as the name of a message type.
     word = what[0] if kind == Nodetype.BASE else str(what).rpartition("/")[2]
     if word == "wstring":
         raise LogError(

@@ -59,9 +59,9 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
 
 
 def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
-    """Return whether a chunk contains exactly the messages of its indexes.
+    """Return whether a chunk contains exactly the messages that its indexes list.
 
-    A chunk with other records can be valid, too; the caller compares it record by record.
+    A chunk that also contains other records can be valid; the caller then compares each record.
     """
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
     if not len(ids):
@@ -73,7 +73,7 @@ def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     offsets = index["offset"]
     if offsets[0] or offsets[-1] >= len(records):
         return False
-    # Each size is at least the size of a header, so the lengths below do not wrap around.
+    # Reject records that are shorter than a header: the subtraction below would wrap around.
     sizes = np.diff(offsets, append=np.uint64(len(records)))
     if (sizes < MESSAGE_HEADER.itemsize).any():
         return False
@@ -114,7 +114,7 @@ def check_statistics(reader: McapReader) -> list[Problem]:
             if id_ in counts
         ]
     return [
-        Problem(f"the summary counts {wrong} {name}, the file {count}", "the summary")
+        Problem(f"the summary counts {wrong} {name}, but the file has {count}", "the summary")
         for name, wrong, count in triples
         if wrong != count
     ]

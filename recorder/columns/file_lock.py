@@ -77,14 +77,14 @@ def release(file: FileIO) -> None:
 
 
 def replaced(path: Path, locked: FileIO, length: int) -> FileIO:
-    """Replace a file with a locked copy of its start; current readers keep the old file.
+    """Replace a file with a locked copy of its first bytes; current readers keep the old file.
 
     The old file is released once the copy is in place; an error leaves the old file unchanged.
 
     Args:
         path: Path of the file; a symbolic link is followed.
         locked: The file, locked by the caller.
-        length: Number of bytes to copy; the copy is positioned after them.
+        length: Number of bytes to copy; the returned file is positioned after them.
 
     Raises:
         LogError: Another process is writing the file.
@@ -115,7 +115,7 @@ def copy_start(source: FileIO, target: FileIO, length: int) -> None:
     while length:
         part = memoryview(source.read(min(length, _COPIED_BYTES)))
         if not part:
-            raise OSError(errno.EIO, "the file to copy is shorter than before")
+            raise OSError(errno.EIO, "the file became shorter while it was copied")
         length -= len(part)
         while part:
             part = part[target.write(part) :]

@@ -65,7 +65,7 @@ def message_record(channel_id: int, sequence: int, time_ns: int, data: bytes) ->
 
 
 def are_messages(rows: NDArray[Any], channel_id: int) -> bool:
-    """Return whether all rows of a `record_dtype` are messages of this channel and length."""
+    """Return whether all rows are messages of the channel with the length of their dtype."""
     size = rows.dtype.itemsize
     head = _HEAD.pack(Opcode.MESSAGE, size - RECORD_HEADER_BYTES, channel_id)
     words, expected = rows.view(_words(size)), np.frombuffer(head, _words(_HEAD.size))[0]
@@ -108,7 +108,7 @@ def message_index(file: memoryview, offset: int, channel_id: int) -> NDArray[Any
 
 
 class MessageRange:
-    """Messages of one channel that are stored in one chunk; `len()` is their number.
+    """Messages of one channel in one chunk or outside of chunks; `len()` is their number.
 
     Attributes:
         chunk: Chunk with the messages; None for unchunked messages.
@@ -140,10 +140,15 @@ class MessageRange:
 
 
 def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the messages of `INDEX_ENTRY` entries as one structured array of a `record_dtype`.
+    """Return the messages at the entries of `index` as one structured array.
 
-    Adjacent messages are not copied. Others are copied by fancy indexing of void items, at the
-    speed of memcpy; fancy indexing of structured items takes twenty times as long.
+    Adjacent messages are not copied. Other messages are copied by fancy indexing of void items, at
+    the speed of memcpy; fancy indexing of structured items takes twenty times as long.
+
+    Args:
+        records: Records of the chunk.
+        index: Array of `INDEX_ENTRY`.
+        dtype: Result of `record_dtype`.
 
     Raises:
         CorruptLogError: An entry points outside of the chunk.
@@ -160,7 +165,7 @@ def gather(records: memoryview, index: NDArray[Any], dtype: np.dtype[Any]) -> ND
 
 
 def windows(data: memoryview, offsets: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy the structures at the offsets; each must end within the data."""
+    """Return copies of the `dtype` items at byte offsets; each must end within the data."""
     size = dtype.itemsize
     first = np.frombuffer(data, np.dtype((np.void, size)), 1)
     every = np.lib.stride_tricks.as_strided(first, (len(data) - size + 1,), (1,))
@@ -177,5 +182,5 @@ def _are_adjacent(offsets: NDArray[Any], size: int, end: int) -> bool:
 
 @lru_cache(maxsize=2)
 def adjacent_offsets(first: int, last: int, size: int) -> NDArray[np.uint64]:
-    """Return the offsets of adjacent messages; all full chunks of a topic share these."""
+    """Return the offsets of adjacent messages, cached because full chunks of a topic share them."""
     return np.arange(first, last + 1, size, dtype=np.uint64)

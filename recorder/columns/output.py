@@ -21,7 +21,7 @@ from mcaprl.recorder.columns.message_rows import message_index_head
 from mcaprl.recorder.columns.signals import HoldSignals
 from mcaprl.recorder.columns.summary import Summary
 
-# Joining parts up to this total size is faster than several system calls.
+# Up to this total size, joining the parts is faster than one system call for each part.
 _JOINED_BYTES = 2**16
 
 
@@ -125,7 +125,7 @@ class OutputFile:
             with HoldSignals():
                 if sum(map(len, parts)) <= _JOINED_BYTES:
                     parts = (b"".join(parts),)
-                # Of a mapped file, the CRC reads the pages faster than the write would.
+                # Compute the CRC first: it loads the pages of a mapped source faster than `write`.
                 crc = self._crc
                 for part in parts:
                     crc = crc32(part, crc)

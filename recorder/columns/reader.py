@@ -58,10 +58,10 @@ from mcaprl.recorder.columns.records import (
 )
 from mcaprl.remote import RemotePath, as_path
 
-# The first and the last bytes of a remote file, which are fetched at once.
+# Number of bytes at the start and at the end of a remote file that are fetched when it is opened.
 _HEAD_BYTES, _TAIL_BYTES = 2**16, 2**18
 _SUMMARY = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
-# The fields of a MessageIndex record before its entries.
+# Bytes of a MessageIndex record before its entries.
 _INDEX_HEAD_BYTES = RECORD_HEADER_BYTES + 6
 _START_OF = attrgetter("chunk_start_offset")
 _TOP_LEVEL = (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -103,7 +103,7 @@ class McapReader:
         self.data_end = 0
         self._counts: dict[int, int] = {}
         unchunked = UnindexedMessages()
-        # A caller that reads the first message of a chunk usually reads the others next.
+        # Offset and records of the latest chunk: callers usually read all its messages in turn.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
         self._ranges: dict[int, list[MessageRange]] = {}
@@ -112,7 +112,7 @@ class McapReader:
         self.complete = footer is not None
         self.summary_start = footer.summary_start if footer is not None else 0
         if not self.summary_start:
-            # All records are read, because there is no list of them.
+            # Without a summary, all records are read.
             self.fetch([(0, size)])
         if self.summary_start:
             self._read_summary()
@@ -125,7 +125,7 @@ class McapReader:
 
     @property
     def view(self) -> memoryview:
-        """Bytes of the file; all of a remote file is fetched."""
+        """Bytes of the file; a remote file is fetched completely."""
         self.fetch([(0, len(self._view))])
         return self._view
 
@@ -144,7 +144,7 @@ class McapReader:
             self._remote.fetch(ranges)
 
     def fetch_chunks(self, parts: Iterable[MessageRange]) -> None:
-        """Fetch the chunks of messages of a remote file with their indexes, side by side."""
+        """Fetch the chunks and indexes of these messages of a remote file in parallel."""
         if self._remote is not None:
             chunks = [part.chunk for part in parts]
             if None in chunks:
@@ -162,14 +162,14 @@ class McapReader:
         """Check that the file was not changed in place since it was opened.
 
         Reading beyond the end of a truncated file would kill the process. The writers of this
-        library replace finished files instead, and readers keep the old content; an unfinished file
-        may grow.
+        library never truncate a finished file: they replace it, and readers keep the old content.
+        An unfinished file may grow.
 
         Raises:
             LogError: The file was truncated or written to.
         """
         if self._remote is not None:
-            # The local file changes when parts are fetched.
+            # The local copy of a remote file also changes when parts are fetched: do not check it.
             return
         try:
             now, before = os.stat(self.path), self._state
@@ -225,7 +225,7 @@ class McapReader:
         """
         if channel.id not in self._ranges:
             if self._remote is not None:
-                # Without these, a topic that is in many chunks would need a request for each.
+                # Fetch these indexes together; else each chunk would need its own request.
                 places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
                 starts = [one.chunk_start_offset + one.chunk_length for one in places]
                 self.fetch(zip(starts, map(end_of, places), strict=True))
@@ -382,12 +382,12 @@ class McapReader:
         return self._contents[start]
 
     def _read_summary(self) -> None:
-        for offset, opcode, content in records_of(self._view, self.summary_start):
-            if opcode == Opcode.CHUNK_INDEX:
-                with self._named():
+        with self._named():
+            for offset, opcode, content in records_of(self._view, self.summary_start):
+                if opcode == Opcode.CHUNK_INDEX:
                     self.chunks.append(parse_chunk_index(content))
-            elif opcode in _SUMMARY:
-                self._parse(opcode, content, offset)
+                elif opcode in _SUMMARY:
+                    self._parse(opcode, content, offset)
         self.chunks.sort(key=_START_OF)
 
     def _read_between_chunks(self, unchunked: UnindexedMessages) -> None:
@@ -455,18 +455,24 @@ class McapReader:
 
     def _find_topics_in_chunks(self) -> None:
         """Search chunks for schemas and channels that are stored nowhere else."""
+        described = self._described_channels()
         for chunk in self.chunks:
-            # A chunk without message indexes may contain any channel.
-            ids = chunk.message_index_offsets or self.channels
-            found = [self.channels.get(number) for number in ids]
-            is_known = all(channel and self._has_schema(channel) for channel in found)
-            if not is_known or not (chunk.message_index_offsets or self._summary_has_topics):
+            indexed = chunk.message_index_offsets.keys()
+            if indexed:
+                is_known = indexed <= described
+            else:
+                # A chunk without message indexes may contain any channel.
+                is_known = self._summary_has_topics and self.channels.keys() <= described
+            if not is_known:
                 for topic in self._contents_of(chunk).topics:
                     self._keep(topic)
+                described = self._described_channels()
 
-    def _has_schema(self, channel: Channel) -> bool:
+    def _described_channels(self) -> set[int]:
+        """Return the ids of the known channels whose schema is known, too."""
         # The schema id 0 means no schema.
-        return channel.schema_id == 0 or channel.schema_id in self.schemas
+        schemas = {0, *self.schemas}
+        return {number for number, one in self.channels.items() if one.schema_id in schemas}
 
     def _is_listed(self, opcode: int, content: memoryview) -> bool:
         """Return whether the summary has this schema or channel; both records begin with an id."""

@@ -89,7 +89,7 @@ def records_of(
 ) -> Iterator[tuple[int, int, memoryview]]:
     """Yield offset, opcode and content of each record from `start` on.
 
-    Stops before a record that extends beyond `stop`. The default is the end of the view.
+    Stops before a record that extends beyond `stop`, by default the end of the view.
     """
     offset, stop = start, len(view) if stop is None else stop
     while offset + RECORD_HEADER.size <= stop:
@@ -115,7 +115,7 @@ def parse_record(opcode: int, content: memoryview) -> Any:
 
 
 def is_intact_attachment(content: memoryview) -> bool:
-    """Return whether an Attachment record matches its CRC or has none.
+    """Return whether an Attachment record matches its CRC or has no CRC.
 
     Bytes after the CRC are ignored.
     """
@@ -208,7 +208,7 @@ def only(
 
 
 def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
-    """Return the indexes of a chunk; None unless all its records are messages of equal length."""
+    """Return the indexes of a chunk if all records are messages of equal length, else None."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None
     size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]
@@ -227,7 +227,7 @@ def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
 
 
 def start_of_summary(view: memoryview) -> int:
-    """Return the first byte of the summary; 0 if there is none, or no footer."""
+    """Return the offset of the summary section; 0 if the file has no summary or no footer."""
     start = len(view) - len(MCAP0_MAGIC) - _FOOTER_BYTES
     if start < len(MCAP0_MAGIC) or bytes(view[-len(MCAP0_MAGIC) :]) != MCAP0_MAGIC:
         return 0

@@ -2,9 +2,9 @@
 
 MCAP has no synchronization markers. After a damaged record, the search first skips the length that
 this record declares. If no valid record follows, the search tries each byte over a limited
-distance. Then it looks only for chunks, in which two lengths must agree. A record is valid if its
-lengths agree and if serializing its parsed content reproduces its bytes. The CRC of a chunk is
-checked only when the chunk is decompressed.
+distance. Then it looks only for chunks, whose record length and data length must agree. A record is
+valid if its lengths agree and if serializing its parsed content reproduces its bytes. The CRC of a
+chunk is checked only when the chunk is decompressed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Damage:
 
     Attributes:
         offset: Offset of the first byte.
-        bytes: Number of bytes; 0 if the damage is not in one place.
+        bytes: Number of bytes; 0 if the position of the damage is unknown.
         what: Description of the damage.
     """
 
@@ -54,7 +54,7 @@ class Damage:
 
 
 def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidRecord]:
-    """Yield the valid records of the data section; add the bytes between them to `damages`."""
+    """Yield the valid records of the data section; add each damaged range to `damages`."""
     offset = len(MCAP0_MAGIC)
     if bytes(view[:offset]) != MCAP0_MAGIC:
         damages.append(Damage(0, min(offset, len(view)), "no magic bytes"))
@@ -83,7 +83,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
 def _ends_data(view: memoryview, offset: int, content: memoryview) -> bool:
     """Return whether a DataEnd record is the end of the data section.
 
-    Its CRC must match the data before it. Without a CRC, no chunk may follow.
+    The CRC of the record must match all data before it. If it has no CRC, no chunk may follow it.
     """
     (crc,) = struct.unpack("<I", content)
     if crc:
@@ -154,7 +154,7 @@ def _next_record(view: memoryview, damaged: int) -> int:
         is_valid = (
             following < len(view) and view[following] in _KNOWN and _valid_record(view, following)
         )
-        # A wrong length can point to a later chunk, so that valid chunks are skipped.
+        # A wrong length can point to a later chunk; check that no valid chunk would be skipped.
         if is_valid and _next_chunk(view, damaged + 1, following) == following:
             return following
     near = min(damaged + _NEAR_BYTES, len(view))
@@ -171,7 +171,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
         part = bytes_[block : min(block + _BLOCK_BYTES, stop)]
         found = block + np.flatnonzero(part == int(Opcode.CHUNK))
         found = found[found + RECORD_HEADER_BYTES <= len(bytes_)]
-        # The lengths of chunks are below 2**40.
+        # The lengths of chunks are below 2**40, so their three high bytes are 0.
         for high in (6, 7, 8):
             found = found[bytes_[found + high] == 0]
         for offset in found.tolist():

@@ -83,7 +83,7 @@ class Summary:
         for opcode, records in every:
             group_start = builder.count
             for record in records:
-                # The chunk indexes are the most numerous records.
+                # Use the fast function, because most records of a summary are chunk indexes.
                 if isinstance(record, ChunkIndex):
                     builder.write(chunk_index_record(record))
                 else:

@@ -94,7 +94,7 @@ class Topic:
 
     @cached_property
     def chunks_rise(self) -> bool:
-        """Whether one channel has all messages, and the times of its chunks do not overlap."""
+        """Whether one channel has all messages, in chunks that ascend in time without overlap."""
         chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
         return (
             self.channels == 1
@@ -107,7 +107,9 @@ class Topic:
 
     @cached_property
     def fields(self) -> dict[str, np.dtype[Any]]:
-        """Dtypes of the top-level fields; `object` for all but numbers, arrays and times.
+        """Dtypes of the top-level fields.
+
+        The dtype is `object` for all fields except numbers, arrays of numbers, and times.
 
         Raises:
             LogError: The channels of the topic have different types.
@@ -121,7 +123,7 @@ class Topic:
 
     @cached_property
     def kinds(self) -> dict[str, str]:
-        """Kinds of the leaf fields by dotted path; empty if channels differ."""
+        """Kinds of the leaf fields by dotted path; empty if the channels have different types."""
         found = [decoder.type.kinds for decoder in self._decoders]
         return found[0] if found and all(each == found[0] for each in found) else {}
 
@@ -133,7 +135,7 @@ class Topic:
         A time or duration is an int64 in nanoseconds. Arrays of strings and of messages are lists.
 
         Args:
-            wanted: Names of fields, or dotted paths of nested ones; `kinds` has all of them.
+            wanted: Names of fields, or dotted paths of nested fields; `kinds` lists all paths.
             order: Positions in `times` of the messages to read, by default all. Chunks without
                 such messages are not read.
             threads: Number of threads that decompress chunks and copy messages.
@@ -199,7 +201,7 @@ class Topic:
         return (self.parts[number][1] for number in numbers)
 
     def _fetch_indexes(self) -> None:
-        """Fetch the message indexes of a remote file, side by side."""
+        """Fetch the message indexes of a remote file in parallel."""
         if self._reader.is_remote:
             chunks = [part.chunk for _, part in self.parts if part.chunk is not None]
             stops = [end_of(chunk) for chunk in chunks]

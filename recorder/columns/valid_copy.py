@@ -40,7 +40,7 @@ def recover_file(
     Args:
         source: Path of the damaged file.
         target: Path of the new file; an existing one is replaced.
-        damages: List that receives the damaged places and the records that cannot be copied.
+        damages: List to which damaged ranges and records that cannot be copied are added.
         restore: Function that returns the metadata records to write.
 
     Raises:
@@ -56,7 +56,7 @@ def recover_file(
         for offset, opcode, content in records:
             copy.take(offset, opcode, content)
         copy.flush()
-        # Channels without messages.
+        # Also write the channels that have no messages.
         for channel_id in topics.channels:
             topics.announce(channel_id, writer)
 
@@ -74,9 +74,9 @@ def copy_messages(
         reader: Reader of the file; all its messages are in chunks.
         target: Path of the new file; an existing one is replaced.
         actions_of: Function that returns the action for each message of one channel in one chunk,
-            given their index: `DROP`, `KEEP`, or a larger number for a message to edit.
-        edit: Function that changes a message in place. It gets the channel, the bytes of the chunk
-            from the message's payload on, and the action.
+            given the message index: `DROP`, `KEEP`, or a larger number, which is passed to `edit`.
+        edit: Function that changes a message in place. Its arguments are the channel, the bytes of
+            the chunk from the start of the message's payload, and the action.
 
     Yields:
         The writer, for more messages.
@@ -156,7 +156,7 @@ class _Topics:
             self._damages.append(Damage(offset, 0, what))
 
     def announce(self, channel_id: int, writer: McapWriter) -> bool:
-        """Write a channel and its schema once; return False if a definition of them is missing."""
+        """Write a channel and its schema once; return False if either is missing."""
         channel = self.channels.get(channel_id)
         if channel is None or (channel.schema_id and channel.schema_id not in self.schemas):
             return False
@@ -174,8 +174,8 @@ class _Copy:
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
-        # Offsets of the chunks so far, by the CRC and length of their records. A chunk that an
-        # intact summary lists is never a repeated chunk, even if an earlier one has equal records.
+        # Offsets of the chunks so far, by the CRC and length of their records. A chunk with equal
+        # records is dropped as a repetition, unless an intact summary lists it.
         self._seen: dict[tuple[int, int], list[int]] = {}
         self._listed = {
             record.chunk_start_offset
@@ -185,7 +185,7 @@ class _Copy:
         self._unchunked, self._scratch = bytearray(), Scratch()
 
     def take(self, offset: int, opcode: int, content: memoryview) -> None:
-        """Write the content of a record."""
+        """Write a chunk or attachment; collect an unchunked message; skip any other record."""
         if opcode == Opcode.CHUNK:
             self.flush()
             self._take_chunk(offset, len(content))

@@ -211,7 +211,7 @@ class McapWriter(OutputFile):
         """Write a chunk of complete records.
 
         Args:
-            records: Message records with sequence numbers; the file has their channels.
+            records: Message records with sequence numbers. Their channels are already in the file.
             indexes: Arrays of `message_rows.INDEX_ENTRY` by channel id.
         """
         for channel_id, index in indexes.items():
@@ -230,7 +230,7 @@ class McapWriter(OutputFile):
 
         Args:
             view: Bytes of the other file.
-            chunk: Index of the chunk. This file has all its channels, with equal ids.
+            chunk: Index of the chunk. Its channels are already in this file, with the same ids.
             counts: Number of messages of the chunk by channel id.
         """
         self._copy_chunk(view, chunk)

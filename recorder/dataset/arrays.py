@@ -34,7 +34,7 @@ def description_of(
     observation_space: spaces.Space[Any] | None,
     action_space: spaces.Space[Any] | None,
 ) -> LogMetadata:
-    """Return log metadata for the arguments of `Dataset.from_arrays`."""
+    """Return the metadata for `Dataset.from_arrays`; infer the spaces that are None."""
     if observation_space is None and action_space is None:
         observation_space, action_space = _registered_spaces(env_id, observations)
     return LogMetadata(
@@ -109,7 +109,7 @@ def _registered_spaces(
 
 
 def with_fresh_times(columns: Transitions, start_ns: int, step_ns: int) -> Transitions:
-    """Replace the log_times: the first is `start_ns`, and each frame adds `step_ns`."""
+    """Replace the log_times: start at `start_ns`, and increase by `step_ns` per frame."""
     times = start_ns + np.arange(len(columns.log_time_ns)) * step_ns
     first, lengths = columns.first_frames.tolist(), columns.lengths.tolist()
     episodes = tuple(
@@ -139,7 +139,7 @@ def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
 
 
 def box_of(array: NDArray[Any]) -> spaces.Box:
-    """Return a Box without bounds: the dtype's range for integers, infinity for floats."""
+    """Return a Box for rows (N, *shape): bounds of an integer dtype, otherwise infinite bounds."""
     kind = array.dtype.kind
     if kind in "iu":
         low, high = int(np.iinfo(array.dtype).min), int(np.iinfo(array.dtype).max)
@@ -206,5 +206,5 @@ def _last_steps(
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return rows as bytes, because two NaN values only compare as equal in this form."""
+    """Return the bytes of each row; unlike floats, the bytes of two NaN values compare as equal."""
     return np.frombuffer(array.tobytes(), np.uint8).reshape(len(array), -1)

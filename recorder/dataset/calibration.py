@@ -4,8 +4,8 @@ A log contains only the probability p of the action taken. If each action is dra
 probability p, the expected value of 1 / p is the number of actions with p > 0. This also works for
 a range of probabilities: the sum of 1 / p over the steps whose p is in the range, divided by the
 number of all steps, estimates how many actions per state have a probability in the range. For
-example, an epsilon-greedy policy over nine actions has one action of high
-probability and eight of low probability.
+example, an epsilon-greedy policy over nine actions has one action of high probability and eight of
+low probability.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 _STANDARD_ERRORS = 4.0
 """Largest deviation attributed to chance, in standard errors."""
 _LEAST_CHANCE = 1e-6
-"""Smallest chance of drawing an action this improbable that is still attributed to chance."""
+"""Smallest accepted chance that any step draws an action as rare as the rarest in the log."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ProbabilityRange:
     Attributes:
         probability: Mean action probability.
         steps: Number of steps.
-        actions: Mean number of actions per state with a probability in the range.
+        actions: Estimated mean number of actions per state whose probability is in the range.
     """
 
     probability: float
@@ -94,10 +94,11 @@ class Calibration:
 def calibration(
     behavior_probs: NDArray[np.floating], action_space: spaces.Space[Any]
 ) -> Calibration | None:
-    """Estimate the calibration of the logged probabilities (N,) of the actions taken.
+    """Compare the logged action probabilities (N,) with the size of the action space.
 
     Returns:
-        None if the actions are not discrete, or a probability is unknown or not in (0, 1].
+        None if the actions are not discrete, a probability is unknown or not in (0, 1], or there
+        are fewer than two steps.
     """
     if not isinstance(action_space, spaces.Discrete) or len(behavior_probs) < 2:
         return None

@@ -191,7 +191,8 @@ class Conversions:
     def to_d3rlpy(self) -> Any:
         """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
 
-        The last transition before a truncation is included.
+        A truncated episode gets an additional step, because d3rlpy does not use its last step as a
+        transition.
 
         Raises:
             SpaceError: d3rlpy cannot hold a space.

@@ -192,7 +192,7 @@ class Dataset(Conversions):
 
     @property
     def infos(self) -> dict[str, np.ma.MaskedArray[Any, Any]]:
-        """(F, *shape) masked array of each info by its dotted name, such as `episode.r`.
+        """(N + E, *shape) masked array of each info by its dotted name, such as `episode.r`.
 
         Row k is the info that the environment returned with row k of `frames`; the row is masked
         if the environment returned none. The mapping is empty if no infos were recorded.
@@ -236,7 +236,10 @@ class Dataset(Conversions):
 
     @property
     def action_names(self) -> dict[int, str]:
-        """Names of the discrete actions, by value; empty for other actions."""
+        """Names of the discrete actions, by value; empty for other action spaces.
+
+        Without distinct `action_meanings`, a small space's names are the numbers as text.
+        """
         return self._description.action_names()
 
     @cached_property

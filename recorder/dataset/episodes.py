@@ -17,7 +17,7 @@ from mcaprl.recorder.format.reading import Columns, Topic
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
 COUNTERS = ("episode", "step", "final")
-"""Fields of `/rl/step` that place a record: its episode, its step, and the final-record flag."""
+"""Fields of `/rl/step` that locate a record: episode, step and final-record flag."""
 # Number of rows of a column that fit into the processor's cache.
 _BLOCK_ROWS = 2**15
 
@@ -35,8 +35,8 @@ def time_order(topic: Topic) -> NDArray[np.int64] | None:
 def step_order(steps: Topic) -> NDArray[np.int64] | None:
     """Return row indexes that sort `/rl/step` records into whole episodes; None if already sorted.
 
-    Records are sorted by log_time. If channels were recorded at the same time, for example by two
-    robots, records are sorted by channel first.
+    Records are sorted by log_time. If this does not yield whole episodes, for example because two
+    robots recorded at the same time, records are sorted by channel and then by log_time.
 
     Raises:
         CorruptLogError: No order yields whole episodes.
@@ -111,7 +111,10 @@ class EpisodeTopic:
         return self._columns["length"].astype(np.int64)
 
     def summaries(self, ends: NDArray[np.int64]) -> list[EpisodeSummary]:
-        """Read at least the summaries of the episodes that end at these log_times."""
+        """Read the summaries of the episodes that end at the log_times `ends`.
+
+        If these are half of the episodes or more, read all summaries instead.
+        """
         if not self._is_ours:
             return []
         fields, rows = EpisodeSummary._fields, None
@@ -148,7 +151,7 @@ def summaries(
     Raises:
         CorruptLogError: A recorded summary disagrees with the records.
     """
-    # The end time is the key, because episode indexes restart at 0 in appended recordings.
+    # Identify episodes by end time, because indexes restart at 0 in appended recordings.
     by_end = {summary.end_time_ns: summary for summary in recorded}
     finals = np.cumsum(lengths + 1) - 1
     ends = columns["log_time"][finals].tolist()
@@ -169,7 +172,7 @@ def summaries(
 def summaries_of_records(
     columns: Columns, finals: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[EpisodeSummary]:
-    """Compute the summaries of the episodes that end with these final records.
+    """Compute the summaries of the episodes with final records at the rows `finals` (E,).
 
     Fields that the records do not contain keep their defaults.
     """

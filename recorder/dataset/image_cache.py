@@ -19,7 +19,8 @@ from mcaprl.recorder.format.spaces import Leaf
 from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 
 Storage = Literal["auto", "memory", "mapped"]
-"""`memory`, `mapped` (on disk), or `auto`: `mapped` above `MEMORY_SHARE` of the free memory."""
+"""`memory`, `mapped` (on disk), or `auto`: `mapped` if the images exceed
+`MEMORY_SHARE` of the free memory."""
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CACHE_METADATA = "mcaprl.images"
@@ -81,7 +82,7 @@ def image_cache(
 
 
 def fingerprint(reader: McapReader) -> str:
-    """Return the SHA-256 of a log's chunk offsets and CRCs; without CRCs, the mtime is added."""
+    """Return the SHA-256 of a log's chunk offsets and CRCs, and of its mtime if it lacks CRCs."""
     digest = hashlib.sha256(str(len(reader.view)).encode())
     has_crcs = bool(reader.chunks)
     for chunk in reader.chunks:

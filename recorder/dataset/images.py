@@ -122,7 +122,7 @@ class _Images:
             yield self.topic.times[part], self.read(part)
 
     def mapped(self, order: NDArray[np.int64]) -> MappedImages:
-        """Return an array-like (F, *shape) of images on disk; reading a chunk validates it."""
+        """Return an array-like (F, *shape) on disk; a chunk is checked when it is first read."""
         places = np.empty((len(self.topic), 3), np.int64)
         checks, start = [], 0
         first = self._data_offset()

@@ -57,8 +57,8 @@ def _out_of_range(dataset: Dataset) -> Iterator[Problem]:
             first = int(wrong[0])
             yield Problem(
                 f"{_count(len(wrong), 'element')} of {leaf.name} outside its space",
-                f"{_name(dataset, leaf, first)} is {column.low[first]:.4g} to"
-                f" {column.high[first]:.4g}, its space {low[first]:.4g} to {high[first]:.4g}",
+                f"{_name(dataset, leaf, first)} has values from {column.low[first]:.4g} to"
+                f" {column.high[first]:.4g}, but bounds {low[first]:.4g} to {high[first]:.4g}",
                 "observations that are scaled by the bounds of the space are out of range",
             )
 
@@ -132,7 +132,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             "only the last steps of episodes have a reward",
             f"{int((rewards != 0).sum())} of {len(dataset.episodes)} episodes",
-            "these rewards reach the values of early steps slowly: n-step returns help",
+            "training propagates these rewards to early steps slowly: n-step returns help",
         )
         return
     cut, others = rewards[dataset.truncated], rewards[~last]
@@ -142,7 +142,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
             yield Problem(
                 f"{_count(int(beyond.sum()), 'truncated episode')} end with a reward that no"
                 " other step has",
-                f"{cut[beyond][0]:.4g}, elsewhere {others.min():.4g} to {others.max():.4g}",
+                f"{cut[beyond][0]:.4g}; other steps have {others.min():.4g} to {others.max():.4g}",
                 "learners bootstrap after truncation, but this reward suggests a terminal state",
             )
 
@@ -162,7 +162,7 @@ def _time_gaps(dataset: Dataset) -> Iterator[Problem]:
         yield Problem(
             f"{_count(len(gaps), 'gap')} in time; the median step is {usual_ns / 1e9:.4g} s",
             f"the longest is {longest_ns / 1e9:.4g} s, episode {index} step {step}",
-            "steps are missing or took longer: their transitions are not comparable to others",
+            "steps are missing or took longer: these transitions cover more time than others",
         )
 
 
@@ -189,7 +189,7 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             "behavior_prob is estimated",
             "all steps",
-            "off-policy estimates have an error that their intervals do not contain",
+            "intervals of off-policy estimates do not include the error of these probabilities",
         )
 
 

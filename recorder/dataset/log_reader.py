@@ -170,7 +170,7 @@ class LogReader:
             )
 
     def _finished(self, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Warn about records after the last finished episode.
+        """Return `lengths` unchanged; warn about records after the last finished episode.
 
         Raises:
             NoEpisodesError: The log has no finished episode.
@@ -179,7 +179,7 @@ class LogReader:
             raise NoEpisodesError(f"{self.path} has no finished episode")
         extra = len(self._steps) - int(lengths.sum()) - len(lengths)
         if extra or not self._reader.complete:
-            viewers = f"; for a viewer, run `mcaprl recover {self.path} OUT`"
+            viewers = f"; to open it in a viewer, run `mcaprl recover {self.path} OUT`"
             warnings.warn(
                 f"{self.path} was cut off or is still being written; finished episodes read:"
                 f" {len(lengths)}, later records skipped: {extra}"
@@ -247,7 +247,7 @@ def described(reader: McapReader) -> LogMetadata | None:
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # The copy in the summary section is protected by a CRC.
+        # This copy is in the summary section, whose CRC detects damage.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata
@@ -271,7 +271,7 @@ def _steps_of(reader: McapReader) -> Topic:
         topics = ", ".join(sorted(channel.topic for channel in reader.channels.values())) or "none"
         raise NoStepsError(
             f"{reader.path} has no topic {STEP_TOPIC}, hence no transitions (topics: {topics});"
-            " another robot's bag is read by a mapping: --mapping (mapping= in Python)"
+            " to read a robot's bag, pass a mapping: --mapping (mapping= in Python)"
         )
     for schema in map(reader.schema_of, channels):
         if not is_intact(schema.name, schema.data):
@@ -283,7 +283,7 @@ def _as_leaf(path: Path, columns: Columns, leaf: Leaf) -> NDArray[Any]:
     """Convert a field's column to the shape and dtype of its leaf.
 
     Raises:
-        CorruptLogError: The column does not convert exactly.
+        CorruptLogError: The column has another size, or the conversion would change its values.
     """
     column = columns[leaf.name]
     if column[0].size == leaf.size:

@@ -142,7 +142,7 @@ class MappedImages:
 
 
 Frames = NDArray[Any] | MappedImages
-"""The values of one leaf of an observation space."""
+"""All frames of one observation leaf, in memory or on disk."""
 
 
 def rows_of(frames: Frames, rows: Any) -> Frames:

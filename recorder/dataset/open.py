@@ -111,7 +111,7 @@ def _episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     outside = selected[(selected < -count) | (selected >= count)]
     if len(outside) or not len(selected):
         what = f"no episode {outside[0]}" if len(outside) else "no episodes are selected"
-        raise UsageError(f"{what}: the logs have {count} episodes, counted from 0")
+        raise UsageError(f"{what}: the logs have {count} episodes; indexes start at 0")
     return np.unique(selected % count)
 
 

@@ -30,8 +30,8 @@ def save_log(
 ) -> None:
     """Write columns as a log.
 
-    If the log_times do not increase from frame to frame, they are replaced by times that start now.
-    Episodes are numbered from 0.
+    If the log_times start at 0 or do not increase from frame to frame, they are replaced by times
+    that start at the current time. Episodes are numbered from 0.
 
     Raises:
         OutputExistsError: The file exists and `overwrite` is not set.
@@ -79,7 +79,7 @@ def _write_infos(path: Path, log: LogWriter, columns: Transitions) -> None:
             values = info_array(np.ma.getdata(info[rows])[present])
             if values is None or (mask.any(axis=1) != mask.all(axis=1)).any():
                 what = f"{info.dtype} of shape {info.shape[1:]}"
-                what += ", masked in parts of rows" if values is not None else ""
+                what += ", with rows that are partly masked" if values is not None else ""
                 raise SpaceError(f"{path}: a log cannot store the info '{name}': {what}")
             if len(values):
                 part[name] = (columns.log_time_ns[rows][present].tolist(), values)

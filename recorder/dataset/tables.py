@@ -1,11 +1,11 @@
 """Conversion of datasets to PyArrow tables. Requires the extra `tables`.
 
-A tensor is an array of more than one dimension, so each row is a vector or an array. With
-`tensors="columns"`, a tensor becomes one column per element, `observation.<name>` or
-`observation.<index>`; a row of more than MAX_COLUMNS elements, such as an image, becomes a flat
-list. With `tensors="lists"`, each tensor becomes one column of flat fixed-size lists in C order,
-and the metadata of the column's field has its shape, as a JSON list in `shape`. The metadata of the
-table's schema has the spaces: see `described`.
+A tensor is a column whose rows are vectors or arrays. With `tensors="columns"`, a tensor becomes
+one column per element, `observation.<name>` or `observation.<index>`; a row of more than
+MAX_COLUMNS elements, such as an image, becomes a flat list. With `tensors="lists"`, each tensor
+becomes one column of flat fixed-size lists in C order, and the metadata of the column's field has
+the shape of a row, as a JSON list in `shape`. The metadata of the table's schema has the spaces:
+see `described`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mcaprl.recorder.format.spaces import Leaf
 
 Tensors = Literal["columns", "lists"]
 MAX_COLUMNS = 64
-# A chunk per episode costs more than a copy if the chunks are small.
+# Arrow chunks smaller than this are copied into one: many small chunks make a table slow.
 _MIN_SHARED_BYTES = 1 << 14
 
 
@@ -102,7 +102,7 @@ def observation_names(leaves: Sequence[Leaf]) -> list[str]:
 
 
 def field_of(arrow: Any, name: str, array: Any, shape: Sequence[int]) -> Any:
-    """Return the field of a column without nulls; its metadata has the shape of a row, if any."""
+    """Return a non-nullable field; its metadata contains the row shape if `shape` is not empty."""
     metadata = {"shape": json.dumps(list(shape))} if shape else None
     return arrow.field(name, array.type, nullable=False, metadata=metadata)
 
@@ -134,7 +134,7 @@ def info_problem(name: str, info: Masked) -> str:
 def info_columns(
     arrow: Any, infos: Mapping[str, Masked], rows: NDArray[np.int64], prefix: str
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield the field and the column of each info, `PREFIX.<name>`, with these rows.
+    """Yield a field named `PREFIX.<name>` and the values at `rows` for each info.
 
     The metadata of a field has the NumPy dtype and the shape of a row.
 

@@ -79,7 +79,7 @@ class Transitions:
         return np.arange(len(self.rewards)) + episode_of_step
 
     def at(self, steps: Any) -> dict[str, NDArray[Any]]:
-        """Return these rows of the `STEP_COLUMNS`, by name."""
+        """Return the given rows of each of the `STEP_COLUMNS`, by column name."""
         return {name: getattr(self, name)[steps] for name in STEP_COLUMNS}
 
     def take(self, chosen: Sequence[int]) -> Transitions:
@@ -137,11 +137,11 @@ def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str,
     """Concatenate infos; if a part lacks an info, the rows of this part are masked.
 
     Args:
-        parts: Infos by name, and the number of their rows.
+        parts: Infos by name and number of rows, for each dataset or episode.
 
     Raises:
         SpaceError: An info differs in shape or kind (text, flag or number) between the parts, or
-            some of its integers are not exact as floats.
+            some of its integers cannot be converted exactly to the common dtype.
     """
     found: dict[str, Masked] = {}
     for name in dict.fromkeys(name for infos, _ in parts for name in infos):
@@ -150,7 +150,7 @@ def joined_infos(parts: Sequence[tuple[Mapping[str, Masked], int]]) -> dict[str,
         if len(kinds) > 1 or any(one.shape[1:] != shape for one in present):
             raise SpaceError(f"the info '{name}' differs between the parts in shape or kind")
         dtype = np.result_type(*(one.dtype for one in present))
-        # Texts of any lengths are kept.
+        # Conversion to the common dtype can only change numbers, not flags or text.
         for info in present if kinds == {"number"} else ():
             values = info.compressed()
             if not is_exact(values.astype(dtype), values):

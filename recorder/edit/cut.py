@@ -1,4 +1,4 @@
-"""Copies of some episodes of a log."""
+"""Copies of selected episodes of a log, as one new log or as several."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mcaprl.recorder.format.selected_copy import Source, copy_selected
 from mcaprl.recorder.mapping.expression import Column, Expression
 
 _NS_PER_S = 10**9
-# Larger integers are not all float64 values, in which expressions compare numbers.
+# Expressions compare numbers as float64, which cannot represent all larger integers.
 _LARGEST_EXACT = 2**53
 
 
@@ -69,14 +69,14 @@ def split_log(
 def episode_columns(
     summaries: Sequence[EpisodeSummary], names: frozenset[str]
 ) -> dict[str, Column]:
-    """Return one column of the table of episodes for each name that a filter can use.
+    """Return the columns that a filter can use, by name, with one row per episode.
 
     Args:
         summaries: Summaries of the episodes.
         names: Names that the filter uses.
 
     Raises:
-        UsageError: The filter uses seeds that it cannot compare exactly.
+        UsageError: The filter uses `seed`, and a seed is too large to be compared exactly.
     """
     seeds = [summary.seed for summary in summaries]
     largest = max((seed for seed in seeds if seed is not None), default=0)
@@ -114,10 +114,11 @@ def _copy_episodes(log: FinishedLog, chosen: NDArray[np.int64], target: Path, ou
 def _parts(
     count: int, episodes: int | None, ratio: Sequence[float] | None
 ) -> list[tuple[int, int]]:
-    """Return the start and stop of each part of `count` episodes.
+    """Divide `count` episodes into parts, and return the start and stop index of each part.
 
     Raises:
-        UsageError: Neither or both options are given, or a part would be empty.
+        UsageError: Neither or both of `episodes` and `ratio` are given, one is invalid, or a part
+            would be empty.
     """
     if (episodes is None) == (ratio is None):
         raise UsageError("give either the episodes of each part or the ratio of the parts")

@@ -33,7 +33,7 @@ from mcaprl.recorder.format.selected_copy import (
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
-# Each of these topics has messages of one type, so that they can be read as columns.
+# Prefix of topics. Each has messages of only one type, so that they can be read as columns.
 _OUR_TOPICS = "/rl/"
 
 
@@ -62,7 +62,7 @@ def merge_logs(
     records, attachments = _other_records(logs, strings)
     top_level = [*records, *topics.records(), *attachments]
     with replacing(Path(out), LogError, overwrite=overwrite) as unfinished:
-        # Another program's file may have another profile than logs have.
+        # Use the MCAP profile of a log: a file of another program may have a different profile.
         like = next((log.reader for log in logs if log.has_steps), None)
         copied = copy_selected(sources, unfinished, top_level, like=like)
     episodes = sum(len(log.lengths) for log in logs)
@@ -71,13 +71,13 @@ def merge_logs(
 
 
 def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
-    """Return the metadata of all logs together; None if they have none.
+    """Return the metadata of the joined log; None if no log has metadata.
 
-    Fields that may differ are empty if they do, as in a dataset of several logs.
+    A field that may differ between logs is empty if it differs, as in a dataset of several logs.
 
     Raises:
         SpaceError: The spaces differ.
-        LogError: Other metadata differ that are equal in all recordings of a log.
+        LogError: Another field that must be equal differs, or only some logs have metadata.
     """
     found = [described(log.reader) for log in logs]
     described_ones = [(log, one) for log, one in zip(logs, found, strict=True) if one is not None]
@@ -92,12 +92,12 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
         _check_same(first.path, metadata, log.path, other)
     _check_types(logs, are_described=True)
     common = LogMetadata.common([one for _, one in described_ones])
-    # An older log does not name the module of its environment.
+    # Older logs lack the environment's module in the id; the longest id includes it.
     return replace(common, env_id=max((one.env_id for _, one in described_ones), key=len))
 
 
 def _strings(logs: Sequence[FinishedLog], metadata: LogMetadata) -> dict[str, str]:
-    """Return the map to write: that of the logs if it is the same in all of them."""
+    """Return the logs' metadata record if all logs have the same one; else encode `metadata`."""
     found = [log.reader.metadata.get(METADATA_NAME) for log in logs if log.has_steps]
     first = found[0]
     if first is not None and all(one == first for one in found):
@@ -122,8 +122,8 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
     Args:
         logs: Logs of episodes.
-        are_described: Whether the logs have metadata. Then the type of `/rl/step` follows from the
-            spaces, and the metadata of other channels say what their messages mean.
+        are_described: Whether the logs have metadata. If so, `/rl/step` is not compared, because
+            its type follows from the spaces, and the metadata of other channels must be equal.
     """
     known: dict[str, tuple[Path, object]] = {}
     for log in logs:
@@ -143,7 +143,7 @@ def _check_types(logs: Sequence[FinishedLog], *, are_described: bool) -> None:
 
 
 def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift: bool) -> list[int]:
-    """Return the number of nanoseconds by which the times of each log are moved.
+    """Return the delay of each log: the nanoseconds that are added to its times.
 
     Raises:
         LogError: Episodes of two logs overlap in time, and `shift` is not set.
@@ -157,7 +157,7 @@ def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift:
                 raise LogError(
                     f"the episodes of {log.path} overlap in time with those of"
                     f" {_overlapped(logs[:number], log)}; pass --shift (shift=True in Python) to"
-                    " move the times of the later argument to after those of the others"
+                    " delay the later argument until after the end of the earlier ones"
                 )
             delay = end + max(gap, 1) - first
         if log.has_steps:
@@ -174,16 +174,16 @@ def _overlap(spans: Times, others: Times) -> bool:
 
 
 def _overlapped(logs: Sequence[FinishedLog], log: FinishedLog) -> Path:
-    """Return the path of a log whose episodes overlap, in its own times if there is one."""
+    """Return the path of the first of `logs` whose episodes overlap in time with those of `log`."""
     found = [one.path for one in logs if one.has_steps and _overlap(one.spans, log.spans)]
     return (found or [one.path for one in logs if one.has_steps])[0]
 
 
 def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) -> None:
-    """Let each source leave out the messages that an earlier one has with equal bytes.
+    """Let each source omit the messages that an earlier source has with the same time and bytes.
 
-    Parts of one log repeat the messages that are valid in several of them, such as the static
-    scene.
+    If a log was split, several parts contain the messages that are valid in all of them, such as
+    the static scene.
     """
     bounds = [log.span_of_messages() for log in logs]
     starts_ends = [
@@ -203,7 +203,7 @@ def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) 
 
 
 def _repeated(source: Source, other: Source) -> dict[int, Times]:
-    """Return the times of the messages of `other` that `source` has too, by channel of `other`."""
+    """Return log_times of the messages of `other` that `source` also has, by channel of `other`."""
     by_new = {new: old for old, new in source.ids.items()}
     found = {}
     for old, new in other.ids.items():
@@ -230,7 +230,7 @@ def _repeated(source: Source, other: Source) -> dict[int, Times]:
 
 
 def _payloads(reader: McapReader, channel: Channel, times: Times) -> dict[int, list[bytes]]:
-    """Return the messages of a channel at these times."""
+    """Return the payloads of a channel's messages at these log_times, by log_time."""
     found: dict[int, list[bytes]] = {}
     for part in reader.message_ranges(channel):
         index = part.index[np.isin(part.index["log_time"].astype(np.int64), times)]
@@ -245,7 +245,7 @@ def _payloads(reader: McapReader, channel: Channel, times: Times) -> dict[int, l
 def _other_records(
     logs: Sequence[FinishedLog], strings: dict[str, str] | None
 ) -> tuple[list[Metadata], list[Attachment]]:
-    """Return the metadata records and attachments of all logs, each different one once."""
+    """Return the metadata records and attachments of all logs, without duplicates."""
     records: list[Metadata] = []
     attachments: list[Attachment] = []
     if strings is not None:

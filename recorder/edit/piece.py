@@ -1,7 +1,7 @@
 """Copy of a part of a log between two steps or times.
 
-An episode that the part begins or ends within becomes a shorter episode: its steps are numbered
-from 0, and its last record becomes its final record.
+If the part begins or ends within an episode, this episode is shortened: its steps are numbered
+from 0, and its last copied record becomes its final record.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 _NS_PER_S = 10**9
 _LAST_TIME = np.iinfo(np.int64).max
 Bounds = tuple[float | None, float | None]
-"""First value, and the first value after the part; None for no bound."""
+"""Start (included) and stop (excluded) of the part; None for no bound."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ def slice_log(
 
 
 def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
-    """Return the first and last time of a range of transitions, counted over all episodes.
+    """Return the first and last log_time of transitions that are counted over all episodes.
 
     Raises:
-        UsageError: There is no such transition.
+        UsageError: A bound is not an integer, or no transition is between the bounds.
     """
     log.need_steps()
     count = int(log.lengths.sum())
@@ -107,7 +107,7 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
         raise UsageError(f"{log.path} has the steps 0 to {count - 1}: none of them is in this part")
     ends = np.cumsum(log.lengths)
     first, last = (int(np.searchsorted(ends, step, side="right")) for step in (start, stop - 1))
-    # Each earlier episode has one record more than transitions.
+    # Each earlier episode has one more record than transitions, so add the number of episodes.
     low = int(log.times[start + first]) if start else 0
     if stop == count:
         return low, _LAST_TIME
@@ -117,7 +117,7 @@ def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
 
 
 def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
-    """Return the first and last time of a part, given in seconds since the first message.
+    """Return the first and last log_time of a part; `time` is seconds since the first message.
 
     Raises:
         UsageError: No message is in this part.
@@ -134,7 +134,7 @@ def _window_of_time(log: FinishedLog, time: Bounds | None) -> tuple[int, int]:
 
 
 def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:
-    """Return the parts of episodes, with at least one transition, between two times."""
+    """Return the parts of episodes between two log_times that have at least one transition."""
     if not log.has_steps:
         return []
     first = int(np.searchsorted(log.times, low))
@@ -150,7 +150,7 @@ def _pieces(log: FinishedLog, low: int, high: int) -> list[_Piece]:
 def _without_single_records(
     log: FinishedLog, pieces: list[_Piece], low: int, high: int
 ) -> tuple[int, int]:
-    """Move the bounds so that they contain no record without a transition."""
+    """Narrow the time range so that it excludes records that belong to no copied transition."""
     firsts, first, last = log.firsts, pieces[0], pieces[-1]
     before, after = firsts[first.episode] + first.start - 1, firsts[last.episode] + last.stop + 1
     if before >= 0:
@@ -166,14 +166,14 @@ def _shorten(
     """Let `source` change the records of shortened episodes; return their new summaries.
 
     Raises:
-        LogError: The messages of `/rl/step` or `/rl/episode` are not those of this package.
+        LogError: Another program or version wrote the messages of `/rl/step` or `/rl/episode`.
     """
     channels = log.reader.channels_of(STEP_TOPIC)
     dtypes = {one.id: _step_dtype(log, one) for one in channels}
     firsts, times = log.firsts, log.times
     starts = [int(times[firsts[one.episode] + one.start]) for one in pieces]
     ends = [int(times[firsts[one.episode] + one.stop]) for one in pieces]
-    # The flag of the end is on the last transition, which precedes the final record.
+    # The last transition has the end flags; it precedes the final record.
     lasts = [int(times[firsts[one.episode] + one.stop - 1]) for one in pieces]
 
     def change(channel: Channel, time_ns: int, payload: memoryview) -> None:
@@ -215,7 +215,7 @@ def _step_dtype(log: FinishedLog, channel: Channel) -> np.dtype[Any]:
 def _new_summaries(
     path: Path, channel_id: int, pieces: list[_Piece]
 ) -> list[tuple[int, int, bytes]]:
-    """Return the messages of `/rl/episode` of shortened episodes."""
+    """Return channel id, log_time and bytes of a new summary for each shortened episode."""
     numbers: NDArray[np.int64] = np.array([piece.episode for piece in pieces])
     whole = LogReader(path, Selection(columns=())).read(numbers)
     found = []
@@ -230,7 +230,7 @@ def _new_summaries(
         if piece.stop < piece.length:
             summary = summary._replace(terminated=False, truncated=True, reason=INTERRUPTED)
         if piece.start > 0:
-            # The part does not begin with the state of the reset.
+            # The seed and the options of the reset do not reproduce the first state of the part.
             summary = summary._replace(seed=None, options="")
         found.append((channel_id, summary.end_time_ns, summary.to_message()))
     return found

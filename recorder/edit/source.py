@@ -36,7 +36,7 @@ class Edited:
         steps: Number of transitions.
         messages: Number of messages.
         whole_chunks: Number of chunks that were copied without decompressing them.
-        rewritten_chunks: Number of chunks of which messages were copied.
+        rewritten_chunks: Number of chunks that were decompressed and written again.
     """
 
     out: Path
@@ -57,7 +57,7 @@ class FinishedLog:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open the file; a remote one is fetched as a whole.
+        """Open the file; a remote file is first downloaded completely.
 
         Raises:
             LogError: The file is damaged, not finished, or has records of an unfinished episode.
@@ -91,7 +91,7 @@ class FinishedLog:
         if self._log is None:
             return np.empty(0, np.int64)
         with warnings.catch_warnings():
-            # Records after the last episode are an error here.
+            # Suppress the warning about an unfinished last episode: `times` raises an error for it.
             warnings.simplefilter("ignore")
             return self._log.lengths
 
@@ -111,8 +111,8 @@ class FinishedLog:
             raise self._unusable(f"it has {records - len(found)} records of an unfinished episode")
         if (np.diff(found) <= 0).any():
             raise LogError(
-                f"{self.path}: log_times do not increase from record to record of its"
-                f" {len(lengths)} episodes; copy it with mcaprl.open(...).save(...) first"
+                f"{self.path}: the log_times of {STEP_TOPIC} do not increase throughout the"
+                f" {len(lengths)} episodes; copy the log with mcaprl.open(...).save(...) first"
             )
         return found
 
@@ -149,10 +149,11 @@ class FinishedLog:
         return min(starts, default=0), max(ends, default=0)
 
     def spans_of(self, episodes: NDArray[np.int64]) -> Times:
-        """Return the (S, 2) times of all messages that belong to these episodes.
+        """Return (S, 2) time ranges, first and last log_time, that contain the episodes' messages.
 
-        An episode's messages are those from its first record on, up to the next episode; those
-        before the first episode belong to it.
+        The messages of an episode are those from its first record up to the next episode. Messages
+        before the first episode belong to the first one. The ranges of adjacent episodes are
+        merged into one.
 
         Args:
             episodes: Increasing indexes of episodes.
@@ -171,7 +172,7 @@ class FinishedLog:
         such as the static scene, and of topics that ROS calls latched or transient local.
 
         Args:
-            spans: (S, 2) times of kept messages.
+            spans: (S, 2) first and last log_times of the S time ranges that are kept.
 
         Returns:
             Times by channel id.

@@ -1,4 +1,4 @@
-"""Times inside of messages, which move with the log_times of a delayed log."""
+"""Change of the times inside of messages when the log_times of a log are delayed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TIME = "builtin_interfaces/msg/Time"
 _HEAD_BYTES = 4
 # Stamps this far outside of a file's log_times are on another clock, or not set.
 _MARGIN_NS = 10 * _NS_PER_S
-# The start and end of an episode in nanoseconds, after the encapsulation and `total_reward`.
+# Byte offset of the start and end times in `/rl/episode`: after CDR header and `total_reward`.
 _EPISODE_TIMES = 12
 _SIZES = {name: int(code[-1]) for name, code in ROS_TO_NUMPY.items()}
 _MAX_SECONDS = 2**31 - 1
@@ -27,10 +27,10 @@ Fields = Mapping[str, Any]
 
 
 class Delay:
-    """Function that adds a delay to the times inside of messages.
+    """Callable that adds a delay to the times inside of messages.
 
-    Changed are the fields of the type `builtin_interfaces/Time` within the log_times of the file,
-    and the times of `/rl/episode`.
+    It changes the times of `/rl/episode`, and the fields of type `builtin_interfaces/Time` with
+    values in the range of the file's log_times, extended by 10 s on each side.
     """
 
     def __init__(self, reader: McapReader, span: tuple[int, int], delay_ns: int) -> None:
@@ -165,7 +165,7 @@ class _Walk:
         self._place += -(self._place - _HEAD_BYTES) % size
 
     def _advance(self, size: int, count: int) -> None:
-        # An empty sequence is not aligned.
+        # CDR has no alignment padding before the elements of an empty sequence.
         if count:
             self._align(size)
         self._place += size * count
@@ -175,7 +175,7 @@ class _Walk:
 
 @lru_cache(maxsize=256)
 def _flat(descriptions: tuple[Any, ...]) -> tuple[int, int] | None:
-    """Return the size and number of a type's fields if all are numbers of one size."""
+    """Return the bytes per field and number of fields if all are numbers of one size, else None."""
     names = {what[0] if kind == Nodetype.BASE else None for kind, what in descriptions}
     sizes = {_SIZES.get(name or "") for name in names}
     if len(sizes) != 1 or None in sizes:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mcaprl.recorder.format import messages
 
 INTERRUPTED = "interrupted"
-"""End reason of an episode that the recorder ended, not the environment."""
+"""End reason of an episode that was ended by the recorder instead of the environment."""
 
 
 class EpisodeSummary(NamedTuple):

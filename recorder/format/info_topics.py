@@ -43,7 +43,7 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
     try:
         found = np.array(values)
         found = found.astype(found.dtype.newbyteorder("="), copy=False)
-        # If the types are mixed, NumPy would convert numbers to text, and flags to numbers.
+        # If the types are mixed, NumPy would convert numbers to text, and bools to numbers.
         if len({(type(value), np.asarray(value).dtype) for value in values}) > 1 and not all(
             is_exact(np.asarray(one), np.asarray(value))
             for one, value in zip(found, values, strict=True)
@@ -53,12 +53,12 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
         return None
     if found.dtype.kind == "U":
         return found if found.ndim == 1 else None
-    # The types of ROS have no arrays without values.
+    # ROS message definitions cannot have arrays of length 0.
     return found if found.dtype in _TYPES and (found.size or not len(found)) else None
 
 
 class InfoTopics:
-    """Writer of infos to a log; a topic is announced at the first value of its info.
+    """Writer of infos to a log; the topic of an info is added with its first value.
 
     An appended recording continues the topics of the log.
 
@@ -76,7 +76,7 @@ class InfoTopics:
         self.warned: set[str] = set()
 
     def write(self, infos: Mapping[str, tuple[Sequence[int], NDArray[Any]]]) -> None:
-        """Write values (K, *shape) of infos with their log_times (K,), by name.
+        """Write the log_times (K,) and values (K, *shape) of each info, given by name.
 
         If values do not have the type of the info's first value in the log, they are not written,
         and the info's name is added to `refused`.
@@ -92,8 +92,8 @@ class InfoTopics:
                 data = [_ENCAPSULATION + value.tobytes() for value in values.astype(dtype)]
             else:
                 self.refused[name] = (
-                    f"its values are {_described(values.dtype, values.shape[1:])}, and those before"
-                    f" are {_described(dtype, shape)}"
+                    f"its values are {_described(values.dtype, values.shape[1:])}, but earlier"
+                    f" values are {_described(dtype, shape)}"
                 )
                 continue
             messages += [(channel, time, each) for time, each in zip(times_ns, data, strict=True)]
@@ -103,7 +103,7 @@ class InfoTopics:
         dtype, shape = values.dtype, values.shape[1:]
         topic = INFO_TOPICS + re.sub(r"[^A-Za-z0-9_.]", "_", name).replace(".", "/")
         if not re.fullmatch(r"\w+(\.\w+)*", name, re.ASCII):
-            # Other names have the same characters; in each log, a name has the same topic.
+            # The CRC distinguishes names that differ only in replaced characters.
             topic += f"_{zlib.crc32(encodable(name).encode()):08x}"
         while topic in self._topics:
             topic += "_"

@@ -1,9 +1,10 @@
 """Infos of an environment: each info has a topic `/rl/info/<name>`, which omits missing values.
 
 The messages have the log_time of the observation that the info came with. Scalars are messages of
-std_msgs; an array is `mcaprl_msgs/msg/Info...` with the field `data`, flat. The channel's metadata
-contains the name and the shape of the info. In the topic, the dots of the name are slashes. Other
-characters than letters, digits and `_` are replaced by `_`, and the name's CRC-32 is appended.
+std_msgs; arrays are flattened to the field `data` of `mcaprl_msgs/msg/Info...`. The channel's
+metadata contains the name and the shape of the info. In the topic, dots of the name become slashes,
+and characters other than letters, digits and `_` become `_`. If the name has such characters, or a
+dot that is not between two words, the CRC-32 of the name is appended to the topic.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mcaprl.errors import CorruptLogError
 from mcaprl.recorder.format.reading import McapReader, Topic
 
 INFO_TOPICS = "/rl/info/"
-"""Begin of the names of the topics."""
+"""Prefix of the topic names."""
 Masked = np.ma.MaskedArray[Any, Any]
 
 
@@ -44,14 +45,14 @@ def read_infos(reader: McapReader, times_ns: NDArray[np.int64]) -> dict[str, Mas
         metadata = next(one.metadata for one in channels if one.topic == topic)
         name = metadata.get("info", topic.removeprefix(INFO_TOPICS).replace("/", "."))
         messages = Topic(reader, topic)
-        # A part of a log has the topics of the whole log, and possibly no messages on some.
+        # A part of a larger log has all topics of that log, but some may have no messages.
         if len(messages):
             found[name] = _read(messages, metadata.get("shape", "[]"), times_ns, order)
     return found
 
 
 def is_exact(stored: NDArray[Any], values: NDArray[Any]) -> bool:
-    """Return whether an array with another dtype has the same values."""
+    """Return whether two arrays, possibly of different dtypes, have exactly the same values."""
     kinds = {kind_of(stored.dtype), kind_of(values.dtype)}
     if len(kinds) > 1:
         return False
@@ -64,7 +65,7 @@ def is_exact(stored: NDArray[Any], values: NDArray[Any]) -> bool:
 
 
 def kind_of(dtype: np.dtype[Any]) -> str:
-    """Return `number` for integers and floats, and NumPy's letter of other kinds."""
+    """Return `number` for integers and floats, and NumPy's kind code for all other dtypes."""
     return "number" if dtype.kind in "iuf" else dtype.kind
 
 
@@ -83,7 +84,7 @@ def _read(
         raise CorruptLogError(f"{topic.name}: messages do not have shape {shape}") from error
     places = np.searchsorted(times_ns, topic.times, sorter=order)
     frames = order[np.minimum(places, len(order) - 1)]
-    # Unfinished episodes have infos without observations.
+    # Skip infos of unfinished episodes, whose observations are not in `times_ns`.
     known = times_ns[frames] == topic.times
     every = np.zeros((len(times_ns), *shape), values.dtype)
     is_missing = np.ones(every.shape, bool)

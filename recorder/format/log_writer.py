@@ -108,7 +108,7 @@ class LogTopics:
         sink: Receiver of the messages.
         metadata: Metadata of the log.
         action: Shape and dtype of an action.
-        image_leaves: Parts of the observation that are images.
+        image_leaves: Leaves of the observation that are images.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class LogTopics:
         return self.sink.add_channel(topic, type_name, messages.definition(type_name))
 
     def step_rows(self, most: int = STEPS_PER_CHUNK) -> StepRows:
-        """Preallocate rows of `/rl/step` for one chunk, at most `most`."""
+        """Preallocate `most` rows of `/rl/step`, or as many as fit into one chunk."""
         return StepRows.of_text(self._step_text, self._step_channel, most, self.sink.write_rows)
 
     def learner_rows(self, most: int = STEPS_PER_CHUNK) -> TopicRows:
@@ -165,7 +165,7 @@ class LogTopics:
             topic: Name of the topic.
             shape: (height, width) or (height, width, channels).
             encoding: `mono8`, `rgb8`, `rgba8` or `16UC1`.
-            most: Maximum number of rows; all rows also have to fit into a chunk.
+            most: Maximum number of rows; fewer are allocated if they would not fit into a chunk.
         """
         assert encoding is not None, f"{topic} has no images"
         channel = self.add_channel(topic, "sensor_msgs/msg/Image")
@@ -185,7 +185,7 @@ class LogTopics:
         self.sink.write_messages(written + (self._lines(summaries) if log_lines else []))
 
     def write_log_lines(self, summaries: list[EpisodeSummary]) -> None:
-        """Write the starts and ends of episodes to `/rosout` and `/rl/phase` only."""
+        """Write starts and ends of episodes to `/rosout` and `/rl/phase`, but not `/rl/episode`."""
         self.sink.write_messages(self._lines(summaries))
 
     def begin_messages(self, episode: int, policy: str, time_ns: int) -> list[Message]:
@@ -250,7 +250,7 @@ class LogWriter(LogTopics):
         Raises:
             SpaceError: A log cannot contain these spaces; no file is created then.
             OutputExistsError: The file exists, and neither `overwrite` nor `append` is set.
-            LogError: The file cannot be created, or cannot be appended to and stays unchanged.
+            LogError: The file cannot be created; or it cannot be appended to, and stays unchanged.
         """
         strings = metadata.to_strings()
         # Raise SpaceError before a file is created.
@@ -274,8 +274,8 @@ class LogWriter(LogTopics):
             if not same:
                 self.mcap.abandon()
                 raise LogError(
-                    f"{self.mcap.path} cannot be appended to: its {name} is {there:.200}, the"
-                    f" recording's {here:.200}; record to another file"
+                    f"{self.mcap.path} cannot be appended to: its {name} is {there:.200}, but"
+                    f" the recording has {here:.200}; record to another file"
                 )
 
     def close(self) -> None:

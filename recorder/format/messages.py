@@ -140,7 +140,7 @@ def log_message(time_ns: int, text: str, level: int = INFO) -> bytes:
 
 
 def _append_strings(data: bytearray, *texts: str) -> bytearray:
-    """Append CDR strings: length, characters and NUL, each aligned to four bytes.
+    """Append CDR strings, each aligned to four bytes: length, characters and NUL.
 
     A NUL character ends a ROS string, so a NUL in a text is replaced by U+FFFD.
     """

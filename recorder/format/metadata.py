@@ -20,8 +20,8 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
     versions            JSON object: package -> version
     behavior_prob       "estimated" if the probabilities of the actions were not logged but
                         estimated afterwards; otherwise absent
-    about               JSON object: what the dataset of another tool says about itself, such as its
-                        author; absent if there is nothing
+    about               JSON object: description of the source dataset, such as its author, if the
+                        log was converted from another tool's format; otherwise absent
 """
 
 from __future__ import annotations
@@ -120,8 +120,8 @@ class LogMetadata:
     def action_names(self) -> dict[int, str]:
         """Return the names of the discrete actions by value; empty for other action spaces.
 
-        The names are the meanings if all meanings are distinct; otherwise they are numbers. If
-        there are more than `MAX_NUMBERED_ACTIONS` actions, numbers are not used as names.
+        If each action has a distinct meaning, the meanings are the names. Otherwise, the numbers
+        are the names, or the dict is empty for more than `MAX_NUMBERED_ACTIONS` actions.
         """
         space = self.action_space
         if not isinstance(space, spaces.Discrete):
@@ -208,9 +208,9 @@ class LogMetadata:
 
     @classmethod
     def common(cls, parts: Sequence[LogMetadata]) -> LogMetadata:
-        """Keep the fields that are equal in all parts. The spaces of all parts must be equal.
+        """Return one description of several logs; values that differ are reset to the defaults.
 
-        If the probabilities of a part are estimated, those of the result count as estimated.
+        The spaces of all logs must be equal. `behavior_prob` is `ESTIMATED` if it is in any log.
         """
         first, *others = parts
         blank = cls(first.observation_space, first.action_space)

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 
 SMALLEST: Final = float(np.finfo(np.float32).smallest_subnormal)
-"""Smallest probability that a log holds as a number above 0."""
+"""Smallest probability that is above 0 as a float32, the type in a log."""
 LARGEST: Final = 1 + 1e-6
-"""Largest probability, with the rounding errors of a softmax."""
+"""Largest accepted probability, which allows for the rounding errors of a softmax."""
 
 
 def is_impossible(probs: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return where numbers are not within (0, 1]; NaN means unknown, which is possible."""
+    """Return a mask of the numbers outside (0, 1]; NaN, which means unknown, is accepted."""
     found: NDArray[np.bool_] = ~(np.isnan(probs) | ((probs >= SMALLEST) & (probs <= LARGEST)))
     return found
 
@@ -26,7 +26,7 @@ def check_probability(prob: float, name: str) -> None:
 
     Args:
         prob: Probability, or NaN.
-        name: Name in the message.
+        name: Name of the probability in the error message.
 
     Raises:
         UsageError: The number is not within (0, 1].

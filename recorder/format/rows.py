@@ -19,7 +19,7 @@ from mcaprl.recorder.format.topics import BYTES_PER_CHUNK, IMAGE_FRAME, MIN_ROWS
 
 Write = Callable[[NDArray[Any]], None]
 """Function that writes message records of one channel as one chunk."""
-# Values of the other fields in a final record, which contains only an observation.
+# Values of a final record in all fields except its observation, `episode` and `step`.
 _FINAL = {
     "action": 0,
     "reward": 0.0,
@@ -50,7 +50,7 @@ class TopicRows:
         Args:
             text: ROS 2 definition of the message.
             channel_id: Channel of the topic.
-            most: Maximum number of rows; all rows also have to fit into a chunk.
+            most: Maximum number of rows; fewer are allocated if they would not fit into a chunk.
             write: Function that writes rows as one chunk.
         """
         dtype = message_dtype(text)
@@ -80,7 +80,7 @@ class TopicRows:
         return type(self)(rows, self._write)
 
     def grown(self, length: int) -> Self:
-        """Return a block with `length` rows for each episode that starts with copies of these."""
+        """Return a block with `length` rows per episode, the first of them copied from `self`."""
         block = self.blank(len(self._rows), length)
         block._rows[:, : len(self)] = self._rows
         return block

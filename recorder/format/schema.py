@@ -119,8 +119,8 @@ def telemetry_message(values: Iterable[float]) -> bytes:
 def action_constants(names: Mapping[int, str]) -> dict[str, int]:
     """Return the ROS constants of actions, with which a viewer displays `BRAKE (0)` for 0.
 
-    A name is converted to upper case, without text in parentheses and with an underscore for other
-    characters than letters and digits. Names without letters have no constant.
+    Names are converted to upper case; text in parentheses is removed, and characters other than
+    letters and digits become underscores. Names without letters have no constant.
 
     >>> action_constants({0: "brake", 1: "slightly left", 2: "faster north (+x)"})
     {'BRAKE': 0, 'SLIGHTLY_LEFT': 1, 'FASTER_NORTH': 2}
@@ -276,7 +276,7 @@ def _named(
     fields: list[tuple[str, int, str]],
     constants: Mapping[str, Mapping[str, int]] | None = None,
 ) -> tuple[str, str]:
-    """Return the type name and definition of fields, with constants before the field they name."""
+    """Return type name and definition of a message; constants precede the field they belong to."""
     lines = []
     for kind, count, name in fields:
         named = (constants or {}).get(name, {})
@@ -298,5 +298,5 @@ def _digest(text: bytes) -> str:
 
 
 def _align(offset: int, alignment: int) -> int:
-    """Align an offset upwards, relative to the end of the encapsulation header."""
+    """Round an offset up to the alignment, relative to the end of the encapsulation header."""
     return offset + -(offset - ENCAPSULATION_BYTES) % alignment

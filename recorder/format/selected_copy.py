@@ -1,7 +1,7 @@
 """Copies of selected messages of one or more finished MCAP files into a new one.
 
-A chunk whose messages are all kept unchanged is copied without decompressing it. A chunk with kept
-and other messages is written again with the kept ones.
+A chunk whose messages are all kept unchanged is copied without decompressing it. If only some
+messages of a chunk are kept, or some are changed, the kept messages are written as a new chunk.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ class Source:
     Attributes:
         reader: Reader of the file.
         ids: Id in the new file of each channel, by its id in this file.
-        spans: (S, 2) first and last time of each series of kept messages, increasing.
-        also: Times of more kept messages, by channel id.
-        without: Times of messages in the spans that are not kept, by channel id.
-        changed: (S, 2) first and last times of the messages that `change` gets, by channel id; with
-            a delay, it gets all messages.
+        spans: (S, 2) first and last time of each kept time range, increasing.
+        also: Times of additional messages to keep, by channel id.
+        without: Times of messages to drop even if `spans` or `also` has them, by channel id.
+        changed: (S, 2) first and last time of each time range whose messages are passed to
+            `change`, by channel id. Messages that get other times or ids are always passed to it.
         change: Function that changes a message.
         delay_ns: Number that is added to the log_time and publish_time of each message.
     """
@@ -81,7 +81,7 @@ class Source:
         return kept
 
     def changes(self, channel_id: int, start: int, end: int) -> bool:
-        """Return whether messages of a channel in a span of time may be changed."""
+        """Return whether messages of a channel between two times may need a change."""
         if self.delay_ns or self.ids[channel_id] != channel_id:
             return True
         spans = self.changed.get(channel_id, ALL_TIMES[:0])
@@ -94,7 +94,7 @@ class Copied:
 
     Attributes:
         whole: Number of chunks that were copied without decompressing them.
-        rewritten: Number of chunks of which messages were copied.
+        rewritten: Number of chunks of which the kept messages were written as a new chunk.
         messages: Number of messages.
     """
 
@@ -121,12 +121,12 @@ class NewTopics:
     ) -> dict[int, int]:
         """Add the channels of a file; return the new id of each channel by its id in the file.
 
-        A channel that equals one of an earlier file gets its id. Otherwise, it keeps its id if that
-        is free.
+        A channel that equals a channel of an earlier file gets the id of that channel. Any other
+        channel keeps its id if the id is free.
 
         Args:
             reader: Reader of the file.
-            metadata: Metadata of channels that replaces that in the file, by topic.
+            metadata: Metadata that replaces the channel metadata in the file, by topic.
 
         Raises:
             LogError: There are more channels than a file can have.
@@ -188,8 +188,8 @@ def copy_selected(
         sources: Files and the selections of their messages.
         target: Path of the new file; an existing one is replaced.
         top_level: Records at the start of the new file, with all its channels.
-        more: More messages: channel id, log_time in nanoseconds, and data.
-        like: File whose profile and compression the new one has; default: the first source.
+        more: Additional messages: channel id, log_time in nanoseconds, and data.
+        like: File whose profile and compression the new file uses; default: the first source.
 
     Raises:
         LogError: A file is damaged, or the new file cannot be written.
@@ -240,7 +240,7 @@ class _Copy:
     def __init__(self, writer: McapWriter) -> None:
         self.copied = Copied()
         self._writer = writer
-        # Chunks of another reader may not be taken for those of this one: one memory each.
+        # One `Scratch` for each reader: `Scratch.kept` identifies a chunk by its offset only.
         self._scratches: dict[int, Scratch] = {}
         self._embedding: dict[int, bool] = {}
 
@@ -281,7 +281,7 @@ class _Copy:
         return span >= 0 and end <= int(spans[span, 1])
 
     def _is_outside(self, source: Source, start: int, end: int, ids: Sequence[int]) -> bool:
-        """Return whether no message of the chunk is kept, as its times show."""
+        """Return whether the times of a chunk show that none of its messages is kept."""
         spans = source.spans
         following = int(np.searchsorted(spans[:, 1], start))
         if following < len(spans) and int(spans[following, 0]) <= end:
@@ -317,7 +317,7 @@ class _Copy:
 
 
 def _check_times(source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArray[Any]]) -> None:
-    """Raise CorruptLogError if the times of a chunk are not those of its messages."""
+    """Raise CorruptLogError if the times of a chunk do not match its messages."""
     times = [index["log_time"] for index in indexes.values() if len(index)]
     bounds = (
         [min(int(one.min()) for one in times), max(int(one.max()) for one in times)]
@@ -326,7 +326,7 @@ def _check_times(source: Source, chunk: ChunkIndex, indexes: Mapping[int, NDArra
     )
     where = f"{source.reader.path}: the chunk at byte {chunk.chunk_start_offset}"
     if bounds and bounds != [chunk.message_start_time, chunk.message_end_time]:
-        raise CorruptLogError(f"{where} has other times than its messages")
+        raise CorruptLogError(f"{where} has times that do not match its messages")
     if bounds and bounds[1] + source.delay_ns > _LAST_TIME:
         raise CorruptLogError(f"{where} has a log_time after the year 2262")
 
@@ -349,7 +349,7 @@ def _top_level_ids(reader: McapReader) -> set[int]:
 def _taken(
     source: Source, records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Copy messages in the order of the chunk, with new ids and times; return their indexes."""
+    """Return copies of messages in chunk order with new ids and times, and their new indexes."""
     wanted = sorted(
         (offset, channel_id, time_ns)
         for channel_id, index in indexes.items()
@@ -371,7 +371,7 @@ def _taken(
 
 
 def _renew(source: Source, view: memoryview, place: int, channel_id: int, time_ns: int) -> None:
-    """Change the message at a place as the source asks for."""
+    """Set id and times of the message at byte `place`; pass it to `source.change` if needed."""
     if source.change is not None and source.changes(channel_id, time_ns, time_ns):
         _, length = RECORD_HEADER.unpack_from(view, place)
         payload = view[place + MESSAGE_HEADER.itemsize : place + RECORD_HEADER_BYTES + length]

@@ -25,8 +25,8 @@ from mcaprl.files import parse_json
 # Nature CNN needs 36.
 MIN_IMAGE_EDGE = 8
 IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
-# These limits restrict the memory that a reader allocates for a short description of a space. They
-# permit an RGBA image of 3840 x 2160 pixels and a network with one output per action.
+# These limits restrict the memory that a reader allocates, since a few bytes of JSON can describe a
+# huge space. They permit an RGBA image of 3840 x 2160 pixels and one network output per action.
 MAX_ELEMENTS = 2**25
 MAX_ACTIONS = 2**20
 _MAX_DIMENSIONS = 64
@@ -119,7 +119,7 @@ def select(leaves: Sequence[Leaf], keys: Sequence[str] | None) -> list[Leaf]:
 
 
 def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return an (N,) mask of the values (N, *shape) that are outside a space other than a Dict."""
+    """Return an (N,) mask of the values (N, *shape) outside a space; all False for a Dict."""
     match space:
         case spaces.Discrete():
             wrong = (values < space.start) | (values >= space.start + space.n)
@@ -136,7 +136,7 @@ def outside(space: spaces.Space[Any], values: NDArray[Any]) -> NDArray[np.bool_]
 
 
 def restricted(space: spaces.Space[Any], leaves: Sequence[Leaf]) -> spaces.Dict:
-    """Return a Dict space without the parts that are not in `leaves`."""
+    """Return a Dict space with only the parts that are in `leaves`."""
     groups: dict[str, list[Leaf]] = {}
     for leaf in leaves:
         groups.setdefault(leaf.path[0], []).append(replace(leaf, path=leaf.path[1:]))

@@ -8,12 +8,12 @@ LEARNER_TOPIC = "/rl/learner"
 LOG_TOPIC = "/rosout"
 PHASE_TOPIC = "/rl/phase"
 RUNNING = "running"
-"""Phase of an episode before its end; from then on the phase is the reason of the end."""
-# A chunk has at most this number of /rl/step rows, of images, and of bytes.
+"""Phase of a running episode; at the end, the phase becomes the reason of the end."""
+# Maximum number of /rl/step rows, of images, and of bytes in one chunk.
 STEPS_PER_CHUNK = 8192
 IMAGES_PER_CHUNK = 100
 BYTES_PER_CHUNK = 8 * 2**20
-# A buffer needs at least these rows: the last transition, a new one, and one more. The last
-# transition stays in memory because it may turn out to be the end of its episode.
+# Minimum number of rows in a buffer: the last transition, a new transition, and a spare row. The
+# last transition stays in memory because it may turn out to be the end of its episode.
 MIN_ROWS = 3
 IMAGE_FRAME = "camera"

@@ -1,4 +1,4 @@
-"""Actions of a mapping: discrete fields, and commands that are named, binned or kept."""
+"""Actions of a mapping: discrete fields, or commands that are named, binned or continuous."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Actions(NamedTuple):
         space: Action space.
         values: (N,) int64, or (N, K) float32 for a Box; 0 where missing.
         missing: (N,) bool: whether there is no command.
-        far: (N,) bool: whether the command is far from those of all actions, or outside the Box.
+        far: (N,) bool: whether the command is far from every named command, or outside the Box.
         meanings: Names of the discrete actions; empty if they have none.
     """
 
@@ -43,7 +43,7 @@ def actions_of(
         missing: (N,) bool: whether there is no command.
 
     Raises:
-        UsageError: A value is not a whole number, or a text that has no number in the mapping.
+        UsageError: A value is not a whole number, or is a text that `names` does not contain.
     """
     none = np.zeros(len(missing), bool)
     if action.field is not None:
@@ -76,7 +76,7 @@ def _discrete(
         unknown = sorted({str(text) for text in column[present]} - set(action.names))
         if unknown:
             raise UsageError(
-                f"{action.field} has the value '{unknown[0]}', which `names` gives no number;"
+                f"{action.field} has the value '{unknown[0]}', which `names` does not contain;"
                 f" names: {', '.join(action.names) or 'none'}"
             )
         values[present] = [action.names[str(text)] for text in column[present]]
@@ -86,7 +86,7 @@ def _discrete(
         if len(wrong):
             raise UsageError(
                 f"{action.field} has the value {wrong[0]}; a discrete action is a whole number from"
-                " 0, use `fields` with `actions` or `edges` for a continuous command"
+                " 0; for a continuous command, use `fields` with `actions` or `edges`"
             )
         values[present] = numbers.astype(np.int64)
     by_number = {number: name for name, number in action.names.items()}
@@ -98,9 +98,9 @@ def _discrete(
 def _nearest(
     commands: NDArray[np.float64], named: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the nearest named command of each command, and its distance.
+    """Return the index of the named command nearest to each command, and its distance.
 
-    A distance is the largest over the fields, in shares of the named commands' range.
+    The distance is the largest difference in any field, where 1 is the range of the named commands.
     """
     span = np.ptp(named, axis=0)
     span = np.where(span > 0, span, 1.0)
@@ -112,7 +112,7 @@ def _nearest(
 def _binned(
     action: Action, commands: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Return the bin of each command in the product of the fields' bins, and the bins' names."""
+    """Return the action of each command and all action names; an action is one bin per field."""
     values = np.zeros(len(commands), np.int64)
     names = []
     for field, edges, column in zip(action.fields, action.edges, commands.T, strict=True):

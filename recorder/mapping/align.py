@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 NONE = -1
-"""Position of the message of a step that has none."""
+"""Value in `Matches.rows` of a step without a message."""
 _NS_PER_S = 1e9
 
 
 class Matches(NamedTuple):
-    """The message of each step.
+    """The messages that match N steps.
 
     Attributes:
-        rows: (N,) position of the message; `NONE` where there is none.
-        age_s: (N,) time from the message to the step, seconds; negative after the step, and NaN
-            without a message.
+        rows: (N,) index of the message in the sorted messages; `NONE` where there is none.
+        age_s: (N,) time of the step minus time of the message, seconds; NaN where there is none.
     """
 
     rows: NDArray[np.int64]
@@ -26,19 +25,19 @@ class Matches(NamedTuple):
 
 
 def time_order(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the positions of messages by time; equal times keep their order."""
+    """Return the indexes that sort messages by time; equal times keep their order."""
     return np.argsort(times_ns, kind="stable")
 
 
 def last(
     times_ns: NDArray[np.int64], steps_ns: NDArray[np.int64], tolerance_s: float | None
 ) -> Matches:
-    """Return the last message up to each step's time.
+    """Match each step with the last message up to its time.
 
     Args:
         times_ns: (M,) times of the messages, not descending.
         steps_ns: (N,) times of the steps.
-        tolerance_s: Age beyond which a message does not count; None for any age.
+        tolerance_s: Age in seconds above which a message does not match; None for no limit.
     """
     rows = np.searchsorted(times_ns, steps_ns, side="right") - 1
     return _within(times_ns, steps_ns, rows, tolerance_s)
@@ -47,7 +46,7 @@ def last(
 def nearest(
     times_ns: NDArray[np.int64], steps_ns: NDArray[np.int64], tolerance_s: float | None
 ) -> Matches:
-    """Return the message nearest to each step's time; of two equally near ones, the earlier."""
+    """Match each step with the message nearest in time, or with the earlier of two equally near."""
     if not len(times_ns):
         return _within(times_ns, steps_ns, np.full(len(steps_ns), NONE), tolerance_s)
     after = np.searchsorted(times_ns, steps_ns, side="right")
@@ -63,7 +62,7 @@ def during(
     ends_ns: NDArray[np.int64],
     tolerance_s: float | None,
 ) -> Matches:
-    """Return the last message before each step's end, `ends_ns` (N,)."""
+    """Match each step with the last message before the end of the step in `ends_ns`, (N,)."""
     rows = np.searchsorted(times_ns, ends_ns, side="left") - 1
     return _within(times_ns, steps_ns, rows, tolerance_s)
 
@@ -79,8 +78,8 @@ def interpolated(
     A step before the first or after the last message has no value.
 
     Returns:
-        Values (N,) or (N, K), NaN where missing; and the matches with the earlier messages, whose
-        age is the time to the nearer one.
+        Values (N,) or (N, K), NaN where missing; and matches. Their `rows` are the messages before
+        the steps, and `age_s` is the age of the nearer of the two interpolated messages.
     """
     low = np.searchsorted(times_ns, steps_ns, side="right") - 1
     exact = (low >= 0) & (times_ns[np.maximum(low, 0)] == steps_ns) if len(times_ns) else low >= 0

@@ -28,7 +28,7 @@ _STATE = "state"
 
 
 class _Observations(NamedTuple):
-    """The frames of each leaf by its path, the space, and the names of a vector."""
+    """Observation frames by leaf path, observation space, and names of the vector's elements."""
 
     frames: dict[tuple[str, ...], Array]
     space: spaces.Space[Any]
@@ -36,7 +36,7 @@ class _Observations(NamedTuple):
 
 
 def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Dataset:
-    """Return the dataset of the kept episodes of each run; there is at least one.
+    """Return the dataset of the kept episodes of all runs; `kept` has at least one episode.
 
     Raises:
         UsageError: A reward is not a number, or an observation is a text.
@@ -79,7 +79,7 @@ def assembled(plan: Plan, runs: list[Steps], kept: list[list[Segment]]) -> Datas
 
 
 def _shift(run: Steps, episodes: list[Segment], times: list[NDArray[np.int64]]) -> int:
-    """Return what is added to the times of a run, so that times rise from run to run."""
+    """Return the nanoseconds to add to a run's times, so that times increase from run to run."""
     if not (times and episodes):
         return 0
     first_ns, end_ns = int(run.times_ns[episodes[0].first]), int(times[-1][-1])
@@ -94,8 +94,8 @@ def _summary(
     if len(wrong):
         raise UsageError(
             f"{plan.place.of('reward')}: the reward is {rewards[wrong[0]]} at"
-            f" {run.times_ns[segment.first + wrong[0]]} ns, and in {len(wrong)} of {len(rewards)}"
-            " steps of its episode: give `missing` to the quantities that it uses"
+            f" {run.times_ns[segment.first + wrong[0]]} ns, and not finite in {len(wrong)} of"
+            f" {len(rewards)} steps of its episode: set `missing` for the quantities in `reward`"
         )
     named = (name for name, holds in run.reasons.items() if holds[segment.last])
     kind = "terminated" if segment.terminated else "truncated"
@@ -113,7 +113,7 @@ def _summary(
 
 
 def _at_ends(lengths: NDArray[np.int64], flags: list[bool]) -> NDArray[np.bool_]:
-    """Return the flags of all transitions, set at the last one of each episode."""
+    """Return flags of transitions: the episode flags at last transitions, False at the others."""
     found = np.zeros(int(lengths.sum()), bool)
     found[np.cumsum(lengths) - 1] = flags
     return found
@@ -163,7 +163,7 @@ def _put_vector(
     arrays: dict[str, Array],
     parts: dict[str, spaces.Space[Any]],
 ) -> list[str]:
-    """Add all numbers as one vector, unless there are only images; return their names."""
+    """Add all numeric quantities, if any, as one vector; return the names of its elements."""
     vectors, limits, names = [], list[tuple[float, float]](), list[str]()
     for name, quantity in plan.mapping.observation.items():
         if quantity.image is None:
@@ -187,9 +187,9 @@ def _names(name: str, quantity: Quantity, count: int) -> list[str]:
 
 
 def _stacked(lengths: NDArray[np.int64], count: int) -> NDArray[np.int64]:
-    """Return the (F, count) frames that are stacked in each frame, the oldest first.
+    """Return indexes of the `count` frames to stack at each frame, (frames, count), oldest first.
 
-    Before an episode's first frame, that frame is repeated.
+    At the beginning of an episode, its first frame is repeated.
     """
     firsts = np.repeat(np.cumsum(lengths + 1) - lengths - 1, lengths + 1)
     here = np.arange(len(firsts))[:, np.newaxis]
@@ -198,12 +198,12 @@ def _stacked(lengths: NDArray[np.int64], count: int) -> NDArray[np.int64]:
 
 
 def _repeated(space: spaces.Space[Any], count: int) -> spaces.Space[Any]:
-    """Return the space of `count` observations side by side."""
+    """Return the space of `count` observations that are concatenated along the last axis."""
     assert isinstance(space, spaces.Box), "all parts are Boxes"
     low, high = (np.concatenate([limit] * count, axis=-1) for limit in (space.low, space.high))
     return spaces.Box(low, high, dtype=space.dtype.type)
 
 
 def _common_space(found: list[spaces.Space[Any]]) -> spaces.Space[Any]:
-    """Return the space of all runs: the largest of Discrete ones; Boxes are equal."""
+    """Return the largest Discrete space of the runs, or their Box, which is equal in all runs."""
     return max(found, key=lambda space: int(getattr(space, "n", 0)))

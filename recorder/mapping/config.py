@@ -53,33 +53,34 @@ class Quantity(_Part):
     as_: Literal["yaw", "count"] | None = Field(
         default=None,
         alias="as",
-        description="`yaw` converts a quaternion to its angle about z, radians; `count` is the"
-        " number of messages of the topic `field` so far, for events.",
+        description="`yaw` converts a quaternion to its angle about z, radians; `count` counts the"
+        " messages so far of the topic that `field` names, such as events.",
     )
     align: Alignment = Field(
         default="last",
-        description="`last` message up to the step's time, `nearest`, or `linear` interpolation;"
-        " the last two use messages after the step.",
+        description="`last`: last message up to the step's time; `nearest`: nearest message;"
+        " `linear`: linear interpolation. `nearest` and `linear` also use messages after the step.",
     )
     tolerance_s: Positive | None = Field(
         default=None, description="Age in seconds beyond which a value is missing."
     )
     missing: float | None = Field(
         default=None,
-        description="Number for missing values; without it, steps with any are left out.",
+        description="Number that replaces missing values; without it, steps at which an observed"
+        " value is missing are left out.",
     )
     scale: float = Field(default=1.0, description="Factor of the value.")
     offset: float = Field(default=0.0, description="Number added after scaling.")
     clip: tuple[float, float] | None = Field(default=None, description="Lowest and highest value.")
     wrap_angle: bool = Field(default=False, description="Whether to wrap radians into [-pi, pi).")
     crop: tuple[int, int, int, int] | None = Field(
-        default=None, description="Left, top, width and height of the part of the image, pixels."
+        default=None, description="Left, top, width and height of the cropped image, pixels."
     )
     resize: tuple[int, int] | None = Field(default=None, description="Width and height, pixels.")
     gray: bool = Field(default=False, description="Whether to convert colors to gray.")
     range_m: tuple[float, float] | None = Field(
         default=None,
-        description="Depth that becomes 0 and 255; without it, depth stays in its unit.",
+        description="Depths in meters that become 0 and 255; without it, depth stays in meters.",
     )
 
     @model_validator(mode="after")
@@ -105,7 +106,7 @@ class Limits(_Part):
 
 
 class Action(_Part):
-    """The action of each step: a discrete field, or commands that are binned, named or kept."""
+    """The action of each step: a discrete field, or a command that is named, binned or clipped."""
 
     field: str | None = Field(
         default=None, description="Path of an integer, boolean or string field."
@@ -114,27 +115,27 @@ class Action(_Part):
         default=[], description="Paths of the fields of a continuous command."
     )
     names: dict[str, int] = Field(
-        default={}, description="Number of each value of a string field, or name of each number."
+        default={}, description="Action numbers, by value (string field) or name (other fields)."
     )
     actions: dict[str, list[float]] = Field(
         default={}, description="Named commands; the nearest one is the action."
     )
     edges: list[list[float]] = Field(
         default=[],
-        description="Rising edges of the bins of each field; their product is the action.",
+        description="Bin edges of each field, increasing; an action is one bin of each field.",
     )
     box: Limits | None = Field(
-        default=None, description="Limits of a command that is kept as a Box."
+        default=None, description="Limits of a Box action; commands are clipped to them."
     )
     far: Positive = Field(
         default=0.25,
-        description="Distance from every named command, as a share of their range in each field,"
-        " from which a command is counted as far.",
+        description="Distance to the nearest named command above which a command is counted as far;"
+        " 1 is the range of the named commands in a field.",
     )
     align: Literal["during", "last", "nearest"] = Field(
         default="during",
-        description="`during`: the last command before the next step; `last`: up to the step's"
-        " time; `nearest` to the step's time.",
+        description="`during`: last command before the next step; `last`: last command up to the"
+        " step's time; `nearest`: command nearest to the step's time.",
     )
     tolerance_s: Positive | None = Field(
         default=None, description="Age in seconds beyond which the command is missing."
@@ -154,7 +155,9 @@ class Action(_Part):
         lengths += [len(self.edges)] if self.edges else []
         lengths += [len(self.box.low), len(self.box.high)] if self.box else []
         if any(length != count for length in lengths):
-            raise ValueError(f"each command, low, high and edges need {count} entries, as fields")
+            raise ValueError(
+                f"each command, low, high and edges need {count} entries, one for each field"
+            )
         if any(sorted(set(each)) != each for each in self.edges):
             raise ValueError("edges must rise")
         return self
@@ -165,13 +168,16 @@ class Episodes(_Part):
 
     begin: str | None = Field(
         default=None,
-        description="Condition whose rising edge begins an episode; default: the first step.",
+        description="Condition whose rising edge begins an episode; default: the next step with an"
+        " observation and an action.",
     )
     end: str | None = Field(default=None, description="Condition that truncates the episode.")
     terminated: str | None = Field(default=None, description="Condition of a terminal state.")
     truncated: str | None = Field(default=None, description="Condition that truncates the episode.")
     reasons: dict[str, str] = Field(
-        default={}, description="Conditions by the name of the reason that they give to an end."
+        default={},
+        description="Conditions by end reason; the first one that is true at the end of an episode"
+        " determines its reason.",
     )
     gap_s: Positive = Field(
         default=2.0, description="Longest gap, in seconds, in an observed topic within an episode."
@@ -187,27 +193,31 @@ class Episodes(_Part):
 class Meta(_Part):
     """Facts that a bag does not contain."""
 
-    env_id: str = Field(default="", description="Gymnasium id of an environment like the robot.")
+    env_id: str = Field(
+        default="", description="Gymnasium id of an environment that simulates the robot."
+    )
     policy: str = Field(default="", description="Name of the policy that acted.")
 
 
 class Mapping(_Part):
     """Mapping of a bag's topics to transitions."""
 
-    time: TimeSource = Field(default="log_time", description="Time of a message.")
+    time: TimeSource = Field(
+        default="log_time", description="Time of a message: `log_time`, `publish_time` or `header`."
+    )
     clock: Clock = Field(description="Times of the steps.")
     observation: dict[str, Quantity] = Field(description="Observed quantities by name.")
     stack: Annotated[int, Field(ge=1)] = Field(
         default=1, description="Number of observations that are stacked, the oldest first."
     )
     fields: dict[str, Quantity] = Field(
-        default={}, description="Quantities that are not observed, for expressions."
+        default={}, description="Quantities that are used in expressions but not observed."
     )
     action: Action = Field(description="Action of each step.")
     reward: str = Field(
         default="0",
-        description="Expression of the names of quantities, `next(NAME)` for the next step and"
-        " `action`; or `module:function` of Python, with --trust-code.",
+        description="Expression that can use the names of quantities, `next(NAME)` for the value at"
+        " the next step, and `action`; or a Python function `module:function`, with --trust-code.",
     )
     episodes: Episodes = Field(default=Episodes(), description="Begin and end of the episodes.")
     behavior_prob: Quantity | None = Field(
@@ -242,19 +252,19 @@ MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
     "episodes": Episodes,
     "meta": Meta,
 }
-"""Models of the parts of a mapping, by the titles of the reference."""
+"""Models of the parts of a mapping, by section title of the reference documentation."""
 
 
 class Place:
-    """Position of each key of a mapping file, for errors."""
+    """Line numbers of the keys of a mapping file, for error messages."""
 
     def __init__(self, path: str = "mapping", tree: Any = None) -> None:
-        """Refer to a file and its YAML tree; without a tree, keys have no line."""
+        """Store the path of the file and its YAML tree; without a tree, keys have no line."""
         self.path, self._tree = path, tree
 
     @contextmanager
     def named(self, *keys: Any) -> Iterator[None]:
-        """Name a key of the mapping in errors of the body that do not name one."""
+        """Add a key of the mapping to errors of the `with` block that do not name a key."""
         try:
             yield
         except UsageError as error:
@@ -263,7 +273,7 @@ class Place:
             raise UsageError(f"{self.of(*keys)}: {error}") from error
 
     def of(self, *keys: Any) -> str:
-        """Return `FILE:LINE: key.key` of a key, or of the innermost of its parents that exists."""
+        """Return `FILE:LINE: key.key`; a missing key has the line of its innermost parent."""
         tree: Any = self._tree
         line = None
         for key in keys:
@@ -278,7 +288,7 @@ class Place:
 
 
 def load_mapping(source: str | Path | MappingOf[str, Any]) -> tuple[Mapping, Place]:
-    """Read a mapping file, or validate its keys and values; return it with their positions.
+    """Read and validate a mapping; return it with the positions of its keys.
 
     Raises:
         UsageError: The file cannot be read, is not YAML, or has an unknown key or a wrong value;
@@ -308,7 +318,7 @@ def parse_mapping(tree: MappingOf[str, Any], place: Place | None = None) -> Mapp
     """Validate the keys and values of a mapping.
 
     Raises:
-        UsageError: A key is unknown, or a value is wrong; all errors are named, one per line.
+        UsageError: A key is unknown, or a value is wrong; the message has one line per error.
     """
     place = place or Place()
     try:

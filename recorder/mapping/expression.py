@@ -37,9 +37,9 @@ FUNCTIONS: Final[dict[str, tuple[Callable[..., Any], int]]] = {
     "isnan": (np.isnan, 1),
     "clip": (np.clip, 3),
 }
-"""Functions of numbers, with their number of arguments."""
+"""Functions that expressions can call, by name, with the number of arguments."""
 NEXT: Final = "next"
-"""Function of a name or expression whose value at the next step is meant."""
+"""Name of the function that evaluates its argument at the next step."""
 _MAX_CHARACTERS, _MAX_DEPTH = 4000, 50
 
 _BINARY: Final[dict[type[ast.operator], Callable[..., Any]]] = {
@@ -79,7 +79,7 @@ class Expression:
         self.text = text
         if len(text) > _MAX_CHARACTERS:
             raise UsageError(
-                f"the expression has {len(text)} characters, at most {_MAX_CHARACTERS}"
+                f"the expression has {len(text)} characters; the limit is {_MAX_CHARACTERS}"
             )
         try:
             self._tree = ast.parse(text.strip(), mode="eval").body
@@ -100,7 +100,7 @@ class Expression:
 
         Args:
             columns: (N,) or (N, K) column of each name.
-            following: (N,) row of each step's next step.
+            following: (N,) row that follows each row, for `next`.
 
         Raises:
             UsageError: A name is unknown, or a value has the wrong type or shape.
@@ -126,7 +126,7 @@ class Expression:
             raise self._refused(node)
         match node:
             case ast.Name(id=name) if name in FUNCTIONS or name == NEXT:
-                raise UsageError(f"'{self.text}': {name} is a function: {name}(...)")
+                raise UsageError(f"'{self.text}': {name} is a function; call it as {name}(...)")
             case ast.Constant(value=value) if not isinstance(value, bool | int | float | str):
                 raise self._refused(node)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
@@ -134,7 +134,7 @@ class Expression:
                 if count < 0:
                     raise UnknownNameError("function", name, [*FUNCTIONS, NEXT])
                 if len(args) != count:
-                    raise UsageError(f"'{self.text}': {name} has {count} arguments")
+                    raise UsageError(f"'{self.text}': {name} needs {count} arguments")
                 parts = args
             case ast.Call():
                 raise self._refused(node)
@@ -175,7 +175,7 @@ class Expression:
 
         match node:
             case ast.Constant(value=constant):
-                # Integers would overflow, or grow without limit.
+                # Use float64: NumPy integers can overflow, and Python integers have no size limit.
                 return constant if isinstance(constant, str) else np.float64(cast(Any, constant))
             case ast.Name(id=name):
                 return columns[name]

@@ -23,7 +23,7 @@ Image = NDArray[Any]
 _BLOCK_ROWS = 32
 _GRAY_WEIGHTS = np.array([0.299, 0.587, 0.114])
 """ITU-R BT.601 weights of red, green and blue."""
-# Numbers per pixel, dtype, and order of red, green and blue of raw encodings.
+# Raw encodings: channels per pixel, dtype, and channel indexes of red, green and blue.
 _RAW: dict[str, tuple[int, str, tuple[int, ...]]] = {
     "rgb8": (3, "u1", (0, 1, 2)),
     "bgr8": (3, "u1", (2, 1, 0)),
@@ -37,16 +37,16 @@ _RAW: dict[str, tuple[int, str, tuple[int, ...]]] = {
     "32FC1": (1, "f4", (0,)),
 }
 _METERS_PER_UNIT = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}
-"""Depth encodings (REP 118), with their unit."""
+"""Depth encodings (REP 118), with their units in meters."""
 _RAW_FIELDS = ("height", "width", "encoding", "is_bigendian", "step", "data")
 _COMPRESSED_FIELDS = ("format", "data")
 
 
 class ImageReader:
-    """Reader of the images of one topic in the form that a mapping asks for."""
+    """Reader that decodes, crops and resizes the images of one topic as a mapping specifies."""
 
     def __init__(self, bag: Bag, topic: str, quantity: Quantity) -> None:
-        """Find the kind of the images.
+        """Find out whether the images are raw or compressed.
 
         Raises:
             UsageError: The topic has no images.
@@ -55,10 +55,10 @@ class ImageReader:
         self._fields = _image_fields(bag.topics[topic])
 
     def read(self, rows: NDArray[np.int64]) -> Image:
-        """Read the images of messages (N,), each message once, as (N, H, W, C).
+        """Return the images of N messages as (N, H, W, C); a repeated message is decoded once.
 
         Args:
-            rows: Positions of the messages in the topic.
+            rows: (N,) positions of the messages in the topic.
 
         Raises:
             LogError: An image is damaged or of an unknown encoding, or sizes differ.
@@ -75,8 +75,8 @@ class ImageReader:
                     found = np.empty((len(wanted), *image.shape), image.dtype)
                 if image.shape != found.shape[1:] or image.dtype != found.dtype:
                     raise LogError(
-                        f"{self.topic}: image {block[k]} is {image.shape} {image.dtype}, the first"
-                        f" {found.shape[1:]} {found.dtype}: give `resize` in the mapping"
+                        f"{self.topic}: image {block[k]} is {image.shape} {image.dtype}, but the"
+                        f" first is {found.shape[1:]} {found.dtype}: set `resize` in the mapping"
                     )
                 found[first + k] = image
         assert found is not None, "there is at least one image"
@@ -89,7 +89,7 @@ class ImageReader:
         return spaces.Box(0.0, np.inf, images.shape[1:], np.float32)
 
     def _decoded(self, message: dict[str, Any]) -> Any:
-        """Return an image as uint8 colors or gray, of Pillow or NumPy, or as float32 meters."""
+        """Return colors or gray as a uint8 image (Pillow or NumPy), or depth as float32 meters."""
         if "encoding" in message:
             return _raw_image(self.topic, message)
         return _compressed_image(self.topic, str(message["format"]), bytes(message["data"]))
@@ -106,7 +106,7 @@ class ImageReader:
         if quantity.range_m is not None and pixels.dtype == np.float32:
             low, high = quantity.range_m
             share = np.clip((pixels - low) / (high - low), 0.0, 1.0)
-            # As in the sims, nothing is the farthest value.
+            # As in the sims, pixels without a surface have the largest value.
             pixels = np.where(pixels > 0, np.rint(255 * share), 255).astype(np.uint8)
         return pixels if pixels.ndim == 3 else pixels[..., np.newaxis]
 
@@ -145,7 +145,7 @@ def _raw_image(topic: str, message: dict[str, Any]) -> Image:
     if step < used or len(data) < step * height or not height * width:
         raise LogError(
             f"{topic}: an image of {width} x {height} {encoding} with {step} bytes per row has"
-            f" {len(data)} bytes"
+            f" {len(data)} bytes, which do not match"
         )
     rows = np.ascontiguousarray(data[: step * height].reshape(height, step)[:, :used])
     pixels = rows.view(dtype).reshape(height, width, channels)[..., list(order)]
@@ -155,7 +155,7 @@ def _raw_image(topic: str, message: dict[str, Any]) -> Image:
 
 
 def _compressed_image(topic: str, kind: str, data: bytes) -> Any:
-    """Return colors or gray as an image of Pillow, or depth as float32 meters."""
+    """Return colors or gray as a Pillow image, or depth as float32 meters."""
     pillow = import_extra("PIL.Image", "bags")
     # compressed_depth_image_transport puts 12 bytes of parameters before the PNG.
     is_depth = "compressedDepth" in kind
@@ -178,7 +178,7 @@ def _meters(depth: Image, unit_m: float) -> Image:
 
 
 def _size(image: Any) -> tuple[int, int]:
-    """Return width and height of an image of Pillow or NumPy."""
+    """Return width and height of a Pillow image or a NumPy array."""
     if isinstance(image, np.ndarray):
         return image.shape[1], image.shape[0]
     width, height = image.size
@@ -186,7 +186,7 @@ def _size(image: Any) -> tuple[int, int]:
 
 
 def _resized(image: Any, width: int, height: int) -> Any:
-    """Resize by averaging; depth takes the nearest pixel, since a mean of distances is no place."""
+    """Resize by averaging. For depth, use the nearest pixel: a mean may lie on no surface."""
     if _size(image) == (width, height):
         return image
     pillow = import_extra("PIL.Image", "bags")

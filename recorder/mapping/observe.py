@@ -35,10 +35,10 @@ class Values(NamedTuple):
 
 
 class Source(NamedTuple):
-    """Where a quantity comes from.
+    """Topic and fields that contain a quantity.
 
     Attributes:
-        topic: Topic of its messages.
+        topic: Topic that contains the quantity.
         fields: Fields to read; empty for images and transforms.
         path: Path of the field; None for images and transforms.
     """
@@ -86,11 +86,11 @@ def values_of(
         quantity: Quantity of the mapping.
         source: Topic and fields of the quantity.
         stream: Messages of the topic.
-        run: Messages to use.
+        run: Messages of the topic between two resets of the clock.
         steps_ns: (N,) times of the steps.
         transforms: Tree of frames, for a transform.
-        ends_ns: (N,) ends of the steps, to use the last message before them; None to align with
-            the steps.
+        ends_ns: (N,) ends of the steps, to use the last message before each end; None to align
+            with the times of the steps.
 
     Raises:
         UsageError: A field is not a number.
@@ -140,7 +140,7 @@ def _match(
 
 
 def _rows(run: Run, match: Matches) -> NDArray[np.int64]:
-    """Return the positions of the matched messages in their topic."""
+    """Return the index in the topic of the message that matches each step, or `NONE`."""
     rows = np.full(len(match.rows), NONE)
     rows[match.rows != NONE] = run.rows[match.rows[match.rows != NONE]]
     return rows
@@ -159,7 +159,7 @@ def _column(quantity: Quantity, source: Source, stream: TopicStream) -> NDArray[
 
 
 def _unwrapped(quantity: Quantity, column: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return angles without jumps of 2 pi, which would be interpolated through 0."""
+    """Remove jumps of 2 pi from angles, because interpolation across a jump would be wrong."""
     is_angle = quantity.as_ == "yaw" or quantity.wrap_angle
     return np.unwrap(column, axis=0) if is_angle and len(column) else column
 

@@ -16,7 +16,7 @@ _SUFFIX = re.compile(r"(.*?)\[(-?\d*)(?:(:)(-?\d*)(?::(-?\d*))?)?\]")
 
 
 class FieldPath(NamedTuple):
-    """A field of a topic, and the elements of it.
+    """Path of a field of a topic, with an optional index or slice.
 
     Attributes:
         topic: Name of the topic.
@@ -29,7 +29,7 @@ class FieldPath(NamedTuple):
     elements: int | slice | None
 
     def select(self, column: NDArray[Any]) -> NDArray[Any]:
-        """Return the elements of a column (N, K), or the column itself.
+        """Select elements of a column (N, K); without an index or slice, return all of the column.
 
         Raises:
             UsageError: The field is not an array, or is shorter than the index.
@@ -39,7 +39,7 @@ class FieldPath(NamedTuple):
         if column.ndim != 2:
             raise UsageError(f"{self}: the field is not an array of equal length in all messages")
         if isinstance(self.elements, int) and not -column.shape[1] <= self.elements < len(column.T):
-            raise UsageError(f"{self}: the field has {column.shape[1]} elements, counted from 0")
+            raise UsageError(f"{self}: the field has {column.shape[1]} elements; index 0 is first")
         return column[:, self.elements]
 
     def __str__(self) -> str:

@@ -20,7 +20,7 @@ from mcaprl.recorder.mapping.streams import TopicStream
 
 Columns = MappingOf[str, NDArray[Any]]
 Reward = Callable[[Columns, NDArray[np.int64]], NDArray[np.float64]]
-"""Function of the columns of all steps and of each step's next row that returns the rewards."""
+"""Function that returns all rewards, given the columns and the row that follows each step."""
 
 
 class Wanted(NamedTuple):
@@ -36,16 +36,16 @@ class Plan:
 
     Attributes:
         bag: Bag to read.
-        mapping: Mapping to read it by.
+        mapping: Mapping of the bag's topics.
         place: Positions of the mapping's keys, for errors.
         quantities: Observed and other quantities, by name.
         behavior_prob: Probability of the action; None if unknown.
         commands: Fields of the action.
         conditions: Conditions of the episodes: `begin`, `end`, `terminated`, `truncated`.
-        reasons: Conditions of the reasons, by reason.
+        reasons: Conditions of the end reasons, by reason.
         reward: Function that computes the rewards.
         streams: Messages of the used topics.
-        constants: Constants of the used types by name; a name with several values is left out.
+        constants: Constants of the message types, by name; names with several values are omitted.
     """
 
     def __init__(self, bag: Bag, mapping: Mapping, place: Place, *, trust_code: bool) -> None:
@@ -111,7 +111,7 @@ class Plan:
                 fields.setdefault(topic_of(self.bag, self.mapping.clock.topic), set())
         gap_s = self.mapping.episodes.gap_s
         return {
-            # Messages of transforms have a time for each frame.
+            # A TFMessage has no header: each of its transforms has its own stamp.
             topic: TopicStream(
                 self.bag,
                 topic,
@@ -127,7 +127,7 @@ def _reward_of(text: str, *, trust_code: bool) -> Reward:
     """Return the function that computes the rewards of all steps.
 
     Raises:
-        UsageError: The text is neither an expression nor, if code is trusted, a function.
+        UsageError: The expression is wrong, or the function is not trusted or not found.
     """
     module, colon, name = text.partition(":")
     if not colon or not module.replace(".", "").isidentifier():
@@ -146,8 +146,8 @@ def _reward_of(text: str, *, trust_code: bool) -> Reward:
         found = np.asarray(function(columns, following), np.float64)
         if found.shape != following.shape:
             raise UsageError(
-                f"the function '{text}' returned {found.shape}, expected {following.shape}: one"
-                " reward for each step"
+                f"the function '{text}' returned shape {found.shape}, expected"
+                f" {following.shape}: one reward for each step"
             )
         return found
 

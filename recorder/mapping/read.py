@@ -65,7 +65,7 @@ def read_bag(
 def read_open_bag(
     bag: Bag, mapping: Mapping, place: Place | None = None, *, trust_code: bool = False
 ) -> MappedBag:
-    """Read an open bag; see `read_bag`. Errors name the keys of the mapping by `place`."""
+    """Read an open bag; see `read_bag`. In errors, `place` locates the keys of the mapping."""
     plan = Plan(bag, mapping, place or Place(), trust_code=trust_code)
     reader = StepReader(plan)
     runs = [reader.read(number) for number in range(run_count(plan.streams))]
@@ -74,8 +74,8 @@ def read_open_bag(
     report = _report(plan, runs, kept)
     if not any(kept):
         raise LogError(
-            f"{', '.join(map(str, bag.paths))}: no episode of {least} or more steps by this"
-            f" mapping: {report.why_empty()}"
+            f"{', '.join(map(str, bag.paths))}: the mapping finds no episode of {least} or"
+            f" more steps: {report.why_empty()}"
         )
     return MappedBag(assembled(plan, runs, kept), report)
 

@@ -14,7 +14,7 @@ END_OF_DATA = "end_of_data"
 
 
 class Marks(NamedTuple):
-    """What is known of each of N steps, for the division into episodes.
+    """Flags (N,) of the steps that determine the episodes.
 
     Attributes:
         usable: Whether all observations are present.
@@ -59,18 +59,19 @@ class Segment(NamedTuple):
 def segments(marks: Marks, max_steps: int | None) -> list[Segment]:
     """Divide steps into episodes.
 
-    An episode begins at a usable step with an action that is not an end. It ends at the first later
-    step that is terminal or truncating, at the last step before a gap or an unusable step, at a
-    step without an action, after `max_steps` transitions, or before the next rising edge of
+    An episode begins at a usable step that has an action and is neither terminal nor truncating.
+    If `begin` is given, this step must be a rising edge of it. The episode ends at whichever comes
+    first: a terminal or truncating step, the last step before a gap or an unusable step, a step
+    without an action, `max_steps` transitions, or the last step before the next rising edge of
     `begin`. The next episode begins after the final observation.
 
     Args:
-        marks: Facts of the steps.
+        marks: Flags of the steps.
         max_steps: Maximum number of transitions; None for no limit.
     """
     count = len(marks.usable)
     begins = marks.usable if marks.begin is None else marks.usable & _edges(marks.begin)
-    # The positions of all steps that end an episode there or just before, with their kind.
+    # An episode ends at a step in `ends`, or just before a step where `cuts` is true.
     ends = np.flatnonzero(marks.terminated | marks.truncated | ~marks.acted)
     cuts = marks.gap_before | ~marks.usable
     if marks.begin is not None:

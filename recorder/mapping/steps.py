@@ -1,4 +1,4 @@
-"""Steps of a bag: all that a mapping knows of each one, and the episodes that they form."""
+"""Steps of a bag: their quantities, actions and rewards, and the episodes that they form."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Steps(NamedTuple):
         quantities: Values of each quantity by name.
         actions: Action of each step.
         probs: (N,) probability of the action; NaN if unknown.
-        rewards: (N,) reward of each step's action, which needs the next step.
+        rewards: (N,) reward of each step's action; may depend on the next step.
         episodes: Episodes that the steps form.
-        reasons: (N,) conditions of the reasons, by reason.
+        reasons: (N,) whether the condition of an end reason is true, by reason.
     """
 
     times_ns: NDArray[np.int64]
@@ -43,7 +43,7 @@ class Steps(NamedTuple):
 
 
 class StepReader:
-    """Reader of the steps of a bag, one run of the clock after the other."""
+    """Reader of the steps of a bag, run by run; a run is the time between two clock resets."""
 
     def __init__(self, plan: Plan) -> None:
         """Read the transforms, if the mapping uses them."""
@@ -53,7 +53,7 @@ class StepReader:
         self._transforms = Transforms(plan.bag, by_header=by_header) if uses_transforms else None
 
     def read(self, number: int) -> Steps:
-        """Return the steps of the run `number` of the clock.
+        """Return the steps of one run; `number` is its index.
 
         Raises:
             UsageError: The mapping does not fit the messages.
@@ -84,7 +84,7 @@ class StepReader:
         nothing = np.zeros(len(times_ns), bool)
         terminated = conditions.get("terminated", nothing)
         truncated = conditions.get("truncated", nothing) | conditions.get("end", nothing)
-        # A terminal state is an end of the transition that leads to it.
+        # For rewards: a transition is terminal if the step that it leads to is terminal.
         columns |= {"terminated": terminated[following], "truncated": truncated[following]}
         gap_ns = self._mapping.episodes.gap_s * NS_PER_S
         marks = Marks(
@@ -112,12 +112,12 @@ class StepReader:
         if not runs:
             return np.empty(0, np.int64)
         first, last = min(int(t[0]) for t in runs), max(int(t[-1]) for t in runs)
-        # A period that fits a whole number of times is not lost to rounding.
+        # The tolerance keeps the last step if the duration is a whole number of periods.
         count = int((last - first) * clock.rate_hz / NS_PER_S + 1e-6) + 1
         if count > _MAX_STEPS:
             raise UsageError(
                 f"{self._plan.place.of('clock', 'rate_hz')}: {count} steps between {first} and"
-                f" {last} ns: use another `time` or a lower rate"
+                f" {last} ns are too many: use another `time` or a lower rate"
             )
         since_ns: NDArray[np.int64] = np.rint(np.arange(count) * (NS_PER_S / clock.rate_hz)).astype(
             np.int64
@@ -160,12 +160,12 @@ class StepReader:
         for name, expression in expressions.items():
             with self._plan.place.named(*keys, name):
                 values = expression.evaluate(columns, following).astype(np.float64)
-            # A missing number fulfills no condition.
+            # A condition on a missing value (NaN) is false.
             found[name] = np.nan_to_num(values, nan=0.0) != 0
         return found
 
     def _usable(self, quantities: dict[str, Values], count: int) -> NDArray[np.bool_]:
-        """Return the steps whose observations are present and not older than a gap."""
+        """Return whether each step has all observations, none of them older than `gap_s`."""
         usable = np.ones(count, bool)
         for name, quantity in self._mapping.observation.items():
             if quantity.missing is None or quantity.image is not None:
@@ -182,7 +182,7 @@ def _run(stream: TopicStream, number: int) -> Run:
 
 
 def _ends(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the ends of the steps: the next step, and for the last one its usual duration."""
+    """Return the end of each step: the next step's time. The last step has the median duration."""
     if len(times_ns) < 2:
         return times_ns + NS_PER_S
     return np.append(times_ns[1:], times_ns[-1] + int(np.median(np.diff(times_ns))))

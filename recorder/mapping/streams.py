@@ -1,4 +1,4 @@
-"""The topics that a mapping uses, in the order of time."""
+"""Messages of the topics that a mapping uses, in time order."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class Run(NamedTuple):
 class TopicStream:
     """Messages of one topic: times, and the fields that a mapping uses.
 
-    A clock that goes back by more than a gap was reset, as in a simulation that starts again; the
-    messages before and after are different runs. Smaller steps back are jitter: the messages are
-    sorted.
+    If the clock goes back by more than `gap_s`, it was reset, as in a simulation that restarts; the
+    messages before and after the reset are separate runs. If it goes back by less, the cause is
+    jitter, and the messages are sorted by time.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class TopicStream:
         """(M,) times of the messages, in file order.
 
         Raises:
-            UsageError: The time is that of a header, and the messages have none.
+            UsageError: The mapping uses times of headers, but the messages have no header.
         """
         if self._time == "log_time":
             return self._bag.times(self._topic)
@@ -68,7 +68,7 @@ class TopicStream:
 
     @cached_property
     def runs(self) -> list[Run]:
-        """The messages between resets of the clock; one empty run without messages."""
+        """Messages between resets of the clock; one empty run if there are no messages."""
         times_ns = self.times_ns
         resets = np.flatnonzero(np.diff(times_ns) < -self._gap_ns) + 1
         found = []
@@ -82,7 +82,7 @@ def run_count(streams: dict[str, TopicStream]) -> int:
     """Return the number of runs, which is the same for all topics with messages.
 
     Raises:
-        UsageError: The clocks of topics are reset a different number of times.
+        UsageError: The topics' clocks were not all reset the same number of times.
     """
     counts = {name: len(stream.runs) for name, stream in streams.items() if len(stream.times_ns)}
     if len(set(counts.values())) > 1:

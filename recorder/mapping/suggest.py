@@ -1,4 +1,4 @@
-"""A mapping file to begin with, from the topics of a bag."""
+"""Suggestion of a mapping file, from the topics of a bag."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LIKELY = {
 
 
 class _Entry(NamedTuple):
-    """A line of the mapping, and the remark at its end."""
+    """A line of the mapping: name and path of an observation, and a comment."""
 
     name: str
     path: str
@@ -46,7 +46,7 @@ class _Entry(NamedTuple):
 def suggested(bag: Bag) -> str:
     """Return the text of a mapping file with the likely observations and action of a bag.
 
-    Everything else that can be read is a comment, with type and rate.
+    Comments list all other numbers and images that can be read, with type and rate.
 
     Raises:
         LogError: The bag has no topic with numbers.
@@ -104,7 +104,6 @@ def _observations(bag: Bag, topics: Iterable[TopicInfo]) -> Iterator[_Entry]:
                 continue
             name = _name(info.name, plain, names)
             names.add(name)
-            # Missing ranges of a scan are beyond its reach.
             yield _Entry(name, _quoted(f"{info.name}.{field}"), _remark(info))
 
 
@@ -157,7 +156,7 @@ def _action_lines(command: TopicInfo | None, topics: list[TopicInfo]) -> list[st
 
 
 def _numbers(info: TopicInfo) -> list[str]:
-    """Return the scalar numbers of a topic, without those of headers."""
+    """Return the names of the scalar number fields of a topic, except headers and stamps."""
     return [
         name
         for name, kind in info.fields.items()
@@ -166,7 +165,7 @@ def _numbers(info: TopicInfo) -> list[str]:
 
 
 def _rate(topics: Iterable[TopicInfo]) -> float:
-    """Return a rate of steps: that of the slowest topic, but from 1 to 20 Hz."""
+    """Return the step rate: the rate of the slowest topic with at least 1 Hz, limited to 20 Hz."""
     rates = [_rate_of(info) for info in topics if info.name not in _SKIPPED and info.count > 1]
     slowest = min((rate for rate in rates if rate >= _MIN_RATE_HZ), default=_MIN_RATE_HZ)
     return float(f"{min(slowest, _MAX_RATE_HZ):.2g}")
@@ -182,7 +181,7 @@ def _remark(info: TopicInfo) -> str:
 
 
 def _name(topic: str, field: str, used: set[str]) -> str:
-    """Return a name from the last parts of topic and field that is not used yet."""
+    """Return an unused name: the first part of the topic name and the last parts of the path."""
     words = [*topic.strip("/").split("/"), *field.split(".")]
     words = ["".join(c if c.isalnum() else "_" for c in word) for word in words]
     for count in range(min(3, len(words)), len(words) + 1):
@@ -194,5 +193,5 @@ def _name(topic: str, field: str, used: set[str]) -> str:
 
 
 def _quoted(path: str) -> str:
-    """Return a path that YAML reads as text: brackets would begin a list."""
+    """Quote a path with brackets or colons, which YAML would not read as text."""
     return f'"{path}"' if "[" in path or ":" in path else path

@@ -1,4 +1,4 @@
-"""What a mapping finds in a bag, and what it leaves out."""
+"""Report of what a mapping reads from a bag, and of what it leaves out."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from mcaprl.problem import Problem
 from mcaprl.texts import counted
 
 _MUCH = 0.1
-"""Share of the steps from which something missing is a problem."""
+"""Share of missing or dropped steps above which a problem is reported."""
 
 
 @dataclass(frozen=True)
 class FieldReport:
-    """Facts of a quantity at the steps of the clock.
+    """Statistics of a quantity over the steps of the clock.
 
     Attributes:
-        topic: Topic of its messages.
+        topic: Topic that contains the quantity.
         missing: Share of the steps without a value.
         median_age_s: Median age of the value at its step, seconds; NaN if there is none.
         max_age_s: Largest age, seconds; NaN if there is none.
@@ -33,7 +33,7 @@ class FieldReport:
 
     @classmethod
     def of(cls, topic: str, missing: NDArray[np.bool_], ages_s: NDArray[np.float64]) -> FieldReport:
-        """Summarize a quantity's steps (N,)."""
+        """Summarize flags `missing` and ages `ages_s` of N steps."""
         known = np.abs(ages_s[np.isfinite(ages_s)])
         median, largest = (np.nan, np.nan)
         if len(known):
@@ -41,7 +41,7 @@ class FieldReport:
         return cls(topic, float(missing.mean()) if len(missing) else 1.0, median, largest)
 
     def __str__(self) -> str:
-        """Return the line of the table."""
+        """Return the statistics as text for a table."""
         age = (
             ""
             if np.isnan(self.median_age_s)
@@ -62,11 +62,10 @@ class MappingReport:
         clock_steps: Number of steps of the clock.
         steps: Number of transitions.
         episodes: Number of episodes.
-        dropped: Numbers of transitions of the episodes that were too short.
-        ends: Number of episodes by the reason of their end; `condition` is a condition of the
-            mapping.
+        dropped: Number of transitions of each episode that was too short.
+        ends: Number of episodes by end reason; `condition` counts all conditions of the mapping.
         clock_resets: Number of times that the clock went back by more than a gap.
-        fields: Facts of each quantity, by name.
+        fields: Statistics of each quantity, by name.
         missing_actions: Share of the steps of the clock without an action.
         far_actions: Share of the transitions whose command is far from every named action, or
             beyond the limits of the Box.
@@ -93,7 +92,7 @@ class MappingReport:
         return found
 
     def problems(self) -> list[Problem]:
-        """Return what makes the transitions doubtful, or leaves much of the bag out."""
+        """Return problems that reduce the quality or the number of the transitions."""
         found = [
             Problem(
                 f"{name} is missing at {field.missing:.0%} of the steps",
@@ -116,10 +115,10 @@ class MappingReport:
         return found
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return the names and texts of the facts."""
+        """Return the rows of a table: name and text of each result."""
         ends = ", ".join(f"{count} {reason}" for reason, count in self.ends.items())
         rows = [
-            ("steps", f"{self.steps} of {self.clock_steps} of the clock"),
+            ("steps", f"{self.steps} of {self.clock_steps} steps of the clock"),
             ("episodes", str(self.episodes)),
             ("ends", ends or "none"),
             ("episodes left out", _dropped(self.dropped)),

@@ -35,7 +35,7 @@ class Transforms:
 
         Args:
             bag: Bag with `/tf`, `/tf_static` or both.
-            by_header: Whether a transform has the time of its header, instead of the message's.
+            by_header: Whether to use the stamp of each transform instead of the log_time.
         """
         found: dict[str, list[tuple[str, int, list[float], list[float], bool]]] = {}
         for topic in (TF, TF_STATIC):
@@ -52,30 +52,31 @@ class Transforms:
         align: str,
         tolerance_s: float | None,
     ) -> tuple[Floats, Floats]:
-        """Return the pose of a frame in another at the times of steps.
+        """Return the planar pose of a frame in another frame at the times of steps.
 
-        Each transform on the way is the last one up to the step, or the nearest or interpolated
-        one; static transforms hold at all times.
+        The pose is composed of the transforms between the two frames. Static transforms are valid
+        at all times.
 
         Args:
-            frame: Frame whose pose is wanted.
-            fixed: Frame in which it is given.
-            steps_ns: (N,) times.
-            align: `last`, `nearest` or `linear`.
-            tolerance_s: Age beyond which a transform is missing.
+            frame: Frame whose pose is returned.
+            fixed: Reference frame of the pose.
+            steps_ns: (N,) times of the steps.
+            align: Selection of each transform: `last`, `nearest` or `linear` (interpolated).
+            tolerance_s: Age in seconds beyond which a transform is missing.
 
         Returns:
-            (N, 3) x, y and yaw, NaN where missing; and (N,) the largest age in seconds.
+            (N, 3) x, y and yaw, NaN where missing; and (N,) age of the oldest transform, seconds.
 
         Raises:
-            UsageError: There is no way between the frames.
+            UsageError: No transforms connect the frames.
         """
         above, below = self._chain(frame), self._chain(fixed)
         common = next((each for each in above if each in below), None)
         if common is None:
             known = sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
             raise UsageError(
-                f"/tf has no way from frame '{frame}' to '{fixed}'; frames: {', '.join(known[:12])}"
+                f"/tf has no path from frame '{frame}' to '{fixed}'; frames:"
+                f" {', '.join(known[:12])}"
             )
         count = len(steps_ns)
         age_s = np.zeros(count)
@@ -104,7 +105,7 @@ class Transforms:
 
 
 def yaw_of(quaternions: Floats) -> Floats:
-    """Return the angle about z, radians, of quaternions (N, 4) x y z w; NaN if one is all 0."""
+    """Return the yaw in radians of quaternions (N, 4) x y z w; NaN for a quaternion of zeros."""
     x, y, z, w = quaternions.T
     with np.errstate(invalid="ignore"):
         is_none = ~(np.square(quaternions).sum(axis=1) > 0)

@@ -1,16 +1,16 @@
-"""Topics that only viewers read, with the same log times as the transitions.
+"""Topics for viewers, with the same log times as the transitions.
 
 /scene                  moving shapes, at most ten times a second, and at episode starts and ends
 /scene/static           static shapes, when they differ from those of the previous episode
 /scene/tracks           tracks of the episodes so far, written at the ends of episodes
-/tf                     moving frames at each step, and their poses until the next step; each pose
-                        has its own stamp
+/tf                     poses of the moving frames at and between the steps; each pose has its own
+                        stamp
 /tf_static              static frames, when they differ from those of the previous episode
 /telemetry              numbers to plot: the environment's telemetry and the return so far
 /camera/depth           metric depth in millimeters
 /camera/camera_info     intrinsics of the depth camera, once
 
-A viewer that seeks needs only the latest message of each scene topic.
+After a seek, a viewer needs only the latest message of each scene topic.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
 DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Display messages are written when they exceed this size or the episode ends.
 _CHUNK_BYTES = 2**20
-# Tracks are written again when the messages since the last ones have this many times their size.
+# The tracks are written again after other messages of this many times the tracks' size.
 _BYTES_PER_TRACKS = 4
-# Bodies move with their frames at each step; other moving shapes are redrawn after this time.
+# Shapes of a body move with its frame at each step; other moving shapes are written at this period.
 _SCENE_PERIOD_NS = 100_000_000
 
 
 class ShownTopics:
-    """The scene and telemetry topics of an environment, announced to a log.
+    """The scene and telemetry topics of an environment, whose channels are added to a log.
 
     Attributes:
         channels: Channel id of each topic.
@@ -86,7 +86,7 @@ class ShownTopics:
 
 
 class Display:
-    """A buffer of an episode's display messages, which writes them in separate chunks."""
+    """Buffer of the display messages of an episode, which are written in separate chunks."""
 
     def __init__(self, log: LogTopics, source: object, *, scene: bool, camera: bool) -> None:
         """Select the topics to record.
@@ -95,8 +95,8 @@ class Display:
             log: Log to write to.
             source: Unwrapped environment, which implements any of the protocols in `scene.py`.
             scene: Whether to record shapes, frames and telemetry.
-            camera: Whether to record the depth camera, which is always recorded if observations
-                contain images.
+            camera: Whether to record the depth camera. If observations contain images, the depth
+                camera is recorded even without this flag.
         """
         self._log, self._source = log, source if scene else None
         self._messages: list[tuple[int, int, bytes]] = []
@@ -114,14 +114,15 @@ class Display:
         self._shown: ShownTopics | None = None
         self._tracks, self._bytes_since_tracks = Tracks(), 0
         self._static: dict[str, bytes] = {}
-        # Latest shapes that are not drawn yet; they are drawn at the end of the episode.
+        # Latest shapes that are not in a message yet; they are written at the end of the episode.
         self._pending: tuple[int, Sequence[Shape]] | None = None
-        # Frames at the latest step, which are written with the motion after it.
+        # Frames at the latest step. They are written at the next step, because one message contains
+        # them and the poses up to that step.
         self._moment: Moment | None = None
 
     @property
     def shown(self) -> ShownTopics:
-        """The announced scene and telemetry topics; defined after the first `begin`."""
+        """The scene and telemetry topics; available after the first call of `begin`."""
         assert self._shown is not None, "no episode has begun"
         return self._shown
 
@@ -131,7 +132,7 @@ class Display:
         return (*self.shown.channels, *((DEPTH,) if self._depth_images else ()))
 
     def begin(self, start_ns: int, step_ns: int) -> None:
-        """Begin an episode, after the environment's reset, at the log_time `start_ns`."""
+        """Begin an episode at the log_time `start_ns`; call this after the environment's reset."""
         self._start_ns, self._step_ns = start_ns, step_ns
         self._return_so_far = 0.0
         self._tracks.begin()
@@ -154,7 +155,12 @@ class Display:
             self._emit_changed(CAMERA_INFO, start_ns, self._camera)
 
     def observe(self, step: int, reward: float) -> None:
-        """Add the messages that show the state after `step` steps, and the last step's reward."""
+        """Add the display messages for the state after `step` steps.
+
+        Args:
+            step: Number of steps since the start of the episode.
+            reward: Reward of the last step.
+        """
         self._return_so_far += reward
         time_ns = self._start_ns + step * self._step_ns
         if self._scene is not None:
@@ -204,7 +210,7 @@ class Display:
             self._pending = None
 
     def _emit_motion(self, time_ns: int, frames: Sequence[Frame]) -> None:
-        """Add the frames of the previous step with their motion until `time_ns`, its end."""
+        """Add the poses of the frames from the previous step to the current one, at `time_ns`."""
         end = (time_ns, frames)
         if self._moment is not None:
             inner = self._motion.motion() if self._motion is not None else ()
@@ -213,7 +219,7 @@ class Display:
         self._moment = end
 
     def _emit_tracks(self, summary: EpisodeSummary) -> None:
-        """Write the tracks so far, unless short episodes would make them most of the log."""
+        """Write the tracks so far, but limit their share of the log if episodes are short."""
         failed = self._log.metadata.is_failure(summary.reason)
         self._tracks.end(summary.episode, summary.total_reward, failed=failed)
         data = marker_array(self._tracks.shapes())

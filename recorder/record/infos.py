@@ -19,8 +19,8 @@ class EpisodeInfos:
 
         Args:
             topics: Topics of the infos in the log.
-            names: Whether infos are recorded, or the names of those that are; `episode` includes
-                `episode.r`.
+            names: Whether to record infos, or the names of the infos to record. The name `episode`
+                includes nested infos such as `episode.r`.
         """
         self._topics = topics
         self._names = None if isinstance(names, bool) else tuple(names)
@@ -28,7 +28,7 @@ class EpisodeInfos:
         self._twice: set[str] = set()
 
     def begin(self, info: Mapping[str, Any]) -> None:
-        """Store the info that `reset` returned, in place of those of an earlier episode."""
+        """Drop the infos of earlier episodes, and store the info that `reset` returned."""
         self._values.clear()
         self.add(0, info)
 
@@ -48,7 +48,7 @@ class EpisodeInfos:
         """Write the infos of the episode.
 
         Args:
-            length: Number of recorded transitions; infos of later observations are left out.
+            length: Number of recorded transitions; infos of later steps are not written.
             start_ns: log_time of the first observation.
             step_ns: Time between two observations, nanoseconds.
         """
@@ -63,7 +63,7 @@ class EpisodeInfos:
             elif array is None:
                 refused[name] = (
                     "a log stores flags, texts, integers, float32 and float64, and arrays of one"
-                    " shape, without a mixture of these"
+                    " shape, but no mixture of these"
                 )
             else:
                 found[name] = ([start_ns + step * step_ns for step in steps[:count]], array)
@@ -71,7 +71,7 @@ class EpisodeInfos:
         self._topics.write(found)
 
     def warn(self) -> None:
-        """Warn once of each info that the log cannot store, after the episode is written."""
+        """Warn once about each info that the log cannot store; call this after `end`."""
         for name, why in self._topics.refused.items():
             if name not in self._topics.warned:
                 self._topics.warned.add(name)
@@ -86,9 +86,10 @@ def _copied(value: Any) -> Any:
 
 
 def info_of(infos: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """Return the info of one environment from those of a vector environment.
+    """Return the info of one environment from the infos of a vector environment.
 
-    Gymnasium puts the values of all environments into arrays; `_name` says which have the info.
+    Gymnasium stores the values of all environments in one array per info. The mask `_name` selects
+    the environments that returned the info `name`.
     """
     found: dict[str, Any] = {}
     for name, value in infos.items():

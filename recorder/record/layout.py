@@ -1,8 +1,8 @@
 """A Foxglove layout for a log: its screens Drive, Learning and Data.
 
 The classic form (`configById`, `layout`, `globalVariables`, `userNodes`, `playbackConfig`) opens in
-Foxglove and in Lichtblick. The screens are the tabs of one panel, so that each has few panels, also
-in a window of 1280 x 720 pixels.
+Foxglove and in Lichtblick. The screens are the tabs of one panel. Each screen has few panels, so
+that it fits into a window of 1280 x 720 pixels.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ _WORLD = "map"
 _STILL = (_WORLD, "follow-none")
 _NONE: Sequence[str] = ()
 _SPEED = "speed_m_s"
-# Telemetry in the first plot besides the speed, by the ends of its names.
+# Suffixes of the telemetry names in the first plot; the speed has a gauge instead.
 _WATCHED = ("offset_m", "steering_rad", "distance_m")
 # Values for environments without `view_settings`.
 _CAMERA_M, _TILT_DEG, _AROUND_M, _DEPTH_M, _HIGHEST_M_S = 22.0, 73.0, 100.0, (0.0, 50.0), 30.0
 # Length of the vehicle's axes in the view from above, as a share of the visible height.
 _MARK = 0.03
-# Reasons of failures in the sims and of Gymnasium; their names are shown by the indicator.
+# End reasons of failures, from the sims and from Gymnasium. The indicator shows their names.
 _REASONS = (
     *("off_lane", "off_line", "collision", "crash", "stall", "no_gate", "slow", "low_reward"),
     *("terminated", "time_limit"),
@@ -101,14 +101,14 @@ class _Screens:
     found: dict[str, Panel] = field(default_factory=dict)
 
     def drive(self) -> Node:
-        """Return what one watches while the vehicle drives."""
+        """Return views of the scene and instruments, for watching the vehicle while it drives."""
         beside = self._instruments()
         views = self._images()
         if _SCENE not in self.topics:
             if not views:
                 return beside
             return panels.split(panels.stack(views, "column"), beside, "row", 50)
-        # The view from above is wide, and images are square.
+        # The view from above gets more of the width than an image, because images are square.
         below = [(view, 0.4) for view in views] + [(self._above(), 0.6)]
         if _TRACKS not in self.topics and "/tf" in self.topics and "y_m" in self.telemetry:
             below.append((self._track_so_far(), 0.4))
@@ -131,7 +131,7 @@ class _Screens:
         return panels.split(left, right, "row", 42)
 
     def data(self) -> Node:
-        """Return the messages themselves, all numbers of the log, and its log lines."""
+        """Return raw messages, plots of all numbers of the log, and the log lines."""
         raw = [
             (self._put(f"RawMessages!{topic[4:]}", panels.raw_messages(topic)), weight)
             for topic, weight in ((STEP_TOPIC, 0.6), (EPISODE_TOPIC, 0.4))
@@ -175,7 +175,7 @@ class _Screens:
         return self._put("3D!scene", panels.three_d("scene", shown, camera, followed))
 
     def _above(self) -> Node:
-        """Add the view from above: the whole world, or what is around the vehicle if unknown."""
+        """Add the view from above: the whole world, or the vehicle's surroundings by default."""
         view = self.metadata.view
         height_m = view.get("world_m", _AROUND_M)
         camera = {
@@ -194,7 +194,7 @@ class _Screens:
             {_SCENE: ["speed"], **shown},
             camera,
             followed,
-            # The vehicle is too small to see, but its axes are not.
+            # The vehicle is too small to see, so larger axes mark its position.
             axes_m=_MARK * height_m,
             without_axes=(_WORLD, IMAGE_FRAME),
         )
@@ -226,7 +226,7 @@ class _Screens:
         return names
 
     def _instruments(self) -> Node:
-        """Add the gauge and the indicator, the plots of this moment, and the actions."""
+        """Add the gauge, the indicator, plots of reward, return and telemetry, and the actions."""
         lights = [*self._gauge(), *self._indicator()]
         returns = {"return of each episode": f"{EPISODE_TOPIC}.total_reward"}
         if RETURN_SO_FAR in self.telemetry:
@@ -254,7 +254,7 @@ class _Screens:
         return [self._put("Gauge!speed", panel)]
 
     def _indicator(self) -> list[Node]:
-        """Add the state of the episode: red for a failure, if the successes are known."""
+        """Add the state of the episode; failures are red if the success reasons are known."""
         if PHASE_TOPIC not in self.topics:
             return []
         successes = self.metadata.success_reasons
@@ -268,7 +268,7 @@ class _Screens:
         return [self._put("Indicator!state", panel)]
 
     def _actions(self) -> tuple[Node, float]:
-        """Add the actions of the last seconds, and those of the policies; return their share."""
+        """Add recent logged and policy actions; return the panel and its share of the height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
             paths = series.action_series(self.metadata)
@@ -315,7 +315,7 @@ class _Screens:
         return rows
 
     def _policy(self, topic: str) -> Node:
-        """Add the outputs of one policy: values over time and now, errors, and its agreement."""
+        """Add a policy's outputs over time, its current Q-values, errors, and agreement."""
         title = topic.removeprefix("/rl/")
         names = list(self.metadata.action_names().values())[: series.MAX_SERIES]
         over_time: dict[str, Node] = {}

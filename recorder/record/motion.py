@@ -1,8 +1,9 @@
 """Motion of frames within a step, as the few poses that viewers interpolate between.
 
-A message of `/tf` at the log_time of a step contains the frames at that time, and then their poses
-until the end of the step, each with its own stamp. A viewer that has only transforms up to the
-current time cannot draw a vehicle between two of them; with the step's end, it can draw any moment.
+A message of `/tf` at the log_time of a step contains the poses of the frames from that time until
+the end of the step, each with its own stamp. A viewer interpolates between two poses, so it needs
+the pose after the current time, too. Because a message includes the pose at the end of the step,
+the viewer can draw any moment of the step.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
     """Encode the moments of a step as one `tf2_msgs/msg/TFMessage`, in order of time.
 
     Args:
-        moments: Moments with the same frames each, in order of time.
-        thins: Whether to leave out the poses between the first and the last moment that linear
-            interpolation between the others finds within 0.04 m and 0.02 rad.
+        moments: Moments in order of time; all contain the same frames.
+        thins: Whether to omit intermediate poses that linear interpolation between the remaining
+            poses reproduces with errors of at most 0.04 m and 0.02 rad.
     """
     times = np.array([time_ns for time_ns, _ in moments], np.float64) - moments[0][0]
     kept = []
@@ -44,14 +45,14 @@ def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes
 
 
 def knots(times: NDArray[np.float64], values: NDArray[np.float64]) -> list[int]:
-    """Return the indices of the rows from which linear interpolation finds all others within 1.
+    """Select rows such that linear interpolation gives all other rows with errors of at most 1.
 
     Args:
         times: (N,) increasing times; N is at least 2.
         values: (N, K) numbers.
 
     Returns:
-        Increasing indices, the first 0 and the last N - 1.
+        Increasing indices of the selected rows; the first is 0 and the last N - 1.
 
     >>> times = np.arange(5.0)
     >>> knots(times, times[:, None] * 7), knots(times, np.array([[0.0], [0], [0], [4], [8]]))

@@ -1,6 +1,6 @@
 """Panels of a Foxglove layout: the configuration of each kind, and their arrangement.
 
-Titles have two keys, since Foxglove and Lichtblick read different ones.
+Each title is stored under two keys, because Foxglove and Lichtblick read different keys.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 Panel = dict[str, Any]
 Node = dict[str, Any] | str
-"""Name of a panel, or two nodes that share a rectangle."""
+"""Node of a layout: the name of a panel, or a split into two nodes."""
 FIELD_OF_VIEW_DEG = 45
 """Vertical angle of view of a 3D panel, degrees."""
 
@@ -25,19 +25,19 @@ _SCREEN_PX = 570
 
 
 def tabs(nodes: Mapping[str, Node]) -> Panel:
-    """Return a panel of tabs, each with a layout."""
+    """Return a panel of tabs, one for each node."""
     parts = [{"title": title, "layout": node} for title, node in nodes.items()]
     return {"activeTabIdx": 0, "tabs": parts}
 
 
 def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **options: Any) -> Panel:
-    """Return a plot of series by label; the legend is left of the plot, if there are several.
+    """Return a plot of series. With several series, there is a legend to the left of the plot.
 
     Args:
         title: Title of the panel.
         paths: Message path of each series, by label.
         values: Whether the legend has the values at the current time.
-        options: Fields of the panel to replace.
+        options: Values that replace fields of the panel.
     """
     several = len(paths) > 1
     return _titled(
@@ -58,7 +58,7 @@ def plot(title: str, paths: Mapping[str, str], *, values: bool = False, **option
 
 
 def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
-    """Return a plot of the elements of the latest message's arrays as points over their index."""
+    """Return a plot of arrays in the latest message: one point per element, over its index."""
     panel = plot(title, paths, xAxisVal="index", isSynced=False)
     for series in panel["paths"]:
         series |= {"showLine": False, "lineSize": 4}
@@ -66,22 +66,22 @@ def points_by_index(title: str, paths: Mapping[str, str]) -> Panel:
 
 
 def curve(title: str, x_path: str, y_path: str) -> Panel:
-    """Return a plot of one number over another, which must be of another topic.
+    """Return a plot of one number over another.
 
-    Lichtblick draws nothing if both are numbers of one topic.
+    The numbers must be from different topics, because Lichtblick otherwise draws nothing.
     """
     x_axis = {"value": x_path, "enabled": True}
     return plot(title, {"y": y_path}, xAxisVal="custom", xAxisPath=x_axis, isSynced=False)
 
 
 def state_transitions(title: str, paths: Mapping[str, str], last_s: float | None = None) -> Panel:
-    """Return rows of discrete values by label.
+    """Return a panel with one labeled row of discrete values per message path.
 
     Args:
         title: Title of the panel.
         paths: Message path of each row, by label.
-        last_s: Seconds before the current time to show; None shows all. Rows of the last seconds
-            are not synchronized with other panels: all plots would show these seconds only.
+        last_s: Number of seconds before the current time to show; None for all. A limited time axis
+            is not synchronized with other panels, because their range would also be limited.
     """
     rows = [_series(label, path) for label, path in paths.items()]
     if last_s is None:
@@ -109,13 +109,13 @@ def gauge(title: str, path: str, highest: float) -> Panel:
 
 
 def indicator(title: str, path: str, colors: Mapping[str, str], other: tuple[str, str]) -> Panel:
-    """Return a light with the color of a text.
+    """Return an indicator whose color depends on a string.
 
     Args:
         title: Title of the panel.
-        path: Message path of the text.
-        colors: Color of each text.
-        other: Color and label of any other text.
+        path: Message path of the string.
+        colors: Color for each value of the string.
+        other: Color and label for any other value.
     """
     rules = [
         {"operator": "=", "rawValue": text, "color": color, "label": text.replace("_", " ")}
@@ -126,7 +126,7 @@ def indicator(title: str, path: str, colors: Mapping[str, str], other: tuple[str
 
 
 def raw_messages(topic: str) -> Panel:
-    """Return the latest message of a topic as a tree."""
+    """Return a panel that shows the latest message of a topic as a tree."""
     options = {"diffEnabled": False, "diffMethod": "custom", "diffTopicPath": ""}
     return _titled(topic, topicPath=topic, showFullMessageForDiff=False, **options)
 
@@ -143,7 +143,7 @@ def log_lines(topic: str) -> Panel:
 
 
 def image(title: str, topic: str, **mode: Any) -> Panel:
-    """Return an image, with options of its colors."""
+    """Return an image panel; `mode` sets options such as the color map."""
     return _titled(
         title,
         cameraState={},
@@ -151,7 +151,7 @@ def image(title: str, topic: str, **mode: Any) -> Panel:
         imageMode={"imageTopic": topic, "synchronize": False, **mode},
         layers={},
         publish={},
-        # Viewers report transforms that are not preloaded.
+        # Without preloading, viewers report missing transforms.
         scene={"transforms": {"enablePreloading": True}},
         topics={},
         transforms={},

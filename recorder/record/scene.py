@@ -35,7 +35,7 @@ MARKER_TYPES = {
     "triangles": 11,
 }
 _ADD, _DELETE_ALL = 0, 3
-# Values are rounded to binary fractions. This halves their size in a log and is invisible.
+# Values are rounded to binary fractions. This halves their size in a log without visible changes.
 _POINTS_PER_M = 2**6
 _POSITIONS_PER_M = 2**8
 _ROTATIONS_PER_ONE = 2**12
@@ -126,7 +126,7 @@ class MotionSource(Protocol):
         """Return the moving frames at moments within the last step, in order of time.
 
         Each element consists of the seconds before the end of the step, more than 0, and the
-        frames at that moment. There are none after `reset`.
+        frames at that moment. The sequence is empty after `reset`.
         """
 
 
@@ -190,8 +190,8 @@ def camera_info(focal_px: tuple[float, float], shape: tuple[int, ...]) -> bytes:
 
     Args:
         focal_px: Focal lengths in pixel widths and pixel heights.
-        shape: Height and width of the image, pixels. The optical axis meets its middle; the middle
-            of the first pixel is at 0.
+        shape: Height and width of the image, pixels. The optical axis passes through the middle of
+            the image. Pixel coordinates are 0 in the middle of the first pixel.
     """
     height, width = shape[:2]
     matrix = np.array([[focal_px[0], 0, width / 2 - 0.5], [0, focal_px[1], height / 2 - 0.5]])
@@ -271,7 +271,7 @@ def _marker(
         ),
         scale=_vector(size),
         color=new("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=opacity),
-        # The marker moves with its frame between messages; static bodies are sent only once.
+        # With this flag, a marker moves with its frame, so static bodies are sent only once.
         frame_locked=True,
         points=[point(x=x, y=y, z=z) for x, y, z in _rounded_points(points)],
         text=text,
@@ -286,7 +286,7 @@ def _unstamped(frame: str) -> Any:
 
 @lru_cache(maxsize=1)
 def _unused_fields() -> dict[str, Any]:
-    """Return the fields that are equal in all markers; a lifetime of 0 has no end."""
+    """Return the fields that are equal in all markers. A lifetime of 0 means no expiration."""
     new, nothing = messages.new, np.empty(0, np.uint8)
     image = "sensor_msgs/msg/CompressedImage"
     return {

@@ -1,7 +1,7 @@
 """Series that the panels of a layout plot, as labels and message paths.
 
-A message path selects a number of each message: `/topic{field==value}.field[index]`. Each series is
-a scalar, because viewers join all elements of an array slice into one line. No series contains
+A message path, `/topic{field==value}.field[index]`, selects one number of each message. Array
+slices are not used, because viewers join all elements of a slice into one line. The paths exclude
 `final` records, which have neither an action nor a reward.
 """
 
@@ -18,7 +18,7 @@ STEPS = "/rl/step{final==false}"
 EPISODE_VARIABLE = "episode"
 """Variable of a layout with the number of the episode that the viewer's user chooses."""
 CHOSEN_REWARD = f"/rl/step{{episode==${EPISODE_VARIABLE}}}{{final==false}}.reward"
-# Numbers of similar size by title, and the ends of their names in telemetry.
+# Title of each group of similar numbers, and the suffixes of their telemetry names.
 _GROUPS = {
     "offsets": ("offset_m", "distance_m"),
     "speeds": ("_m_s",),
@@ -34,7 +34,7 @@ def telemetry_series(names: Sequence[str]) -> dict[str, str]:
 
 
 def telemetry_groups(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return the series of `/telemetry` by title; numbers of different sizes are separate.
+    """Group the series of `/telemetry` by title, so that numbers of similar size share a plot.
 
     >>> telemetry_groups(["offset_m", "x_m"])
     {'offsets': {'offset_m': '/telemetry.offset_m'}, 'positions': {'x_m': '/telemetry.x_m'}}
@@ -47,7 +47,7 @@ def telemetry_groups(names: Sequence[str]) -> dict[str, dict[str, str]]:
 
 
 def action_series(metadata: LogMetadata) -> dict[str, str]:
-    """Return one series per component of an action, or one per discrete action at its steps."""
+    """Return one series per component of an action, or one per value of a discrete action."""
     names = metadata.action_names()
     if names:
         taken = {

@@ -57,14 +57,14 @@ class EpisodeLog:
         max_file_bytes: int | None,
         start_time_ns: int | None,
     ) -> None:
-        """Create the file or open it to append; arguments are those of `RecordMcap`.
+        """Create the file or open it to append. For the arguments, see `RecordMcap`.
 
         Raises:
             UsageError: Timestamps would not increase, or `max_file_bytes` is too small.
-            SpaceError, OutputExistsError, LogError: As for `LogWriter`.
+            SpaceError, OutputExistsError, LogError: `LogWriter` raises this error.
         """
         self._description = description
-        # A relative path refers to this folder, even if the process changes its folder later.
+        # Relative paths refer to this folder, even if the working directory changes later.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
@@ -118,7 +118,7 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a seed must be from 0 to 2**64 - 2")
 
     def begin(self, display: Display) -> None:
-        """Begin the display messages of the next episode; start a new file if this one is full.
+        """Write the first display messages of the next episode, to a new file if this one is full.
 
         The layout is written with the first episode.
         """
@@ -153,7 +153,7 @@ class EpisodeLog:
         truncated: bool,
         reason: str,
     ) -> EpisodeSummary:
-        """Return the summary of the log's next episode, which ends now."""
+        """Return the summary of an episode as if it ended now; its number is the log's next one."""
         return EpisodeSummary(
             episode=self.episodes,
             length=episode.steps,
@@ -170,7 +170,7 @@ class EpisodeLog:
         )
 
     def advance(self, summary: EpisodeSummary) -> None:
-        """Count an episode after it is completely written.
+        """Update the episode count and the next start time; call this after writing an episode.
 
         Raises:
             LogError: The file was removed or replaced; the log is then closed.
@@ -209,12 +209,12 @@ class _Parts:
 
     @property
     def current(self) -> Path:
-        """The file that is written now."""
+        """Path of the current file."""
         name = f"{self._family.stem}-{self._number:05d}{self._family.suffix}"
         return self._family.with_name(name)
 
     def next(self) -> Path:
-        """Return the file after the current one."""
+        """Advance to the next file and return its path."""
         self._number += 1
         return self.current
 

@@ -1,9 +1,9 @@
 """Buffers that copy the values of an open episode at each step and write whole columns.
 
-A step only copies its values; times, counters, constants and the message layout are filled in when
-a chunk is written. Buffers have no row counter: their first value belongs to the first step that is
-not on disk. Only the recorder counts steps. It counts a step after all values of the step are
-stored; values of steps that are not counted are dropped.
+At each step, only values are copied. Times, counters, constants and the message layout are filled
+in when a chunk is written. Buffers have no row counter: their first value belongs to the first step
+that is not on disk. Only the recorder counts steps, after it has stored all values of a step. If an
+error interrupts a step, the step is not counted and its values are dropped.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Arrays:
         self._waiting = BytesIO()
 
     def append(self, value: NDArray[Any]) -> None:
-        """Store a copy of an array of this size."""
+        """Store a copy of an array that has the dtype and size of this buffer."""
         self._waiting.write(value.tobytes())
 
     def store(self, leaf: Leaf) -> Store:
@@ -64,7 +64,7 @@ class Arrays:
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Fill a column with the first values, which also stay in the buffer."""
+        """Copy the first values to a column; they also stay in the buffer."""
         if len(column):
             waiting = np.frombuffer(self._waiting.getbuffer(), self._dtype, column.size)
             column[:] = waiting.reshape(column.shape)
@@ -102,7 +102,7 @@ class Integers:
         return store_value
 
     def put(self, column: NDArray[Any]) -> None:
-        """Fill a column with the first values, which also stay in the buffer."""
+        """Copy the first values to a column; they also stay in the buffer."""
         column[:] = self._waiting[: len(column)]
 
     def drop(self, count: int | None = None) -> None:
@@ -133,7 +133,7 @@ class StepColumns:
         self.store_reward: Store = self._rewards.append
 
     def store_behavior_prob(self, prob: float) -> None:
-        """Store the latest action's probability, and NaN for earlier actions without one."""
+        """Store the probability of the latest action, and NaN for earlier actions without one."""
         unknown = len(self._rewards) - len(self._probs)
         if unknown:
             self._probs.extend([math.nan] * unknown)
@@ -218,7 +218,7 @@ class ImageColumn:
     def __init__(
         self, log: LogTopics, topic: str, shape: tuple[int, ...], encoding: str | None
     ) -> None:
-        """Announce the topic; see `LogTopics.image_rows`."""
+        """Add the topic to the log. For the arguments, see `LogTopics.image_rows`."""
         self._rows = log.image_rows(topic, shape, encoding)
         self._images = Arrays(np.dtype(np.uint8), self._rows.fields["data"].shape[-1])
         self._first_step = 0
@@ -238,7 +238,7 @@ class ImageColumn:
         return self._first_step + len(self._rows)
 
     def append(self, image: NDArray[Any]) -> None:
-        """Store the next step's image, of any dtype with the same number of bytes."""
+        """Store the image of the next step; any dtype is valid if the number of bytes is equal."""
         self._images.append(image)
 
     def flush(self, stop: int) -> None:
@@ -277,7 +277,7 @@ def converters(space: spaces.Space[Any]) -> list[Converter]:
 def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     """Convert a value to the dtype and shape that its space declares.
 
-    An array of floats that loses precision causes a warning; other values must convert exactly.
+    Arrays of another float type are converted with a warning; other values must convert exactly.
 
     Raises:
         SpaceError: The value has another shape, or does not convert exactly.
@@ -296,7 +296,7 @@ def as_declared(value: Any, leaf: Leaf) -> NDArray[Any]:
     if array.dtype == leaf.dtype:
         return cast
     if array.dtype.kind == leaf.dtype.kind == "f":
-        # Only arrays declare a dtype, so lists cause no warning.
+        # Lists have no dtype, so their conversion causes no warning.
         if array.ndim and isinstance(value, np.ndarray):
             warnings.warn(
                 f"{where} is {array.dtype}; converted to its space's {leaf.dtype}",

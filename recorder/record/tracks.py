@@ -14,14 +14,14 @@ _MAX_TRACKS = 32
 _MAX_POINTS = 64
 _RAISED_M = 0.2
 _MIN_WIDTH_M = 0.05
-# A track is visible in a view of the whole world, and a mark is larger than the track is wide.
+# Tracks are wide enough for a view of the whole world. Marks are wider than tracks.
 _WIDTHS_PER_WORLD, _WIDTHS_PER_MARK = 250, 5
 _LOW_RETURN, _HIGH_RETURN = np.array([0.30, 0.25, 0.80]), np.array([0.98, 0.85, 0.25])
 _FAILED: Quad = (0.90, 0.10, 0.10, 1.0)
 
 
 class TrackShape(NamedTuple):
-    """A track, or the mark of a failure at its end; attributes as in `scene.Shape`."""
+    """A track, or a mark at the end of a failed track. For the attributes, see `scene.Shape`."""
 
     name: str
     kind: str
@@ -96,7 +96,7 @@ class Tracks:
         return max(_MIN_WIDTH_M, world_m / _WIDTHS_PER_WORLD)
 
     def _color(self, total_reward: float) -> Quad:
-        # An infinite return, or NaN, has no place on the scale.
+        # Infinite returns and NaN have no color, so finite numbers replace them.
         returns = np.nan_to_num([total_reward, *(track.total_reward for track in self._tracks)])
         low, high = returns.min(), returns.max()
         share = returns[0] / (high - low) - low / (high - low) if high > low else 1.0

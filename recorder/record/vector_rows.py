@@ -13,8 +13,8 @@ import numpy as np
 from mcaprl.recorder.format.episode_summary import EpisodeSummary, add_up
 from mcaprl.recorder.format.rows import StepRows, TopicRows
 
-# Maximum initial capacity in steps, and in bytes of one environment's rows. The capacity doubles
-# when an episode needs more.
+# Limits of the initial capacity: steps, and bytes per environment. The capacity doubles when an
+# episode needs more.
 _FIRST_CAPACITY = 64
 _FIRST_BYTES = 2**20
 
@@ -72,5 +72,5 @@ class OpenSteps(OpenRows[StepRows]):
         self.write(environment, count, summary.start_time_ns, step_ns)
 
     def total_reward(self, environment: int, steps: int) -> float:
-        """Return the sum of an environment's first rewards, added in order."""
+        """Return the sum of an environment's first `steps` rewards, in the order of the steps."""
         return add_up(self._rows.fields["reward"][environment, :steps])

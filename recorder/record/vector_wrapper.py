@@ -1,10 +1,10 @@
-"""A Gymnasium wrapper that records a vector environment, one whole episode after the other.
+"""A Gymnasium wrapper that records a vector environment episode by episode.
 
 The rows of an open episode stay in memory. When the episode ends, they are appended to the file.
 The file has the same form as a recording of a single environment, and simulated time increases from
 episode to episode. If the process is killed, the open episode of each environment is lost.
 
-No scene is recorded: replay the seeds and actions in a single environment to get it.
+No scene is recorded. To get a scene, replay the seeds and actions in a single environment.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._action_leaf = action_leaf(self.action_space)
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Whether each environment has an open episode, and the number of transitions in it.
+        # Number of transitions in each open episode, and whether each environment has one.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # Whether each environment resets itself in the next step.
@@ -132,11 +132,11 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
 
     @property
     def episodes(self) -> int:
-        """Number of finished episodes in the log, including those it had before appending."""
+        """Number of finished episodes in the log, including those from before appending."""
         return self._recording.episodes
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Reset all environments, or those of `options["reset_mask"]`, and begin their episodes.
+        """Reset all environments, or those that `options["reset_mask"]` selects; begin episodes.
 
         Args:
             seed: Seed of the first environment (environment k uses seed + k), or a list of seeds.
@@ -171,8 +171,8 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             ResetNeeded: An environment has no open episode.
             UsageError: One of `behavior_probs` is not in (0, 1]; the environments are not stepped.
             SpaceError: The actions do not fit their space (the environments are not stepped), or an
-                observation does not. An error in an environment or in its results ends all
-                episodes, which are recorded up to the previous transition.
+                observation does not fit its space. An error in an environment or in its results
+                ends all episodes, which are recorded up to the previous transition.
         """
         if not (self._running | self._due).all():
             idle = np.flatnonzero(~(self._running | self._due)).tolist()
@@ -188,7 +188,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             if self._infos:
                 self._add_infos(infos, ended)
             if ended.any() or self._due.any() or self._steps.max() + 1 >= self._full_at:
-                # No signal may interrupt the writes or separate them from the step counters.
+                # A signal must not interrupt the writes and the update of the step counters.
                 with HoldSignals():
                     self._make_room()
                     self._observe(values)
@@ -199,7 +199,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             else:
                 self._observe(values)
         except BaseException:
-            # The environments may be a step ahead of the log, so no episode can continue.
+            # The log may lack the last step of the environments, so no episode can continue.
             self._interrupt(self._every)
             raise
         return observations, rewards, terminated, truncated, infos
@@ -263,7 +263,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         infos: dict[str, Any],
         episode: OpenEpisode,
     ) -> None:
-        """Begin an episode of one environment with its observation."""
+        """Begin an episode of one environment with its first observation."""
         if self._infos:
             self._infos[number].begin(info_of(infos, number))
         self._put(number, 0, [value[number] for value in values])
@@ -315,7 +315,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         """Append an ended episode to the log."""
         recording, episode = self._recording, self._open[number]
         steps = episode.steps = int(self._steps[number])
-        # Set first, so that an error does not cause a second write of this episode.
+        # Set this before writing, so that an error does not cause a second write of the episode.
         self._running[number], self._steps[number] = False, 0
         summary = recording.summary(
             episode,
@@ -356,6 +356,6 @@ def _autoreset_mode(env: gym.vector.VectorEnv[Any, Any, Any]) -> AutoresetMode:
 
 
 def _of_env(infos: dict[str, Any], key: str, number: int) -> Any:
-    """Return `infos[key]` of one environment; None if it is missing."""
+    """Return the value of `infos[key]` for one environment; None if the key is missing."""
     found = infos.get(key)
     return found[number] if isinstance(found, np.ndarray | list | tuple) else None

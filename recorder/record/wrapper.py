@@ -1,6 +1,6 @@
 """A Gymnasium wrapper that records an environment while it runs.
 
-Row k of `/rl/step` contains observation k, the action taken in it and the resulting reward. The
+Row k of `/rl/step` contains observation k, the action that follows it and the resulting reward. The
 `final` row, after an episode's last transition, contains the last observation. Each step stores
 only the values that change; times, counters and constants are filled in as whole columns when a
 chunk is written. Values are copied, so the environment may reuse its buffers.
@@ -77,17 +77,17 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             seed: Seed to store in the log's metadata.
             compression: Compression of chunks: `zstd`, `lz4` or `none`.
             overwrite: Whether to replace an existing file.
-            append: Whether to append episodes to an existing file, which must have been recorded
-                from an environment of the same id, arguments and spaces.
-            max_file_bytes: File size after which the next episode begins a new file. `lane.mcap`
-                becomes `lane-00000.mcap`, `lane-00001.mcap` and so on, each a log of whole
-                episodes; `mcaprl.open` reads their folder as one dataset.
+            append: Whether to append episodes to an existing file. The file must be a recording of
+                an environment with the same id, arguments and spaces.
+            max_file_bytes: File size from which the next episode begins a new file. `lane.mcap`
+                becomes `lane-00000.mcap`, `lane-00001.mcap` and so on. Each file contains whole
+                episodes; `mcaprl.open` reads the folder of the files as one dataset.
             scene: Whether to record shapes, frames and telemetry for viewers, if the environment
                 provides them.
             camera: Whether to record the environment's metric depth image.
-            infos: Whether to record the infos that the environment returns, or the names of those
-                to record; `episode` includes `episode.r`. A value that is no number, flag, text or
-                array is not recorded, with a warning.
+            infos: Whether to record the infos that the environment returns, or the names of the
+                infos to record; `episode` includes `episode.r`. Values other than numbers, flags,
+                strings and arrays are not recorded and cause a warning.
             step_duration_s: Simulated seconds between two observations; default: the environment's
                 `step_duration_s`, else 1 / `render_fps`, else 0.1.
             start_time_ns: log_time of the first message, since the Unix epoch; default: now.
@@ -136,7 +136,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def episodes(self) -> int:
-        """Number of finished episodes in the log, including those it had before appending."""
+        """Number of finished episodes in the log, including those from before appending."""
         return self._recording.episodes
 
     def reset(
@@ -164,15 +164,15 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             ResetNeeded: No episode is open.
             UsageError: `behavior_prob` is not in (0, 1]; the environment is not stepped.
             SpaceError: The action does not fit its space (the environment is not stepped), or the
-                observation does not. An error in the environment or in its results ends the
-                episode, which is recorded up to the previous transition.
+                observation does not fit its space. An error in the environment or in its results
+                ends the episode, which is recorded up to the previous transition.
         """
         episode = self._open
         if episode is None:
             raise gym.error.ResetNeeded("call reset() before step(): no episode is open")
         step = episode.steps + 1
         probability = self.behavior_prob
-        # This comparison is faster than a call, so the function is called only if it fails.
+        # The comparison is faster than a call, so the function is called only for invalid values.
         if probability is not _UNKNOWN and not SMALLEST <= probability <= 1.0:
             check_probability(probability, "behavior_prob")
         try:
@@ -201,7 +201,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
                 number = reward_number(reward)
                 self._store_reward(number)
             if terminated or truncated or step >= self._full_at:
-                # No signal may interrupt the writes or separate them from the step counter.
+                # A signal must not interrupt the writes and the update of the step counter.
                 with HoldSignals():
                     self._make_room(step)
                     self._count(episode, step, float(number))
@@ -213,7 +213,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
             else:
                 episode.steps = step
         except BaseException:
-            # The environment may be a step ahead of the log, so the episode cannot continue.
+            # The log may lack the last step of the environment, so the episode cannot continue.
             self._interrupt()
             raise
         return observation, reward, terminated, truncated, info
@@ -269,7 +269,7 @@ class RecordMcap(gym.Wrapper[Any, Any, Any, Any]):
     def _end(self, terminated: bool, truncated: bool, reason: str) -> None:
         episode = self._open
         assert episode is not None
-        # Set first, so that an error does not cause a second write of this episode.
+        # Set this before writing, so that an error does not cause a second write of the episode.
         self._open = None
         summary = self._recording.summary(
             episode,

@@ -69,7 +69,7 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
 
     Args:
         reader: Reader of the file.
-        found: Problems of the file so far, to which others are added.
+        found: Problems found so far; this function adds further problems.
         threads: Number of threads that decompress chunks.
 
     Raises:
@@ -80,7 +80,7 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
         try:
             log = EpisodeCheck(reader)
         except (LogError, SpaceError) as error:
-            # The chunks of a file that is not a log are checked as well.
+            # Raise the error later, because the chunks of any MCAP file are checked.
             refusal = error
     for chunk, read in _decompressed(reader, threads):
         try:
@@ -101,7 +101,7 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
 def _decompressed(
     reader: McapReader, threads: int
 ) -> Iterator[tuple[ChunkIndex, Callable[[], memoryview]]]:
-    """Yield chunks with functions that return their records, valid until the next chunk."""
+    """Yield each chunk and a function that returns its records, valid until the next chunk."""
     if threads == 1:
         scratch = Scratch()
         for chunk in reader.chunks:
@@ -110,7 +110,7 @@ def _decompressed(
     chunks = iter(reader.chunks)
     with ThreadPoolExecutor(threads) as pool:
         ahead = deque[tuple[ChunkIndex, Future[memoryview]]]()
-        # One buffer per thread and one for the caller, so that memory use is bounded.
+        # The buffers limit memory use: one for each thread, and one for the caller.
         scratches = cycle([Scratch() for _ in range(threads + 1)])
         while True:
             for chunk in islice(chunks, threads + 1 - len(ahead)):

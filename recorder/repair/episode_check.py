@@ -38,14 +38,14 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("action", "reward", "terminated", "truncated", *COUNTERS)
 IMPOSSIBLE_ACTION = "leave the episode out of training"
-"""Next step for an action outside its space, which is no damage of the file."""
+"""Advice for an action outside its space, which does not mean that the file is damaged."""
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
 # A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 
 class EpisodeCheck:
-    """Check of a log that collects values chunk by chunk and validates the episodes at the end."""
+    """Checker of a log, which collects values of each chunk and finally validates the episodes."""
 
     def __init__(self, reader: McapReader) -> None:
         """Find the topics.
@@ -56,7 +56,7 @@ class EpisodeCheck:
         self._reader = reader
         self._steps = Topic(reader, STEP_TOPIC)
         if not reader.channels_of(STEP_TOPIC):
-            raise NoStepsError(f"no topic {STEP_TOPIC}, hence no transitions")
+            raise NoStepsError(f"no transitions, because there is no topic {STEP_TOPIC}")
         if not len(self._steps):
             raise NoEpisodesError("no finished episode")
         self._metadata = described(reader)
@@ -67,7 +67,7 @@ class EpisodeCheck:
             )
             if leaf.encoding is not None
         ]
-        # Logs of other writers are validated by `LogReader`.
+        # `LogReader` validates logs that were written by other software.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
         self._problems = Shortlist[Problem]()
@@ -124,7 +124,7 @@ class EpisodeCheck:
                 )
 
     def _schema_fits(self) -> bool:
-        """Return whether `/rl/step` has one channel, and the schema of the metadata's spaces."""
+        """Return whether `/rl/step` has one channel, whose schema matches the metadata's spaces."""
         channels = self._reader.channels_of(STEP_TOPIC)
         assert self._metadata is not None
         spaces = (self._metadata.observation_space, self._metadata.action_space)
@@ -137,7 +137,7 @@ class EpisodeCheck:
         return fits and len(channels) == 1
 
     def _prepare(self) -> None:
-        """Set the destination of each message range, by chunk."""
+        """Map each chunk to its message ranges and the rows that they fill."""
         start = 0
         for decoder, messages in self._steps.parts:
             stop = start + len(messages)
@@ -205,7 +205,8 @@ def _check_summary(
     for name, claim, fact in pairs:
         if claim != fact and not math.isnan(fact):
             yield Problem(
-                f"{EPISODE_TOPIC} has {name} {claim}, the records {fact}", f"episode {number}"
+                f"{EPISODE_TOPIC} has {name} {claim}, but the records have {fact}",
+                f"episode {number}",
             )
 
 
@@ -213,7 +214,7 @@ def _check_return(episode: Episode) -> Iterator[Problem]:
     total = add_up(episode.rewards)
     if total != episode.total_reward and not np.isnan(total):
         yield Problem(
-            f"{EPISODE_TOPIC} has return {episode.total_reward}, the records {total}",
+            f"{EPISODE_TOPIC} has return {episode.total_reward}, but the records have {total}",
             f"episode {episode.index}",
         )
 

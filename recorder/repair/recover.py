@@ -47,7 +47,7 @@ class Recovery:
         messages: Number of messages in the new file.
         episodes: Number of episodes in the new file; 0 if it has no `/rl/step`.
         damages: Byte ranges that could not be read.
-        dropped: Episodes that are not in the new file, if any of their records were read.
+        dropped: Episodes of the old file that are not in the new file.
         ended: Number of unfinished episodes that were kept up to their last whole transition.
         strays: Number of messages on `/rl/` topics that do not belong to a kept episode.
     """
@@ -66,7 +66,7 @@ class Recovery:
         return bool(self.damages or self.dropped or self.ended or self.strays)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what `recover --json` prints."""
+        """Return the JSON object that `recover --json` prints."""
         return {
             "ok": not self.has_losses,
             **{name: value for name, value in vars(self).items() if name not in _LISTS},
@@ -76,7 +76,7 @@ class Recovery:
 
     @property
     def problems(self) -> list[Problem]:
-        """Losses of messages, in the order of the attributes."""
+        """Lost messages: `damages`, then `dropped`, then `strays`."""
         found = [(one.what, f"byte {one.offset}, {one.bytes} bytes", "") for one in self.damages]
         found += [
             (f"episode {one.number}", f"{one.records} of its records were read", one.why)
@@ -103,12 +103,13 @@ def recover_log(
     Args:
         source: MCAP file, damaged or not; not changed.
         target: Path of the new file.
-        keep_unfinished: Whether to keep episodes without an end up to their last whole transition,
-            marked as truncated. By default they are dropped.
+        keep_unfinished: Whether to keep the whole transitions of episodes without an end, and mark
+            these episodes as truncated. By default, these episodes are dropped.
         overwrite: Whether to replace an existing file.
 
     Raises:
-        OutputExistsError, UsageError: The target exists, or is the source.
+        OutputExistsError: The target exists and `overwrite` is not set.
+        UsageError: The target is the source.
         LogError: Nothing can be kept, or the target cannot be written.
     """
     source, target = as_path(source, whole=True), Path(target)
@@ -166,7 +167,7 @@ def _is_complete(source: str) -> bool:
 def _restore_metadata(
     damages: Shortlist[Damage], metadata: list[Metadata], channels: Iterable[Channel]
 ) -> list[Metadata]:
-    """Replace the metadata record with its copy in the channel of `/rl/step`, if it exists."""
+    """Replace the metadata record with the copy in the channel of `/rl/step`, if there is one."""
     for channel in channels:
         if channel.topic == STEP_TOPIC and "format_version" in channel.metadata:
             records = [record for record in metadata if record.name == METADATA_NAME]
@@ -183,7 +184,7 @@ def _count_messages(reader: McapReader) -> int:
 
 
 def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
-    """Add the episodes of a plan to the result.
+    """Add the episode counts and losses of a plan to the result.
 
     Raises:
         NoEpisodesError: No episode can be kept.

@@ -1,8 +1,9 @@
 """Copy of a log without incomplete episodes.
 
 A run is a gapless series of records of `/rl/step`. A whole episode is a run from step 0 to a final
-record. A run from step 0 without a final record, from an unfinished episode or one that lost its
-end, can be kept with its last record as the end. Other runs have lost their beginning.
+record. If an episode is unfinished or its end is lost, its run begins at step 0 but has no final
+record. Such a run can be kept: its last record becomes the final record. All other runs have no
+beginning and are dropped.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from mcaprl.recorder.format.writing import DROP, KEEP, copy_messages
 _FIELDS = ("reward", "episode", "step", "terminated", "truncated", "final")
 # Prefix of topics whose messages belong to episodes; other topics are copied unchanged.
 _EPISODE_TOPICS = "/rl/"
-# More missing episodes in a row are taken for another recording.
+# A larger gap in the episode numbers is regarded as the start of another recording.
 _MAX_GAP = 10**6
 
 Place = tuple[int, int]
@@ -74,7 +75,7 @@ class DroppedEpisode:
     @property
     def what(self) -> str:
         """Description of the loss."""
-        return f"episode {self.number}: {self.why}{', it can be ended' if self.can_end else ''}"
+        return f"episode {self.number}: {self.why}{', but it can be kept' if self.can_end else ''}"
 
 
 @dataclass
@@ -82,7 +83,7 @@ class EpisodePlan:
     """Selection of the records to keep.
 
     Attributes:
-        actions: `RowAction` of each record of `/rl/step`, by place, in file order.
+        actions: `RowAction` of each record of `/rl/step` in file order, by `Place`.
         spans: (E, 2) first and last log_time of the kept episodes, increasing.
         dropped: Episodes that are not kept.
         ended: Number of kept episodes whose end is missing.
@@ -118,7 +119,7 @@ def plan_episodes(reader: McapReader, *, keep_unfinished: bool) -> EpisodePlan |
         keep_unfinished: Whether to keep episodes without an end if they have a whole transition.
 
     Returns:
-        None if the file is not a log, that is, has no `/rl/step` with the required fields.
+        Plan; None if the file is not a log because `/rl/step` or its required fields are missing.
 
     Raises:
         LogError: The file is a log according to its metadata, but lacks required fields.
@@ -188,8 +189,8 @@ class _Run:
 
     Attributes:
         start: Row of the first record.
-        last: Row of the last record before the first one that lacks an image.
-        records: Number of records, including those that lack images.
+        last: Row of the last record, not counting any records from the first missing image on.
+        records: Number of records, including records without their images.
         begins: Whether the run begins with step 0.
         is_whole: Whether the run is a whole episode.
     """
@@ -274,7 +275,7 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
 
 
 def _listed_episodes(reader: McapReader) -> dict[int, int]:
-    """Return the numbers of the episodes on `/rl/episode` by their last log_times."""
+    """Return the episode numbers on `/rl/episode`; the key is the log_time of the last record."""
     topic, names = Topic(reader, EPISODE_TOPIC), ("end_time_ns", "episode")
     if not set(names) <= set(topic.fields):
         return {}
@@ -283,7 +284,7 @@ def _listed_episodes(reader: McapReader) -> dict[int, int]:
 
 
 def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
-    """Yield the episodes without any record: listed ones, and those between others."""
+    """Yield episodes without records: those in `listed`, and gaps in the episode numbers."""
     known = np.unique(columns["episode"]).astype(np.int64)
     gaps = np.diff(known)
     between = [

@@ -1,4 +1,4 @@
-"""Annotation of a copy of a log with topics that contain the outputs of policies, or the scene.
+"""Copies of logs with additional topics for the outputs of policies, or for the scene.
 
 The copy contains all messages of the log, then the new messages, and a layout that shows the new
 topics. Each new message has the log_time of its step.
@@ -58,7 +58,7 @@ class AnnotatedCopy:
     """A copy of a log to which topics are added."""
 
     def __init__(self, log: LogWriter, source: McapReader) -> None:
-        """Add to `log`, which contains all records of `source`."""
+        """Prepare to add topics to `log`, which is a copy of `source`."""
         self._log, self._source = log, source
         self._topics = {channel.topic for channel in source.channels.values()}
         self._display: Display | None = None
@@ -68,7 +68,7 @@ class AnnotatedCopy:
 
         Args:
             topic: Topic to write; see `values_topics`.
-            episodes: Episodes, each with a dict of the columns (T, ...) by field name.
+            episodes: Pairs of an episode and its columns (T, ...) by field name.
 
         Raises:
             UsageError: The log already has the topic.

@@ -23,7 +23,7 @@ class ViewerServer:
     """
 
     def __init__(self) -> None:
-        """Create a server without channels; `start` opens the port.
+        """Create a server without channels, which does not listen before `start`.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -118,5 +118,5 @@ class ViewerServer:
 
 
 def _hidden_host() -> str:
-    """Return a random loopback address, so that no web page finds a way around the filter."""
+    """Return a random loopback address, so that web pages cannot bypass the origin filter."""
     return "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))

@@ -1,4 +1,4 @@
-"""Messages of a running environment, sent to viewers at their times."""
+"""Messages of a running environment, each sent to viewers at its log_time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ _PERIOD_S = 1 / 30
 
 
 class LiveSink(MessageSink):
-    """A sink whose thread sends each message to viewers at its log_time, in the order of writing.
+    """A sink with a thread that sends messages to viewers at their log_times, in write order.
 
     The latest messages of the topics in `kept` are also sent to each new viewer.
     """
 
     def __init__(self, viewers: ViewerServer, kept: Sequence[str]) -> None:
-        """Create a sink without channels; `start` begins to send."""
+        """Create a sink without channels.
+
+        Args:
+            viewers: Server of the viewers.
+            kept: Topics whose latest message is also sent to each new viewer.
+        """
         self._viewers, self._kept = viewers, kept
         self._channels: list[Any] = []
         self._kept_ids: set[int] = set()
@@ -38,7 +43,7 @@ class LiveSink(MessageSink):
         self._thread.start()
 
     def close(self) -> None:
-        """Send what is due, and drop the rest."""
+        """Stop the thread, send the messages that are due, and drop all later messages."""
         if self._thread.is_alive():
             self._stop.set()
             self._thread.join()
@@ -49,11 +54,11 @@ class LiveSink(MessageSink):
         return any(channel.has_sinks() for channel in self._channels)
 
     def welcome(self) -> None:
-        """Send the kept messages to all viewers, because a new viewer needs them."""
+        """Send the latest messages of the kept topics to all viewers, including a new viewer."""
         self._has_newcomers = True
 
     def send(self, channel_id: int, time_ns: int, data: bytes) -> None:
-        """Send a message now, before all that are waiting."""
+        """Send a message now, before all messages in the queue."""
         self._channels[channel_id].log(data, log_time=time_ns)
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
@@ -62,7 +67,7 @@ class LiveSink(MessageSink):
     def add_channel(
         self, topic: str, schema_name: str, schema_text: str, metadata: dict[str, str] | None = None
     ) -> int:
-        """Announce a topic and return its channel id."""
+        """Advertise a topic and return its channel id."""
         self._channels.append(self._viewers.add_channel(topic, schema_name, schema_text.encode()))
         channel_id = len(self._channels) - 1
         if topic in self._kept:
@@ -70,7 +75,7 @@ class LiveSink(MessageSink):
         return channel_id
 
     def write_rows(self, rows: NDArray[Any]) -> None:
-        """Send message records of one channel at their times."""
+        """Queue message records of one channel, to be sent at their log_times."""
         self.write_messages(
             [
                 (int(row["channel_id"]), int(row["log_time"]), row["payload"].tobytes())
@@ -79,7 +84,7 @@ class LiveSink(MessageSink):
         )
 
     def write_messages(self, messages: Sequence[Message]) -> None:
-        """Send messages at their times."""
+        """Queue messages, to be sent at their log_times."""
         with self._lock:
             self._waiting.extend(messages)
 

@@ -1,4 +1,4 @@
-"""Live stream of a running environment to viewers: one episode after the other, slowed down.
+"""Live stream of a running environment to viewers: single episodes at a lower speed.
 
 Viewers receive the topics of a log (see `log_writer` and `display`) and one more:
 
@@ -59,13 +59,13 @@ from mcaprl.recorder.viewer.live_sink import LiveSink
 
 DEFAULT_SPEED = 2.0
 MAX_STEPS = 2_000
-"""Number of steps of an episode that are shown; messages take about 20 kB per step in memory."""
+"""Maximum number of steps shown per episode; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
 _KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
-# Viewers draw no motion within a step shorter than this.
+# If a step is shorter than this, the poses within the step are not sent.
 _SHORTEST_MOTION_NS = 10_000_000
 _ROW = slice(1)
-"""The only row that is reserved for each topic."""
+"""Slice that selects the one row reserved for each topic of fixed-size messages."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ class LiveStep:
 
 @dataclass
 class Pace:
-    """A limit on the time that is spent on frames.
+    """A limit on the time for frames, that is, for sending data to viewers.
 
     Attributes:
-        share: Largest share of the run time that is spent on frames.
+        share: Maximum fraction of the run time that is spent on frames.
         period_s: Shortest time between two frames.
         clock: Function that returns the time in seconds.
     """
@@ -137,7 +137,7 @@ class Pace:
 
 
 class LiveStream(ViewerServer):
-    """Episodes of one environment, and metrics of its learner.
+    """Server that streams episodes of one environment, and metrics of its learner.
 
     For an episode, call `begin_episode`, then `look`, `pause`, `env.step` and `show` for each step,
     and then `end_episode`.
@@ -155,7 +155,7 @@ class LiveStream(ViewerServer):
         speed: float = DEFAULT_SPEED,
         pace: Pace | None = None,
     ) -> None:
-        """Announce the topics and listen.
+        """Advertise the topics and start the server.
 
         Args:
             metadata: Metadata of the environment.
@@ -166,8 +166,8 @@ class LiveStream(ViewerServer):
             port: Port on 127.0.0.1; 0 selects a free port.
             origins: Additional origins of web pages that may connect.
             speed: Simulated seconds per second.
-            pace: Limit on the time spent on episodes and metrics; its `period_s` is the shortest
-                time between two scenes, depth images, or messages of metrics.
+            pace: Limit on the time spent on episodes and metrics. `pace.period_s` is the minimum
+                time between two scenes, two depth images, or two messages with metrics.
 
         Raises:
             MissingExtraError: foxglove-sdk is not installed.
@@ -182,7 +182,7 @@ class LiveStream(ViewerServer):
         self._log = log = LogTopics(metadata, self._sink)
         self._training = dict(training)
         self._shown = ShownTopics(log, source)
-        # The first message of an episode announces the topics of the log lines.
+        # This call adds the channels of the log lines; the returned messages are not sent.
         self._line_channel = log.begin_messages(0, "", 0)[0][0]
         self._topics = dict(self._shown.channels)
         type_name, text = telemetry_schema(tuple(training))
@@ -203,7 +203,8 @@ class LiveStream(ViewerServer):
         }
         self._static_shapes: Sequence[Any] | None = None
         self._tracks = Tracks()
-        # Frames at the latest step, which are sent with the motion after it.
+        # Coordinate frames of the latest step. They are sent at the next step, because one message
+        # contains all poses from a step until the next.
         self._moment: Moment | None = None
         self._start_ns = self._time_ns = self._next_ns = self._frame_ns = 0
         self._steps_shown = 0
@@ -215,7 +216,7 @@ class LiveStream(ViewerServer):
     def begin_episode(self, episode: int, policy: str) -> bool:
         """Return whether to show the episode that begins now.
 
-        It is shown if a viewer subscribes, the previous one was sent completely, and `pace` allows.
+        Conditions: a viewer subscribes, the last shown episode is sent, and `pace` allows a frame.
         """
         now_ns = time.time_ns()
         if now_ns < self._next_ns or not self._pace.due() or not self._sink.has_viewers():
@@ -228,10 +229,10 @@ class LiveStream(ViewerServer):
         return True
 
     def look(self, source: object, return_so_far: float) -> bool:
-        """Start the timer of the stream, and send the display messages before a step.
+        """Start the timer of the frame, and send the display messages before a step.
 
         Returns:
-            Whether shapes and images were sent; then the learner's values are also due.
+            Whether shapes and depth images were sent. If so, set `values` of the next `LiveStep`.
         """
         self._pace.begin()
         self._time_ns = time_ns = max(time.time_ns(), self._next_ns)
@@ -249,11 +250,11 @@ class LiveStream(ViewerServer):
         return is_shown
 
     def pause(self) -> None:
-        """Stop the timer of the stream while the environment is stepped."""
+        """Stop the timer of the frame while the environment is stepped."""
         self._pace.pause()
 
     def show(self, step: LiveStep) -> bool:
-        """Send the step that followed `look`; return whether to show the next one as well."""
+        """Send the step that followed `look`, and return whether to show the next step, too."""
         self._pace.begin()
         self._send_step(step)
         if self._values is not None and step.values:
@@ -270,7 +271,7 @@ class LiveStream(ViewerServer):
         return goes_on
 
     def end_episode(self, summary: EpisodeSummary) -> None:
-        """Send the end of the shown episode; its times are replaced by those of the stream."""
+        """Send the end of the shown episode. Stream times replace the times in `summary`."""
         self._pace.begin()
         summary = summary._replace(start_time_ns=self._start_ns, end_time_ns=self._next_ns)
         self._send_motion([])
@@ -292,7 +293,7 @@ class LiveStream(ViewerServer):
         return True
 
     def show_metrics(self, metrics: Mapping[str, float]) -> None:
-        """Send metrics of the learner now, by name; missing ones are NaN."""
+        """Send the learner's metrics now. NaN replaces missing metrics."""
         data = telemetry_message([metrics.get(name, math.nan) for name in self._training])
         self._sink.send(self._topics[TRAINING_TOPIC], time.time_ns(), data)
         self._pace.pause()
@@ -333,7 +334,7 @@ class LiveStream(ViewerServer):
             self._emit(SCENE, time_ns, marker_array(source.scene()))
 
     def _send_motion(self, moments: Sequence[Moment]) -> None:
-        """Send the frames at the previous step, and their motion until this one."""
+        """Send the poses of the frames from the previous step to the current one."""
         if self._moment is not None:
             self._emit(
                 TF, self._moment[0], motion_transforms([self._moment, *moments], thins=False)
@@ -352,7 +353,7 @@ class LiveStream(ViewerServer):
         self._sink.write_messages([(self._topics[topic], time_ns, data)])
 
     def _send_step(self, step: LiveStep) -> None:
-        """Send the transition in the messages of a log."""
+        """Send the transition as messages on the same topics as in a log."""
         columns = {name: getattr(step, name) for name in ("reward", "behavior_prob")}
         columns["action"] = as_declared(step.action, self._log.action)
         for leaf in observation_leaves(self._log.metadata.observation_space):

@@ -22,7 +22,7 @@ def layout_of_log(
     Args:
         reader: Reader of the log.
         topics: Topics to show; default: all topics of the log.
-        shown: Source of telemetry names and the frame to follow; default: the log.
+        shown: Telemetry names and the frame to follow; default: read them from the log.
 
     Raises:
         LogError: The file has no transitions, or is damaged.

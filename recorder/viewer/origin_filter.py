@@ -1,4 +1,4 @@
-"""A proxy in front of the Foxglove server that only lets trusted web pages connect.
+"""A proxy for the Foxglove server, which rejects connections from untrusted web pages.
 
 Any web page can open a WebSocket to a local port. The browser sends the page's origin in the header
 `Origin`, which a server must check. foxglove-sdk does not check it. This proxy checks the head of
@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 VIEWER_ORIGINS = (
     "https://app.foxglove.dev",
     "https://lichtblick-suite.github.io",
-    # Desktop applications.
+    # Origin of desktop applications.
     "file://",
 )
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -42,7 +42,7 @@ def is_allowed(head: bytes, origins: Collection[str]) -> bool:
     for line in lines:
         name, colon, value = line.partition(":")
         name = name.lower()
-        # A name with spaces is a folded header line, which servers parse in different ways.
+        # A header name with outer spaces may be a folded line, which servers parse differently.
         if not colon or name != name.strip() or (name in headers and name in ("host", "origin")):
             return False
         headers[name] = value.strip()
@@ -71,7 +71,7 @@ class OriginFilter:
     """A listener that forwards allowed connections to a server, in a separate thread.
 
     Attributes:
-        port: Port to connect to.
+        port: Port on which the listener accepts connections.
     """
 
     def __init__(self, listener: socket.socket, server: tuple[str, int], origins: Collection[str]):

@@ -1,4 +1,4 @@
-"""Playback of logs by a clock with pause, speed and seek.
+"""Playback of logs with a clock that supports pause, speed and seek.
 
 The indexes of the memory-mapped file locate messages, which are read on demand. Only a few
 decompressed chunks are cached, so memory use does not grow with the log.
@@ -84,7 +84,7 @@ class Track:
             yield place.time_ns, place.channel, self._message(place)
 
     def latest(self, time_ns: int) -> _Messages:
-        """Yield the latest message of each topic up to a time; a viewer shows these messages.
+        """Yield the latest message of each topic up to a time: what a viewer shows at that time.
 
         Messages before `start_ns` are included.
         """
@@ -105,7 +105,7 @@ class Track:
 
 
 class _Place(NamedTuple):
-    """Position of a message; `chunk_start` is -1 for a message outside of chunks."""
+    """Location of a message in the file; if the message is in no chunk, `chunk_start` is -1."""
 
     time_ns: int
     channel: Channel
@@ -146,7 +146,7 @@ class _TopicIndex:
 
 
 def _rows_before(part: MessageRange, time_ns: int) -> int:
-    # NumPy would convert uint64 times to floats to compare them with a signed integer.
+    # Use uint64, because NumPy compares uint64 times with signed integers as inexact floats.
     return int(np.searchsorted(part.index["log_time"], np.uint64(max(time_ns, 0))))
 
 
@@ -159,7 +159,7 @@ def _by_time(part: MessageRange) -> MessageRange:
 
 @dataclass
 class Player:
-    """Playback clock of one or more logs, which are shifted to the start time of the first log.
+    """Playback clock of one or more logs, shifted in time to start at the first log's start time.
 
     Attributes:
         tracks: Logs to play.
@@ -188,7 +188,7 @@ class Player:
         return self.time_ns >= self.end_ns
 
     def seek(self, time_ns: int) -> None:
-        """Set the clock, limited to the time range of the logs."""
+        """Set the clock to a time; the time is clipped to the range of the logs."""
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next_ns = self.time_ns + 1
 
@@ -208,7 +208,7 @@ class Player:
         return sorted(due, key=lambda message: message.time_ns)
 
     def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
-        """Call `found` on each log, and return its messages with times on the player's clock."""
+        """Return the messages that `found` yields for each log, timed on the player's clock."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

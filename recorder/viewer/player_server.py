@@ -1,7 +1,7 @@
 """A live server that plays logs to Foxglove, with play, pause, speed and seek.
 
 Messages are sent as they are stored in the file. If several logs are played at once, a prefix for
-each log is added to the frame names in its messages, so that the frames of two cars differ.
+each log is added to the frame names in its messages, because the names must differ between logs.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from mcaprl.recorder.viewer.playback import Played, Player
 from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 
 _PERIOD_S = 1 / 30
-# Range of speeds that a viewer may request; others are ignored.
+# Range of speeds that a viewer may request; requests for other speeds are ignored.
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
-# Viewers drop all messages when the time goes back, so the time has to arrive before the messages.
-# The server has separate queues for times and messages, so the messages wait for this many ticks.
+# Viewers drop all messages when the time goes back, so the new time must arrive first. The server
+# has separate queues for times and messages, so messages are sent this many ticks after a seek.
 _TICKS_AFTER_SEEK = 2
-# Topics whose messages are events; a viewer that receives one twice shows it twice.
+# Topics whose messages are events. A viewer that receives an event twice shows the event twice.
 _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
 
 
@@ -65,12 +65,12 @@ class LiveServer(ViewerServer):
         self._lock = threading.Lock()
         self._looked_at = self._seeked = False
         self._ticks_to_latest = 0
-        # Number of subscribers by channel, and the channels with a new one.
+        # Number of subscribers by channel, and the channels with a new subscriber.
         self._subscribers: Counter[int] = Counter()
         self._joined: set[int] = set()
-        # Viewers have all events up to this time.
+        # All events up to this time have been sent.
         self._sent_ns = -1
-        # The first response includes the messages at the start.
+        # After this seek, the first tick sends the messages at the start time, too.
         player.seek(player.start_ns)
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)
@@ -90,7 +90,7 @@ class LiveServer(ViewerServer):
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the messages that are due; first send the current ones to viewers without them."""
+        """Send the current messages that viewers lack, then the messages that are due."""
         # The lock is held until all messages are sent. Otherwise a message from before a seek could
         # arrive after the response to the seek.
         with self._lock:
@@ -126,7 +126,7 @@ class LiveServer(ViewerServer):
             return self._state(did_seek=seek_ns is not None, request_id=request.request_id)
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """Send the topic's latest message with the next tick; the first call starts the clock."""
+        """Mark the topic's latest message for sending. The first subscription starts the clock."""
         with self._lock:
             if not self._looked_at:
                 self._looked_at = self._player.playing = True
@@ -134,7 +134,7 @@ class LiveServer(ViewerServer):
             self._joined.add(channel.id)
 
     def on_unsubscribe(self, client: Any, channel: Any) -> None:
-        """Count the topic's subscribers."""
+        """Update the number of the topic's subscribers."""
         with self._lock:
             self._subscribers[channel.id] -= 1
 
@@ -172,7 +172,7 @@ class LiveServer(ViewerServer):
         return [message for message in current if self._is_lacking(message, joined, seeked)]
 
     def _is_lacking(self, message: Played, joined: set[int], seeked: bool) -> bool:
-        """Return whether viewers lack a current message; never send an event to a viewer twice."""
+        """Return whether viewers still need the latest message of a topic. Events are sent once."""
         channel_id = self._channels[message.track, message.channel_id].id()
         topic = self._reader(message.track).channels[message.channel_id].topic
         if topic not in _EVENT_TOPICS:
@@ -180,7 +180,7 @@ class LiveServer(ViewerServer):
         first_ns = self._player.start_ns
         is_first = channel_id in joined and self._subscribers[channel_id] == 1
         if not is_first and self._player.time_ns >= self._sent_ns:
-            # After a seek forward, viewers still show earlier events.
+            # After a seek forward, viewers still show the events that were already sent.
             first_ns = max(first_ns, self._sent_ns + 1)
         return (seeked or is_first) and message.time_ns >= first_ns
 

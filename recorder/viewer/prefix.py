@@ -58,7 +58,7 @@ def prefixed_message(data: bytes, type_name: str, prefix: str, shift_ns: int) ->
 
 
 def side_by_side(layouts: Sequence[dict[str, Any]], prefixes: Sequence[str]) -> dict[str, Any]:
-    """Return a layout that shows several logs side by side, on each of its screens."""
+    """Return a layout in which each screen shows several logs side by side."""
     parts = [_prefixed_layout(*pair) for pair in zip(layouts, prefixes, strict=True)]
     if len(parts) == 1:
         return parts[0]

@@ -96,7 +96,7 @@ def _findings_section(findings: Sequence[Problem]) -> Section:
 
 
 def _calibration_section(dataset: Dataset) -> list[Section]:
-    """Return a list of the section on behavior probabilities; empty if they are unknown."""
+    """Return the section about behavior probabilities; an empty list if they are unknown."""
     found = calibration(dataset.behavior_probs, dataset.action_space)
     if found is None:
         return []
@@ -164,7 +164,7 @@ def _cards(dataset: Dataset, tracks: Sequence[Positions]) -> list[Card]:
 
 
 def _commands(dataset: Dataset) -> list[str]:
-    """Return one command per episode that replays it; an empty string if its file is unknown."""
+    """Return a replay command for each episode, or empty strings if their files are unknown."""
     counts = [len(open_logs(path, columns=[]).episodes) for path in dataset.sources]
     if sum(counts) != len(dataset.episodes):
         return [""] * len(dataset.episodes)
@@ -261,7 +261,7 @@ def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
 def _positions_at(
     times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
 ) -> Positions:
-    """Return the positions at these exact times, or an empty array if no log contains them all."""
+    """Return positions at exactly these times; empty if no single log contains all the times."""
     for known, positions in logs:
         start = int(np.searchsorted(known, times[0]))
         stop = start + len(times)

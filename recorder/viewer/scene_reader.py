@@ -27,7 +27,7 @@ _ADD = 0
 
 @dataclass(frozen=True)
 class SeenShape:
-    """A marker with the attributes of `scene.Shape`; rotations other than about z are lost."""
+    """A marker with the attributes of `scene.Shape`; rotations other than about z are ignored."""
 
     name: str
     kind: str
@@ -52,12 +52,12 @@ class SeenFrame:
 
 @dataclass(frozen=True)
 class SeenStep:
-    """The scene at one step, or at a moment between it and the next one.
+    """The scene at one step, or at a moment between this step and the next step.
 
     Attributes:
         step: Index of the step; the final observation has the largest index.
         time_ns: log_time of the moment.
-        static: Static shapes; the same list object until they change.
+        static: Static shapes; consecutive moments share the list object until the shapes change.
         moving: Moving shapes.
         frames: Moving and static frames.
         follow: Name of the first moving frame; empty if there is none.
@@ -77,8 +77,8 @@ def moments_of_episode(reader: McapReader, episode: Episode, parts: int = 1) -> 
     Args:
         reader: Reader of the log.
         episode: Episode of the log.
-        parts: Number of moments for each step except the last one: the step, and evenly spaced
-            moments before the next one.
+        parts: Number of moments for each step: the step itself, and evenly spaced moments before
+            the next step. The last step has only one moment.
 
     Raises:
         LogError: The log has no scene.
@@ -114,7 +114,7 @@ def _moments(times_ns: list[int], parts: int) -> Iterator[tuple[int, int]]:
 
 
 def _frames_at(stamped: list[tuple[int, SeenFrame]], time_ns: int) -> list[SeenFrame]:
-    """Interpolate the frames of a message at a time; outside its stamps, use the nearest stamp."""
+    """Interpolate frames at a time; outside the range of their stamps, use the nearest stamp."""
     by_name: dict[str, list[tuple[int, SeenFrame]]] = {}
     for stamp_ns, frame in stamped:
         by_name.setdefault(frame.name, []).append((stamp_ns, frame))

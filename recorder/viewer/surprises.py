@@ -29,8 +29,8 @@ class Surprise:
         time_ns: log_time of the step.
         episode: Index of the episode in the log.
         step: Index of the step in the episode.
-        value: TD error, or for a disagreement the advantage of the logged action. If the policy has
-            no Q-values, the value of a disagreement is the policy's normalized entropy.
+        value: For `td_error`, the TD error. For `disagreement`, the advantage of the logged action,
+            or the policy's normalized entropy if the policy has no Q-values.
     """
 
     file: str
@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage; without Q-values, the lowest entropy."""
+    """Yield the disagreements with the lowest advantage or, without Q-values, lowest entropy."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]

@@ -114,12 +114,12 @@ def verify(
         env: New environment of the same kind as the logged one; this function resets and steps it.
         only: Index of the episode to compare. If the start of this episode depends on earlier
             episodes, these are also compared. Default: all episodes.
-        on_frame: Function that is called with the episode and step after each identical
-            observation, while the environment is in that state.
+        on_frame: Function of episode and step. It is called after each observation that matches the
+            log, while the environment is in the state of that step.
 
     Raises:
         SpaceError: The spaces of the environment and the log differ.
-        LogError: The environment fails on a logged action.
+        LogError: The environment raises an error for a logged action.
     """
     _check_spaces(dataset, env)
     compared = steps = 0
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return the episode `only` and the episodes that its start depends on; all if it is None."""
+    """Return episode `only` and those that its start depends on, or all if `only` is None."""
     if only is None:
         return episodes
     first = only

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 _NEAR_M = 0.1
 """Distance of the near plane."""
 _BACK_M = 1e-6
-"""Distance behind a triangle's plane from which the triangle is culled; allows for rounding."""
+"""Tolerance of back-face culling: the camera may be this far behind a triangle's plane."""
 
 
 class Lens(NamedTuple):
@@ -43,7 +43,7 @@ def lens(width_px: int, height_px: int, horizontal_fov_rad: float) -> Lens:
 
 
 def focal_lengths(view: Lens, shape: tuple[int, int]) -> tuple[float, float]:
-    """Return the focal lengths in x and y of an image of another size, in pixels of that image.
+    """Return the focal lengths in x and y, in pixels, after the image is resized to `shape`.
 
     >>> focal_lengths(lens(256, 144, math.pi / 2), (72, 64))
     (32.00000000000001, 64.00000000000001)
@@ -72,7 +72,7 @@ def level_axes(yaw_rad: float) -> Floats:
 
 
 def fronts(mesh: Floats) -> Floats:
-    """Return the (T, 4) planes of triangles: the front's unit normal n, and n . p of a corner p."""
+    """Return the (T, 4) planes n . p = d of triangles: the front-facing unit normal n, and d."""
     ahead = np.cross(mesh[:, 1] - mesh[:, 0], mesh[:, 2] - mesh[:, 0])
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     return np.column_stack([ahead, (ahead * mesh[:, 0]).sum(axis=1)])
@@ -91,7 +91,7 @@ def draw(
 
     Args:
         mesh: (T, 3, 3) triangles, visible from the side where their corners run counter-clockwise.
-        planes: (T, 4) `fronts` of the mesh.
+        planes: (T, 4) result of `fronts` for the mesh.
         eye_m: (3,) position of the camera.
         axes: (3, 3) the camera's x, y and z axes as rows, in the mesh's coordinates.
         focal_px: Focal length; the optical axis meets the middle of the image.
@@ -287,7 +287,7 @@ def draw_wires(
     it is steeper than 45 degrees in the image, it covers one pixel in each row instead.
 
     Args:
-        wires: (S, 2, 3) ends of the wires.
+        wires: (S, 2, 3) both ends of each of the S wires.
         eye_m: (3,) position of the camera.
         axes: (3, 3) axes of the camera, as in `draw`.
         focal_x_px: Focal length in pixel widths.

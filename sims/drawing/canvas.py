@@ -36,7 +36,7 @@ class Canvas:
         Raises:
             MissingExtraError: Pygame is not installed.
         """
-        # pygame prints a greeting to stdout, where commands print results.
+        # pygame would print a greeting among the results that commands print to stdout.
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.pygame = import_extra("pygame", "sims")
         self.pygame.font.init()
@@ -57,7 +57,7 @@ class Canvas:
         self.pygame.draw.polygon(self._large, rgb(color), (_SMOOTH * corners_px).tolist())
 
     def flatten(self) -> None:
-        """Finish the polygons; everything that follows is drawn over them."""
+        """Downsample the polygons to the image; later calls draw over them."""
         self._image = self.pygame.transform.smoothscale(self._large, self._size_px)
 
     def rectangle(self, box_px: tuple[int, int, int, int], color: Rgb, edge_px: int = 0) -> None:
@@ -65,14 +65,14 @@ class Canvas:
         self.pygame.draw.rect(self._image, color, box_px, edge_px)
 
     def arrowhead(self, middle_px: tuple[int, int], toward: tuple[int, int], color: Rgb) -> None:
-        """Draw a 16-pixel triangle that points right for (1, 0), down for (0, 1)."""
+        """Draw a 16-pixel triangle; `toward` is (1, 0) for right and (0, 1) for down."""
         (x, y), (dx, dy) = middle_px, toward
         tip, left, right = (dx, dy), (dy - dx, -dx - dy), (-dy - dx, dx - dy)
         corners = [(x + 8 * part[0], y + 8 * part[1]) for part in (tip, left, right)]
         self.pygame.draw.polygon(self._image, color, corners)
 
     def text(self, text: str, at_px: tuple[int, int], height_px: int, color: Rgb) -> None:
-        """Draw text whose left top corner is at `at_px`."""
+        """Draw text whose top left corner is at `at_px`."""
         if height_px not in self._fonts:
             self._fonts[height_px] = self.pygame.font.Font(None, height_px)
         self._image.blit(self._fonts[height_px].render(text, True, color), at_px)

@@ -1,8 +1,8 @@
 """Perspective view of a scene from behind a body, drawn with pygame from back to front.
 
 Faces that lie flat on the ground are drawn first, the lowest first. Then all other faces are drawn,
-the farthest first. The order is based on the distances to the middles of the faces, so it can be
-wrong for a large face beside a small one. For depth images, see `sims.drawing.camera`.
+the farthest first. The order is based on the distances to the middles of the faces. It can be wrong
+for a large face next to a small face. For depth images, see `sims.drawing.camera`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 
 SIZE_PX = (960, 540)
 BACK_M, ABOVE_M, AHEAD_M = 15.0, 6.5, 7.0
-"""Backward and upward offset of the camera from the body, and forward offset of its target."""
+"""Distance of the camera behind the body, its height above the body, and distance from the body
+forward to the point that the camera looks at."""
 FAR_M = 400.0
 _FOCAL_PX = 0.9 * SIZE_PX[0]
 _NEAR_M = 0.3
@@ -34,7 +35,7 @@ _SUN = (0.36, 0.28, 0.89)
 _FLAT_M = 0.15
 _INK, _PLATE = (255, 255, 255), (20, 22, 26)
 _DOT = np.array([[0.0, 0.0, -1e-3], [0.0, 0.0, 1e-3]])
-"""A stroke so short that it is drawn as a dot."""
+"""Ends of a stroke of almost no length, which is drawn as a dot."""
 _ROUND = np.array([(math.cos(a), math.sin(a)) for a in np.arange(12) * math.pi / 6]) / 2
 
 
@@ -85,7 +86,7 @@ class ChaseView:
                 in the frame `map` are not prepared again.
             moving: Shapes that change.
             frames: All frames.
-            follow: Frame of the body; if empty, the camera faces the map's origin.
+            follow: Name of the frame that the camera follows; if empty, the map's origin.
             lines: Lines of text in the corner.
         """
         poses = poses_of(frames)
@@ -111,7 +112,7 @@ class ChaseView:
         self._canvas.close()
 
     def _visible_in_map(self, static: Sequence[Shape], eye: Pose) -> list[_Piece]:
-        """Return the static pieces in the frame `map` that are closer than `FAR_M`."""
+        """Return the static pieces in the frame `map` that are in view and closer than `FAR_M`."""
         if self._prepared is None or self._prepared[0] is not static:
             pieces = [p for s in static if s.frame == "map" for p in _pieces(s, {})]
             middles = np.array([p.corners_m.mean(axis=0) for p in pieces]).reshape(-1, 3)
@@ -246,7 +247,7 @@ def _order(piece: _Piece, eye_m: Floats) -> tuple[int, float]:
 
 
 def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]:
-    """Return a mask of the spheres that are not completely outside the view of the camera."""
+    """Return a mask of the spheres that are at least partly inside the view of the camera."""
     x_m, y_m, z_m = ((middles_m - eye.at_m) @ eye.axes).T
     seen: NDArray[np.bool_] = z_m + radii_m > _NEAR_M
     for aside_m, size_px in ((x_m, SIZE_PX[0]), (y_m, SIZE_PX[1])):
@@ -256,7 +257,7 @@ def _in_view(middles_m: Floats, radii_m: Floats, eye: Pose) -> NDArray[np.bool_]
 
 
 def _seen(piece: _Piece, eye: Pose) -> Floats | None:
-    """Project a piece to a polygon in the image; None if no part is in front of the camera."""
+    """Project a piece to a polygon in the image; return None if it is behind the camera."""
     corners = _before_eye((piece.corners_m - eye.at_m) @ eye.axes, closed=piece.width_m == 0)
     if len(corners) < 2:
         return None
@@ -267,7 +268,7 @@ def _seen(piece: _Piece, eye: Pose) -> Floats | None:
 
 
 def _before_eye(corners: Floats, *, closed: bool) -> Floats:
-    """Clip corners at the near plane."""
+    """Clip a closed polygon or an open line at the near plane."""
     if (corners[:, 2] >= _NEAR_M).all():
         return corners
     kept: list[Floats] = []
@@ -289,7 +290,7 @@ def _projected(corners: Floats) -> Floats:
 
 
 def _stroke(ends: Floats, widths_px: Floats) -> Floats:
-    """Return a polygon for a stroke whose ends have different widths; a short stroke is a dot."""
+    """Return the polygon of a stroke with a width at each end; a short stroke becomes a dot."""
     along = ends[1] - ends[0]
     length = float(np.hypot(*along))
     half_px = np.clip(widths_px, 1.0, _WIDEST_PX)[:, None] / 2

@@ -58,16 +58,16 @@ def encode_nearness(depth_m: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 class Overlaps(NamedTuple):
-    """Overlaps of a row of old pixels with a shorter row of new pixels."""
+    """Weights that downsample a row of old pixels to a shorter row of new pixels."""
 
     first: NDArray[np.int64]
     """(new,) index of the first old pixel that overlaps each new one."""
     weights: Floats
-    """(new, K) fraction of each new pixel that each of K old pixels covers, starting at `first`."""
+    """(new, K) fraction of each new pixel covered by each of K old pixels from `first` onward."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
-    """Return the overlaps of `new_size` equal pixels with `old_size` pixels.
+    """Return the weights that downsample a row of `old_size` pixels to `new_size` pixels.
 
     >>> overlaps(3, 2).weights.round(2).tolist()
     [[0.67, 0.33, 0.0], [0.0, 0.33, 0.67]]
@@ -103,7 +103,7 @@ def shrink(
         sums[:], hits[:] = 0.0, 0.0
         for k in range(rows.weights.shape[1]):
             line, weight = inverse[rows.first[i] + k], rows.weights[i, k]
-            # Most new rows overlap fewer than K old rows; the other weights are 0.
+            # Most output rows overlap fewer than K input rows; their remaining weights are 0.
             if weight > 0.0:
                 for column in range(width):
                     sums[column] += weight * line[column]
@@ -129,7 +129,7 @@ class DepthCamera:
             mesh: (T, 3, 3) triangles, meters; see `draw`.
             view: Lens and size of the rendered images.
             small: Size (h, w) of the downsampled images, pixels.
-            wires: (S, 2, 3) meters, drawn into the small image, one pixel wide.
+            wires: (S, 2, 3) ends, meters; drawn one pixel wide into the downsampled image.
         """
         self._mesh, self._planes = mesh, fronts(mesh)
         self._wires = wires
@@ -158,7 +158,7 @@ class DepthCamera:
         return inverse
 
     def image_m(self, position_m: tuple[float, float, float], axes: Floats) -> NDArray[np.float32]:
-        """Render the small image: (h, w) meters along each ray; infinity if a ray hits nothing."""
+        """Render the downsampled image: (h, w) meters along each ray; infinity without a hit."""
         small = np.empty(self._small, dtype=np.float32)
         shrink(self.inverse_distance(position_m, axes), self._rows, self._columns, small)
         if len(self._wires):

@@ -54,8 +54,8 @@ class Shape:
     kind: Kind
     color: Color
     points: NDArray[np.float64] = field(default_factory=no_points)
-    """(N, 3) meters. `line`: a strip; `segments`: pairs; `triangles`: triples; `arrow`: start and
-    end; empty for the others."""
+    """(N, 3) meters. `line`: corners in order; `segments`: pairs of ends; `triangles`: triples of
+    corners; `arrow`: start and end; `points` and `spheres`: centers; other kinds: empty."""
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Meters. `line`, `segments` and `points`: the first is the width; `spheres`: the diameters;
     `arrow`: shaft diameter, head diameter, head length; `text`: the last is the height."""
@@ -90,7 +90,7 @@ def yaw_rotation(yaw_rad: float) -> tuple[float, float, float, float]:
 
 
 def path(points: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
-    """Return the `points` of a line through positions; a single position is used twice."""
+    """Return the `points` of a line through positions; a single position is duplicated."""
     return np.array(points if len(points) > 1 else [*points, *points])
 
 
@@ -110,14 +110,14 @@ def cut(segments_m: NDArray[np.float64], longest_m: float) -> NDArray[np.float64
     """Cut each segment into pieces of `longest_m`; the last piece may be shorter.
 
     Viewers do not draw a line that begins behind the camera, even if the rest of the line is in
-    front. With short pieces, little is missing.
+    front. With short pieces, only a small part of the line is missing.
 
     Args:
-        segments_m: (2 N, K) starts and ends in turn.
+        segments_m: (2 N, K) alternating starts and ends of N segments.
         longest_m: Length of a piece.
 
     Returns:
-        (2 M, K) starts and ends in turn.
+        (2 M, K) alternating starts and ends of M pieces.
 
     >>> cut(np.array([[0.0, 0.0], [5.0, 0.0]]), 2.0)[:, 0].tolist()
     [0.0, 2.0, 2.0, 4.0, 4.0, 5.0]

@@ -53,7 +53,7 @@ def label(speed_m_s: float, height_m: float, frame: str = "car") -> Shape:
 
 
 def trail(places_m: Sequence[tuple[float, ...]], width_m: float) -> Shape:
-    """Return a line through the car's last positions in the map, of which there is at least one."""
+    """Return a line through the last positions in the map; at least one position is required."""
     return Shape("trail", "line", TRAIL, raised(path(places_m), 0.1), size=(width_m, 0.0, 0.0))
 
 
@@ -66,8 +66,9 @@ def lookahead(points_m: NDArray[np.float64]) -> Shape:
 def rays(lines_m: NDArray[np.float64], car: Frame, height_m: float) -> tuple[Shape, Shape]:
     """Return distance rays as lines, with dots at their ends.
 
-    Dots and lines have the same points in the car's frame, because repeated bytes compress well in
-    logs. Therefore the starts have dots, too. These are inside the car or mark its sensors.
+    Dots and lines use the same array of points in the car's frame, because repeated bytes compress
+    well in logs. Therefore, the starts of the rays have dots, too. These dots are inside the car or
+    mark the car's sensors.
 
     Args:
         lines_m: (R, 2, 2) starts and ends in the map.

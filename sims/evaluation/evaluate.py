@@ -139,7 +139,7 @@ def evaluate(
 
 
 def normalize(score: PolicyScore, random: PolicyScore, pilot: PolicyScore | None) -> PolicyScore:
-    """Normalize a score to the scale random = 0, pilot = 1; without a pilot, it is unchanged."""
+    """Add the normalized score (random = 0, pilot = 1) to a score, if there is a pilot."""
     if pilot is None or pilot.mean_return == random.mean_return:
         return score
     span = pilot.mean_return - random.mean_return

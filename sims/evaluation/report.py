@@ -21,8 +21,8 @@ from mcaprl.sims.evaluation.statistics import interquartile_mean, median
 
 _MAX_PATHS = 30
 _PAIRS = (
-    "Probability that an episode of one policy has a higher return than one of another;"
-    " ties count half."
+    "Probability that an episode of the first policy has a higher return than an episode of"
+    " the second; ties count half."
 )
 _FLAT_M = 1.0
 """Boxes up to this height are ground and are not drawn."""
@@ -39,7 +39,8 @@ def comparison_figure(
     Args:
         scores: Scores from top to bottom.
         title: Title of the figure.
-        behavior: Mean, low and high of the logged episodes' returns, drawn as a band.
+        behavior: Mean return of the logged episodes, drawn as a line, and the lower and upper limit
+            of its interval, drawn as a band; None without a log.
         width: Width of the figure in inches.
 
     Raises:
@@ -64,7 +65,7 @@ def comparison_figure(
         # The label is to the right of the bar, the interval and the dots.
         end = max(high, 0.0, float(means.max()))
         text = axes.annotate(label, (end, row), (8, 0), textcoords="offset points", va="center")
-        # The line of the logged behavior may cross the label.
+        # The background keeps the label readable where the line of the logged behavior crosses it.
         text.set_bbox({"facecolor": axes.get_facecolor(), "alpha": 0.85, "lw": 0, "pad": 1})
     axes.set_yticks(range(len(scores)), tick_labels(score.policy for score in scores))
     axes.invert_yaxis()
@@ -80,7 +81,7 @@ def trajectory_figure(scores: Sequence[PolicyScore], world: Sequence[Shape]) -> 
     """Draw the trajectories of each policy on the map; a cross marks an episode that ended early.
 
     Args:
-        scores: Scores, one panel for each that has positions.
+        scores: Scores; each score that has positions gets a panel.
         world: Static shapes of the map.
 
     Returns:
@@ -151,9 +152,10 @@ def evaluation_page(
         scores: Scores of the policies.
         compared: Comparisons of pairs of policies.
         world: Static shapes of the map.
-        behavior: Mean, low and high of the logged episodes' returns, if there is a log.
-        recorded: Log with the episodes of the first policies in `scores`, and the number of these
-            policies.
+        behavior: Mean return of the logged episodes, and the lower and upper limit of its interval;
+            None without a log.
+        recorded: Log with the episodes of the first N policies in `scores`, and the number N; None
+            without a log.
         curves: Learning curves of the policies.
 
     Raises:
@@ -171,7 +173,7 @@ def evaluation_page(
         Section("Probability of improvement", _PAIRS, table=_improvement_table(compared)),
     ]
     if trajectories is not None:
-        text = "A cross marks an early end."
+        text = "A cross marks an episode that ended before the time limit."
         sections.append(Section("Trajectories", text, figures=_trajectories(scores, world)))
     cards = _cards(scores, world, recorded)
     sections.append(Section("Best and worst episodes", cards=cards))
@@ -227,7 +229,7 @@ def _cards(
 
 
 def _thumbnail(episode: EpisodeResult, world: Sequence[Shape]) -> str:
-    """Return an episode's trajectory as a small SVG; empty if it has no positions."""
+    """Return an episode's trajectory as a small SVG; empty if the episode has no positions."""
     if not episode.positions.size:
         return ""
     figure, axes = new_figure((3.2, 2.2))

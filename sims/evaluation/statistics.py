@@ -51,13 +51,13 @@ _STUDENT: Final = {
 
 
 def median(returns: Floats) -> Floats:
-    """Return the medians (...) of returns (..., S, E)."""
+    """Return the medians of returns (..., S, E) over seeds and episodes."""
     medians: Floats = np.median(returns, axis=(-2, -1))
     return medians
 
 
 def interquartile_mean(returns: Floats) -> Floats:
-    """Return the interquartile means (...) of returns (..., S, E).
+    """Return the interquartile means of returns (..., S, E) over seeds and episodes.
 
     A quarter of the returns, rounded down, is dropped at each end. The result is more robust to
     outliers than the mean, and has less variance than the median.
@@ -72,10 +72,11 @@ def interquartile_mean(returns: Floats) -> Floats:
 def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the mean.
 
-    With several seeds, two intervals are combined: Student's t over the means of the seeds, and
-    bootstrap-t over the means of the starts. The squared distances of their limits from the mean
-    are added, because the first interval covers only the variation between seeds, and the second
-    only the variation between starts.
+    With several seeds, the result combines two intervals: the interval of Student's t for the means
+    of the seeds, which covers the variation between seeds; and the bootstrap-t interval for the
+    means of the starts, which covers the variation between starts. On each side, the distance
+    of the limit from the mean is the root of the sum of the squares of the corresponding
+    distances of the two intervals.
 
     Args:
         returns: (S, E) returns.
@@ -100,7 +101,7 @@ def bootstrap_interval(
 
     Args:
         returns: (S, E) returns.
-        statistic: Function of (..., S, E), such as `median` or `interquartile_mean`.
+        statistic: Function of returns (..., S, E), such as `median` or `interquartile_mean`.
         seed: Seed of the resampling.
     """
     return _interval(statistic(_resampled(returns, np.random.default_rng(seed))))
@@ -129,7 +130,7 @@ def improvement_interval(first: Floats, second: Floats, *, seed: int = 0) -> tup
 
 
 def _improvement(firsts: Floats, seconds: Floats) -> Floats:
-    """Return the probabilities (R,) of improvement for returns (R, N) and (R, M)."""
+    """Return the (R,) probabilities of improvement for each row of returns (R, N) and (R, M)."""
     pairs = firsts.shape[1] * seconds.shape[1]
     parts = []
     step = max(1, _PAIRS_AT_ONCE // pairs)
@@ -149,9 +150,9 @@ def _student_interval(values: Floats) -> tuple[float, float]:
 def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
     """Return the 95 % bootstrap-t interval of the mean of N > 1 values.
 
-    If there are few values or many are equal, the bootstrap samples differ little. Therefore, the
-    interval is at least as wide on each side as the interval of Student's t. Samples whose standard
-    error is almost 0 are excluded.
+    If there are few values, or if many values are equal, the bootstrap samples vary little.
+    Therefore, the interval is at least as wide on each side as the interval of Student's t. Samples
+    whose standard error is almost 0 are excluded.
     """
     random = np.random.default_rng(seed)
     count, mean, error = len(values), values.mean(), _standard_errors(values)
@@ -170,7 +171,7 @@ def _bootstrap_t_interval(values: Floats, *, seed: int) -> tuple[float, float]:
 
 
 def _standard_errors(values: Floats) -> Floats:
-    """Return the standard errors (...) of the means of values (..., N)."""
+    """Return the standard errors of the means of values (..., N) over the last axis."""
     errors: Floats = values.std(axis=-1, ddof=1) / math.sqrt(values.shape[-1])
     return errors
 

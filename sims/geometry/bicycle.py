@@ -76,8 +76,8 @@ def slip_for_lateral(lateral_m_s2: float, speed_m_s: float, wheelbase_m: float) 
     """Return sin(beta) for a turn with the given lateral acceleration and speed.
 
     Let l be half the wheelbase and v the speed. The radius of the turn is l / sin(beta), so the
-    lateral acceleration is v^2 sin(beta) / l. If the speed is too low for the given acceleration,
-    the result is 1.
+    lateral acceleration is v^2 sin(beta) / l. At speeds too low for
+    the given acceleration, the result is 1, the maximum of sin(beta).
     """
     least = 0.5 * wheelbase_m * lateral_m_s2
     return least / max(speed_m_s * speed_m_s, least)

@@ -52,7 +52,7 @@ def ready(
     Args:
         function: Compiled function.
         *arguments: First arguments, which each call reuses.
-        examples: Examples of the remaining arguments, which each call passes.
+        examples: Example values of the arguments that each call passes; only the types matter.
     """
     if not isinstance(function, numba.core.dispatcher.Dispatcher):
         return partial(function, *arguments)

@@ -34,9 +34,9 @@ def ground_mesh(half_side_m: float) -> NDArray[np.float64]:
 def frustum_mesh(
     foot_m: Vector, foot_side_m: float, top_side_m: float, height_m: float
 ) -> NDArray[np.float64]:
-    """Return an upright square frustum without its base, (10, 3, 3) meters.
+    """Return the triangles of an upright square frustum without base, (10, 3, 3) meters.
 
-    With a top side of 0, the frustum is a pyramid, (4, 3, 3).
+    With a top side of 0, the frustum is a pyramid with 4 triangles, (4, 3, 3).
     """
     height = _CORNERS[:, 2:] + 0.5
     level = _CORNERS[:, :2] * (foot_side_m + (top_side_m - foot_side_m) * height)

@@ -195,7 +195,7 @@ def point_at(path: Path, along_m: float) -> tuple[float, float]:
 
 @compiled
 def project(path: Path, x_m: float, y_m: float, from_m: float, to_m: float) -> Projection:
-    """Return the nearest path point between two distances along the path.
+    """Return the path point nearest to (x_m, y_m) between two distances along the path.
 
     Where the path crosses itself, the window [from_m, to_m] selects the vehicle's branch. The
     window may begin on any lap. The result's `along_m` is within the window.

@@ -21,13 +21,13 @@ FLIP = np.array([1.0, -1.0])
 
 
 class Place(NamedTuple):
-    """Nearest point of a course to a position."""
+    """Point of a course that is nearest to a position."""
 
     along_m: float
     offset_m: float
     """Distance of the position from the course, positive to the left of its direction."""
     yaw_rad: float
-    """Direction of the course there."""
+    """Direction of the course at the nearest point."""
 
 
 class Course(NamedTuple):
@@ -36,7 +36,7 @@ class Course(NamedTuple):
     points_m: Floats
     """(N + 1, 2) points about 1 m apart; on a closed course, the last point equals the first."""
     along_m: Floats
-    """(N + 1,) distance of each point from the first."""
+    """(N + 1,) distance of each point from the first, along the course."""
     lengths_m: Floats
     """(N,) lengths of the legs from each point to the next."""
     directions: Floats
@@ -50,7 +50,7 @@ class Course(NamedTuple):
         return float(self.along_m[-1])
 
     def nearest(self, x_m: float, y_m: float) -> Place:
-        """Return the nearest point of the course to a position."""
+        """Return the point of the course that is nearest to a position."""
         dx_m, dy_m = x_m - self.points_m[:-1, 0], y_m - self.points_m[:-1, 1]
         cos, sin = self.directions
         along_m = np.clip(dx_m * cos + dy_m * sin, 0.0, self.lengths_m)

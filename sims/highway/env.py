@@ -104,14 +104,14 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
     ## Rewards
 
     The rewards are those of highway-env; d is the distance from the middle of the lane. Lane
-    keeping: 1 - (d / 10 m)^2 for the lane to follow. Racetracks: 1 / (1 + 4 d^2), minus 0.3 for
-    full steering, scaled to the range 0 to 1. Off a racetrack, the reward is 0.
+    keeping: 1 - (d / 10 m)^2, where d refers to the lane to follow. Racetracks: 1 / (1 + 4 d^2),
+    minus 0.3 for full steering, scaled to the range 0 to 1. Off a racetrack, the reward is 0.
 
     ## Starting State
 
     `start="line"`: the starting state of highway-env, which is constant in lane keeping.
-    `start="anywhere"`: a random position on the road with an offset of up to 1.5 m and 0.2 rad. It
-    is at least 20 m from other cars, and 60 m from the end of an open road.
+    `start="anywhere"`: a random position on the road with an offset of up to 1.5 m and 0.2 rad. The
+    position is at least 20 m from other cars, and 60 m from the end of an open road.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})` starts at that pose; the speed in m/s may follow
     as a fourth number.
 
@@ -208,7 +208,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     @property
     def place(self) -> Place:
-        """Nearest point of the lane to the car."""
+        """Point of the lane that is nearest to the car."""
         return self._place
 
     def reset(
@@ -277,7 +277,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
         self._place, self._along_m = places[self._lane], places[0].along_m
 
     def _moved_m(self, before_m: float) -> float:
-        """Return the distance along the first lane from the earlier position `before_m`, meters."""
+        """Return the distance, meters, that the car moved along the first lane from `before_m`."""
         moved_m, length_m = self._along_m - before_m, self.courses[0].length_m
         if self.courses[0].is_closed:
             moved_m = (moved_m + length_m / 2) % length_m - length_m / 2

@@ -29,7 +29,7 @@ MARGIN_M = 60.0
 """Width of the grass around the road."""
 CAR_HEIGHT_M = 1.4
 PIECE_M = 3.0
-"""Approximate length of the pieces of lanes and lines; a dashed line has every second piece."""
+"""Approximate length of the pieces of lanes and lines; dashed lines omit every second piece."""
 STRIPED, CONTINUOUS = 1, 2
 """Values of highway-env's `LineType`."""
 
@@ -127,7 +127,7 @@ def moving_shapes(
     aims_m: Sequence[tuple[float, float]],
     steering_rad: float,
 ) -> tuple[Shape, ...]:
-    """Return the shapes that change with each step; the agent observes the points `aims_m`."""
+    """Return the shapes that change with each step; `aims_m` are the observed lane points."""
     return (
         shapes.trail(trail_m, 0.25),
         shapes.lookahead(np.array(aims_m)),

@@ -23,7 +23,7 @@ LAST_START_M = 60.0
 def drawn_pose(
     random: np.random.Generator, courses: Sequence[Course], others: Sequence[Car], speed_m_s: float
 ) -> Pose:
-    """Draw a starting pose away from other cars, up to 1.5 m and 0.2 rad off a lane."""
+    """Draw a pose away from other cars, up to 1.5 m and 0.2 rad off the middle of a lane."""
     course = courses[int(random.integers(len(courses)))]
     last_m = course.length_m - (0.0 if course.is_closed else LAST_START_M)
     while True:
@@ -53,7 +53,7 @@ def pose_from_options(
     if offset_m > half_width_m:
         raise UsageError(
             f"pose ({pose.x_m}, {pose.y_m}) is {offset_m:.1f} m from the middle of a lane:"
-            f" the lane ends at {half_width_m} m"
+            f" the lane's edge is at {half_width_m} m"
         )
     if not _is_free(pose.x_m, pose.y_m, others, own.length_m):
         raise UsageError(f"pose ({pose.x_m}, {pose.y_m}) is occupied by another car")

@@ -1,8 +1,8 @@
 """Vectorized flight of many quadrotors.
 
 Drones are stored in blocks, as structures of arrays, so that the compiler can vectorize over
-drones. A step takes a quarter of the time that the same drones take when they are stepped one by
-one. The results are bit-identical.
+drones. A vectorized step takes a quarter of the time of stepping the same drones one by one. The
+results are bit-identical.
 """
 
 from __future__ import annotations

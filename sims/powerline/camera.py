@@ -33,24 +33,24 @@ Floats = NDArray[np.float64]
 
 LENS = lens(256, 144, math.pi / 2)
 IMAGE_SHAPE = (84, 84)
-"""Size of the averaged image; each pixel covers 3.05 x 1.71 rendered pixels."""
+"""Size of the downsampled image; each pixel covers 3.05 x 1.71 rendered pixels."""
 
 CAMERAS = ("down", "front")
 CAMERA_AT_M = {"down": Vector(0.0, 0.0, 0.1), "front": Vector(0.2, 0.0, 0.0)}
-"""Positions in the body, x forward, y right, z down."""
+"""Positions in the body frame: x forward, y right, z down."""
 CAMERA_AXES = {
     "down": (Vector(0.0, 1.0, 0.0), Vector(-1.0, 0.0, 0.0), Vector(0.0, 0.0, 1.0)),
     "front": (Vector(0.0, 1.0, 0.0), Vector(0.0, 0.0, 1.0), Vector(1.0, 0.0, 0.0)),
 }
-"""Optical axes (x right, y down, z along the view) in the body."""
+"""Optical axes (x right, y down, z along the view) in the body frame."""
 
 GROUND_X_M = np.concatenate(
     [np.linspace(-180, -6, 7), np.linspace(0, 54, 10), np.linspace(60, 720, 31)]
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
-"""NED grid of the ground mesh: densest on the steep hill, 100 m larger than the line."""
+"""NED grid of the ground mesh: densest on the steep hill, up to about 200 m beyond the line."""
 TREE_SIDE_M = 0.45
-"""Side of a fir as a fraction of its height."""
+"""Side of a fir's base as a fraction of its height."""
 MAST_FOOT_M = 3.0
 MAST_TOP_M = 0.9
 

@@ -105,7 +105,7 @@ def point_on_line(along_m: float) -> Vector:
 
 @compiled
 def nearest_on_line(position_m: Vector) -> Place:
-    """Return the nearest point of the line to a position."""
+    """Return the point of the line that is nearest to a position."""
     best = Place(0, 0.0, Vector(0.0, 0.0, 0.0), math.inf)
     for leg in range(LEGS):
         rest_m = 0.0
@@ -123,7 +123,8 @@ def nearest_on_line(position_m: Vector) -> Place:
 def distance_to_infinite_line(position_m: Vector, leg: int) -> float:
     """Return the distance to the infinite line through a leg, meters.
 
-    It is |(p - a) x t| for a position p, a point a on the line, and the line's unit vector t.
+    The distance is |(p - a) x t| for a position p, a point a on the line, and the line's unit
+    vector t.
     """
     start = Vector(POINTS_M[leg, 0], POINTS_M[leg, 1], POINTS_M[leg, 2])
     tangent = Vector(TANGENTS[leg, 0], TANGENTS[leg, 1], TANGENTS[leg, 2])

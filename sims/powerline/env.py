@@ -77,7 +77,8 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
 
     The reward is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from
     the line, and ds is its progress along the line beyond the furthest point so far. The reward is
-    highest at 5 m/s. Finishing adds 5. Leaving the line or a collision gives -5 instead.
+    highest at 5 m/s. Finishing adds 5. If the drone leaves the line or collides, the
+    reward is -5 instead.
 
     ## Starting State
 

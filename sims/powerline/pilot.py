@@ -17,7 +17,7 @@ OFFSET_GAIN_PER_S = 0.5
 MAX_SPEED_M_S = 5.0
 HALF_TURN_RAD = 0.46
 TURN_SPEED_M_S = 2.0
-"""Speed in a corner of 2 x 0.46 rad; sharper corners are flown more slowly."""
+"""Speed in a corner that turns the line by 2 x 0.46 rad; sharper corners are flown more slowly."""
 BRAKE_M_S2 = 0.3
 CORNER_EARLY_M = 6.0
 NO_CHANGE = len(ACTION_MEANINGS) - 1

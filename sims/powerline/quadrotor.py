@@ -51,7 +51,7 @@ DRAG_PER_S = 0.25
 VELOCITY_GAIN_PER_S = 2.5
 INTEGRAL_GAIN_PER_S2 = 1.5
 REFERENCE_GAIN_PER_S = VELOCITY_GAIN_PER_S + DRAG_PER_S
-"""Rate at which the reference approaches the command, equal to the velocity's in still air."""
+"""Rate at which the reference velocity approaches the command, as the drone does in still air."""
 MAX_INTEGRAL_M_S2 = 2.0
 MAX_ACCELERATION_M_S2 = 6.0
 ATTITUDE_GAIN_PER_S = 12.0
@@ -185,10 +185,10 @@ def advance(drone: Drone, command_m_s: Vector, wind_m_s: Vector) -> Drone:
 def wanted_acceleration(drone: Drone, command_m_s: Vector) -> Vector:
     """Return the acceleration with which the velocity controller approaches the command.
 
-    On each axis, it is the sum of three accelerations: k (c - v) for the command c and the velocity
-    v; that of the drag at the commanded speed; and the integral of the deviation from the reference
-    velocity. Wind causes such a deviation; a change of the command does not. The result is limited
-    to 6 m/s^2.
+    On each axis, the acceleration is the sum of three terms: k (c - v) with the gain k, the command
+    c and the velocity v; the acceleration that compensates drag at the commanded velocity; and the
+    integral of the deviation from a reference velocity. Wind causes such a deviation; a change of
+    the command does not. The result is limited to 6 m/s^2.
     """
     c, v, i = command_m_s, drone.velocity_m_s, drone.integral_m_s2
     return Vector(_asked(c.x, v.x, i.x), _asked(c.y, v.y, i.y), _asked(c.z, v.z, i.z))
@@ -267,7 +267,7 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     q' = q (0, omega) / 2. Here, m is the mass, v the velocity, g gravity, R the rotation from body
     to world axes, f the total thrust in body axes, d the drag coefficient, w the wind, J the
     inertia, omega the angular velocity, and q the attitude. Each thrust follows its command with a
-    lag of 20 ms. The attitude and position are advanced with the new rates and velocity.
+    lag of 20 ms. The attitude is integrated with the new omega, the position with the new v.
     """
     share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(
@@ -296,7 +296,7 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
 
 @inlined
 def _turned(rates_rad_s: Vector, thrusts: Rotors) -> Vector:
-    """Return the angular velocity after 2 ms."""
+    """Return the angular velocity after the thrusts act on the body for 2 ms."""
     right, left = thrusts.front_right + thrusts.rear_right, thrusts.front_left + thrusts.rear_left
     front, rear = thrusts.front_right + thrusts.front_left, thrusts.rear_right + thrusts.rear_left
     one_way = thrusts.front_right + thrusts.rear_left

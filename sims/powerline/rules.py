@@ -37,7 +37,7 @@ ACTION_MEANINGS = (
     "no change",
 )
 DIRECTIONS: NDArray[np.float64] = np.vstack([np.eye(3), -np.eye(3), np.zeros((1, 3))])
-"""(7, 3) velocity change of each action along x, y and z, in steps."""
+"""(7, 3) velocity change of each action along x, y and z, in units of the velocity step."""
 
 DECISION_S = 0.5
 CHECK_S = 0.1
@@ -45,10 +45,10 @@ CHECK_S = 0.1
 VELOCITY_STEP_M_S = 0.5
 MAX_COMMAND_M_S = 8.0
 APPROACH_S = 5.0
-"""Duration of the flight from the first point of the line before the first decision."""
+"""Duration of the approach: the flight from the first point before the first decision."""
 FIRST_COMMAND_M_S = (1.0, -0.5, -1.0)
-"""Command of that flight; from the published (1, -0.67, -0.8), steps of 0.5 m/s cannot return to
-hovering."""
+"""Command of the approach, in multiples of 0.5 m/s, so that actions can change it to 0. From the
+published (1, -0.67, -0.8), actions could not command hovering."""
 
 MAX_DISTANCE_M = 7.0
 WIRE_CLEARANCE_M = 0.6
@@ -59,7 +59,7 @@ FINISH_M = 1.0
 FAILURE_REWARD = -5.0
 FINISH_REWARD = 5.0
 BEST_PROGRESS_M = 2.5
-"""Progress per decision with the highest reward; equals 5 m/s."""
+"""Progress per decision that has the highest reward; corresponds to 5 m/s."""
 DISTANCE_SCALE_M = 4.0
 FLYING, OFF_LINE, COLLISION, FINISHED = 0, 1, 2, 3
 REASONS = ("", "off_line", "collision", "finished")
@@ -133,7 +133,7 @@ def begin(position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
 
 @compiled
 def approach(plant: int, position_m: Vector, command_m_s: Vector, wind_m_s: Vector) -> Flight:
-    """Return the flight of a drone that hovered at a position and got a command 5 s ago."""
+    """Return the flight of a drone that hovers at a position, then follows a command for 5 s."""
     drone = cruising(position_m, Vector(0.0, 0.0, 0.0))
     drone = fly(plant, drone, command_m_s, wind_m_s, APPROACH_S)
     along_m = nearest_on_line(drone.position_m).along_m
@@ -190,10 +190,11 @@ def end_of(position_m: Vector, place: Place) -> int:
 def reward_of(furthest_m: float, after: Flight, end: int) -> float:
     """Return the reward of a decision.
 
-    It is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from the line,
-    and ds is its progress beyond `furthest_m`, the maximum before the decision. The finish adds 5;
-    a failure gives -5 instead. The reward decreases beyond 5 m/s. If it were constant there, an
-    agent that discounts rewards would fly too fast, although a crash forfeits further rewards.
+    The reward is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from
+    the line, and ds is its progress beyond `furthest_m`, the maximum before the decision. Finishing
+    adds 5; a failure has the reward -5 instead. The reward decreases beyond 5 m/s. If it were
+    constant there, an agent that discounts rewards would fly too fast, although a crash forfeits
+    further rewards.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD

@@ -35,7 +35,7 @@ DISC: Color = (0.85, 0.88, 0.92, 0.45)
 GRASS = (0.42, 0.52, 0.34)
 NEEDLES = (0.16, 0.33, 0.20)
 UP_A_LITTLE = np.array([0.0, 0.0, 1e-3])
-"""Offset of arrows; viewers reject an arrow of length 0."""
+"""Offset of an arrow's tip that prevents the length 0, which viewers reject."""
 CORNERS_PER_M = 4
 """Rounding of surface corners to 1/4 m, which reduces their size in a log to a third."""
 GROUND_X_M = np.concatenate(
@@ -44,7 +44,7 @@ GROUND_X_M = np.concatenate(
 GROUND_Y_M = np.linspace(-260, 345, 17)
 """NED grid of the drawn ground, coarser than that of the depth camera."""
 FIR_CORNERS = np.array([[1.0, 0.0], [-0.5, 0.75], [-0.5, -0.75]])
-"""Foot of a drawn fir, relative to half its side."""
+"""Base corners (x, y) of a drawn fir, as multiples of half the base's side."""
 SHADES = 8
 """Number of brightness levels of surfaces; the angle to the sun determines the level."""
 SUN = np.array([0.45, 0.35, 0.82])
@@ -79,7 +79,7 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
 def _fir(tree: course.Tree) -> Floats:
     """Return a fir as a pyramid with three sides in ROS axes, (3, 3, 3) meters."""
     half_m = 0.5 * camera.TREE_SIDE_M * tree.height_m
-    # The drawn ground is up to 1 m lower than the real one.
+    # The drawn ground is up to 1 m too low; without this offset, firs would float.
     foot_z_m = course.ground_height(tree.x_m, tree.y_m) - 1.0
     foot = np.array([tree.x_m, -tree.y_m, foot_z_m])
     corners = foot + np.pad(half_m * FIR_CORNERS, ((0, 0), (0, 1)))

@@ -49,7 +49,7 @@ def draw_wind(random: np.random.Generator, greatest_m_s: float) -> Vector:
 def start_on_line(
     random: np.random.Generator, plant: int, command: tuple[float, float, float], wind: Vector
 ) -> Flight:
-    """Return the flight of a drone that hovered near the first point and got a command 5 s ago."""
+    """Return a flight that hovers near the first point, then follows a command for 5 s."""
     noise = random.uniform(-FIRST_POINT_NOISE_M, FIRST_POINT_NOISE_M, 3)
     position = Vector(*(POINTS_M[0] + noise).tolist())
     return approach(plant, position, Vector(*command), wind)

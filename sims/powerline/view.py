@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 VIEW_M = 50.0
 STRIP_TOP_PX, STRIP_BOTTOM_PX = 430, SIDE_PX - 34
 STRIP_M = 180.0
-"""Length of the line in the strip; heights have the same scale."""
+"""Length of the part of the line that the strip shows; heights have the same scale."""
 DRONE_DOWN_PX = 45
 """Distance of the drone from the top of the strip."""
 _SKY = (158, 188, 212)

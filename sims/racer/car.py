@@ -28,7 +28,7 @@ class Car(NamedTuple):
     course_rad: float
     """Direction of travel; equals the heading unless the car drifts."""
     speed_px: float
-    """Speed along the course, pixels per step; negative backward."""
+    """Speed in the direction `course_rad`, pixels per step; negative when reversing."""
     next_gate: float
     gates: float
     """Number of gates passed since the start."""
@@ -45,7 +45,7 @@ class Car(NamedTuple):
 
 
 STARTED_AT = len(Car._fields)
-"""Index, in a car's row, of the initial distance along the path, which follows the `Car`."""
+"""Index in a car's row, after the `Car` fields: distance along the path at the episode's start."""
 
 
 @compiled
@@ -66,7 +66,7 @@ def store_car(car: Car, row: NDArray[np.float64]) -> None:
 def placed(
     track: Track, x_px: float, y_px: float, heading_rad: float, speed_px: float, near_m: float
 ) -> Car:
-    """Return a car on a track before its first step; the gate ahead is its next gate.
+    """Return a car on a track before its first step. Its next gate is the nearest gate ahead.
 
     The function searches for the car's position along the path within half a lap of `near_m`.
     """

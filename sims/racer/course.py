@@ -54,7 +54,7 @@ CONTROL_POINTS_PX = (
 
 _SAMPLES_PER_SPAN = 32
 _STRAIGHT_PX = 220.0
-"""Length of a straight with the same number of walls as a turn of 1 rad."""
+"""Length of a straight that is divided into as many walls as a bend of 1 rad."""
 _MARGIN_PX = 6.0
 _TIGHTEST_PX = 62.0
 """Minimum distance of random tracks from the image's edge, and minimum radius of their turns."""
@@ -100,7 +100,7 @@ def asphalt(track: Track) -> Floats:
 def _progress(path: Path, corners_px: Floats) -> list[float]:
     """Return the distance along the path to each wall corner of one side.
 
-    The last item is for the first corner again, one lap later: the length of the path.
+    The last item is the length of the path: the distance to the first corner after one lap.
     """
     rest = [project(path, x, y, 0.0, path.length_m).along_m for x, y in to_map(corners_px[1:])]
     return [0.0, *rest, path.length_m]
@@ -175,7 +175,7 @@ def _along(line: Floats) -> Floats:
 
 
 def _at(values: Floats, along: Floats, places: Floats) -> Floats:
-    """Interpolate values (M, 2), which are given at distances `along`, to distances `places`."""
+    """Interpolate values (M, 2), known at the distances `along`, at the distances `places`."""
     return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
 
 
@@ -199,11 +199,11 @@ def _gate(middle: Floats, normal: Floats, walls: Floats) -> Floats:
 
 
 def _distance(start: Floats, direction: Floats, walls: Floats) -> float:
-    """Return the distance to the nearest wall in a direction, pixels."""
+    """Return the distance from a point to the nearest wall in a direction, pixels."""
     edge = walls[:, 2:] - walls[:, :2]
     to_wall = walls[:, :2] - start
     cross = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
-    # A parallel wall is at an infinite distance.
+    # Infinity results in the distance 0, so that a parallel wall is ignored.
     cross[cross == 0.0] = math.inf
     distance = (to_wall[:, 0] * edge[:, 1] - to_wall[:, 1] * edge[:, 0]) / cross
     share = (to_wall[:, 0] * direction[1] - to_wall[:, 1] * direction[0]) / cross
@@ -240,7 +240,7 @@ def _drivable(controls: Floats) -> bool:
 
 
 def _apart(center: Floats) -> bool:
-    """Return whether distant parts of the line are at least a track's width apart."""
+    """Return whether points far apart along the line are at least a track's width apart."""
     along = _along(center)
     places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
     points = _at(center, along, places)

@@ -83,7 +83,8 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
     `start="anywhere"`: a random position on the track, with an offset of up to 12 pixels and 0.2
     rad from the center line. The speed is 0 to 6 pixels per step.
     `start="line"`: (50, 300) pixels, facing down in the image, with an offset of up to 3 pixels and
-    0.05 rad. The car is at rest. On a random track, it is at the start of the track's path.
+    0.05 rad. The car is at rest. On a random track, the car starts at the start
+    of the track's path.
     `reset(options={"pose": (x_m, y_m, yaw_rad)})`, optionally with the speed in m/s as a fourth
     number, starts at that pose.
 
@@ -104,13 +105,14 @@ class RacerEnv(VehicleEnv[RacerFleet, "RacerView"]):
       gates can only be passed with `back`. The observed speed is positive in the direction in
       which `forward` drives.
     - Rays that start at the front corners have lengths that are measured from the car's center. The
-      sideways ray of the left corner points right, across the nose, and vice versa.
+      sideways ray of the left corner points right, and the sideways ray of the right corner points
+      left, so both rays cross the nose of the car.
     - The hit point of a ray is rounded down to whole pixels, so that a car in the middle of a
       straight observes unequal distances.
     - Rays are observed as (1000 - d) / 1000; five of six values are between 0.8 and 1.
     - A gate is passed if it is straight ahead of the car and within 20 pixels of the car's center
-      (rounded down), hence before the car crosses it. A gate that the car crosses in any other
-      way can never be passed.
+      (rounded down), hence before the car crosses the gate. A gate that the car crosses in any
+      other way can never be passed.
     - The reward of a crash is -1 for each wall that is hit; at the joint of two walls, it is -2.
     - The start is always exactly on the line, at rest.
     - An episode is truncated after 10,000 steps.

@@ -18,9 +18,9 @@ from mcaprl.sims.vehicle.pilot import ScriptedPilot
 ROOM_EXPONENT = 1.17
 """Exponent of a ray's length in the weight of the ray."""
 TURN_BEYOND_RAD = math.radians(7.5)
-"""Half of the turn of one action."""
+"""Minimum aim angle for a turn: half of the turn of one action."""
 STOP_PX, SPEED_PER_PX, SLOWEST_PX = 38.5, 0.296, 2.0
-"""The target speed is 0.296 times the free distance ahead beyond 38.5 pixels, at least 2."""
+"""Target speed, pixels per step: 0.296 (d - 38.5), at least 2, for a free distance d ahead."""
 
 
 @compiled

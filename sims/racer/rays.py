@@ -94,7 +94,7 @@ def cast(
     Args:
         walls: (W, 4) walls.
         rays: (4, R) rays as written by `write_rays`.
-        shares: (R,) output: hit as a fraction of the ray's length; 1 without a hit.
+        shares: (R,) output: distance of the hit as a fraction of the ray's length; 1 without a hit.
     """
     x_px, y_px, dx, dy = rays[0], rays[1], rays[2], rays[3]
     shares[:] = 1.0

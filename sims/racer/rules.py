@@ -37,7 +37,7 @@ ACTION_MEANINGS = (
 )
 THROTTLE = (0, 1, 0, 0, -1, -1, -1, 1, 1)
 TURN = (0, 0, -1, 1, 0, 1, -1, -1, 1)
-"""Turn of each action; right is positive."""
+"""Turn of each action, in units of 15 degrees; right is positive."""
 
 STEP_S = 0.1
 TURN_RAD = math.radians(15.0)
@@ -45,10 +45,11 @@ SPEED_CHANGE_PX = 2.0
 MAX_SPEED_PX = 10.0
 MAX_SPEED_M_S = MAX_SPEED_PX * METERS_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
-"""Approximate maximum course change of a drifting car per step at top speed; more if slower."""
+"""Approximate limit of a drifting car's course change per step at top speed. At lower speeds, the
+limit is larger."""
 
 BACK_M, AHEAD_M = 4.0, 8.0
-"""Search window of the nearest path point, relative to the last one."""
+"""Search window for the nearest path point: distances before and after the last one."""
 
 CORNER_PX_2 = 0.25 * (CAR_LENGTH_PX**2 + CAR_WIDTH_PX**2)
 """Squared distance of a corner from the car's center."""
@@ -75,7 +76,7 @@ def walls_hit(track: Track, car: Car) -> int:
         along_x, along_y = wall[2] - wall[0], wall[3] - wall[1]
         away = (wall[0] - car.x_px) * along_y - (wall[1] - car.y_px) * along_x
         if away * away > CORNER_PX_2 * (along_x * along_x + along_y * along_y):
-            # The line through the wall is farther from the car's center than any corner.
+            # The wall cannot hit the car: its line is farther from the center than any corner.
             continue
         for i in range(4):
             (x, y), (end_x, end_y) = corners[i], corners[(i + 1) % 4]
@@ -179,7 +180,7 @@ def step_cars(
 
     Args:
         track: Track of all cars.
-        cars: (N, 13) rows that begin with `Car`.
+        cars: (N, 13) rows: a `Car`, then its distance along the path at the start.
         actions: (N,) 0 to 8.
         rewards: (N,) output.
         ends: (N,) output: DRIVING, CRASH, NO_GATE or TIME_LIMIT.
@@ -227,7 +228,7 @@ def car_info(cars: NDArray[np.float64], info: NDArray[np.float64]) -> None:
     """Compute the contents of the `info` of N cars.
 
     Args:
-        cars: (N, 13) rows of a `Car`, followed by its distance along the path at the start.
+        cars: (N, 13) rows: a `Car`, then its distance along the path at the episode's start.
         info: (5, N) output: offsets, heading errors, speeds, progress and gates.
     """
     for i in range(len(cars)):

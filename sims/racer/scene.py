@@ -1,7 +1,7 @@
 """Scene of the racer sim: track, walls, gates, the car and its rays.
 
 Frames: `map` (x and y on the ground, z up) and `car` (on the ground under the car's middle, x
-forward, y left). One pixel of the rules is 0.1 m here.
+forward, y left). The rules use pixels; the scene draws a pixel as 0.1 m.
 """
 
 from __future__ import annotations

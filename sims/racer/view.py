@@ -22,7 +22,7 @@ KEY_PX = 32
 _KEYS = {"forward": (1, 0), "left": (0, 1), "back": (1, 1), "right": (2, 1)}
 """Column and row of each key."""
 _ARROWS = {"forward": (0, -1), "left": (-1, 0), "back": (0, 1), "right": (1, 0)}
-"""Direction of the arrow on each key: right and down."""
+"""Direction of the arrow on each key: components to the right and down."""
 
 
 class RacerView:

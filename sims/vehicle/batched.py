@@ -78,7 +78,7 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._truncates = np.array(fleet.truncates)
         self._some_truncate = bool(self._truncates.any())
-        # The reason for `GOING_ON` is None.
+        # None at index `GOING_ON`: a running episode has no reason for its end.
         self._reasons = np.array([None, *fleet.reasons[GOING_ON + 1 :]], dtype=object)
         self._max_steps = np.iinfo(np.int64).max if max_episode_steps is None else max_episode_steps
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -131,9 +131,9 @@ class BatchedEnv(VectorEnv[Any, Any, NDArray[Any]]):
         if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
             raise UsageError(
                 f"episodes {np.flatnonzero(self._ended).tolist()} have ended and autoreset is"
-                " disabled: reset(options={'reset_mask': terminated | truncated}) first"
+                " disabled: call reset(options={'reset_mask': terminated | truncated}) first"
             )
-        # This step resets the environments whose episodes ended before this step.
+        # `NextStep`: this step resets the environments whose episodes ended before the step.
         fresh, fleet = self._ended.copy(), self.fleet
         if fleet.noise.size:
             for i in np.flatnonzero(~fresh).tolist():

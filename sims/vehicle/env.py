@@ -28,7 +28,7 @@ class View(Protocol):
 
 
 Frames = Sequence[Any]
-"""Moving frames at one moment, each a `mcaprl.sims.drawing.scene.Frame`."""
+"""Moving coordinate frames at one moment, each a `mcaprl.sims.drawing.scene.Frame`."""
 AnyFleet = TypeVar("AnyFleet", bound=Fleet)
 AnyView = TypeVar("AnyView", bound=View)
 
@@ -93,12 +93,12 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self.action_space = spaces.Discrete(len(fleet.action_meanings))
         self.observation_space = fleet.observation_space
         self._noise_size = fleet.noise.shape[1]
-        # Attributes of this object are found faster than attributes of the fleet.
+        # Copies of the fleet's attributes: one attribute lookup per step instead of two.
         self._step_one = fleet.step_one
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        # While watched: the current state, and the state before the last step with its action.
+        # While watched: the current state; and the last step as (state before the step, action).
         self._now: Any = None
         self._last_step: tuple[Any, int] | None = None
 
@@ -130,7 +130,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # This call raises the error. To save time, valid actions do not reach it.
+            # This call raises the error. The quick test above spares valid actions the slower call.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -207,7 +207,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Pair the frames within a step with the time to the step's end; omit the frames at the end.
+    """Return the frames within a step, with the times to its end; omit the frames at its end.
 
     Args:
         moments: Frames at equal intervals of the step, the last at its end.

@@ -106,7 +106,7 @@ class Fleet(ABC):
 
     @cached_property
     def _observe_only(self) -> Callable[[], NDArray[np.float32]]:
-        """Function that returns a copy of the first vehicle's observed numbers."""
+        """Bound method that copies the first vehicle's observed numbers."""
         copy: Callable[[], NDArray[np.float32]] = self._seen[0].copy
         return copy
 

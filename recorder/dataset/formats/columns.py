@@ -1,4 +1,4 @@
-"""Conversion of arrays of episodes, which most formats store, to datasets."""
+"""Conversion of arrays per episode, as most formats store them, to a dataset."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class EpisodeArrays:
         times_ns: (T + 1,) time of each observation, nanoseconds since the Unix epoch; None if
             unknown.
         infos: Masked array of T + 1 rows for each info, by its dotted name.
-        summary: Fields of `EpisodeSummary` that the format knows: seed, reason, policy, ...
+        summary: Fields of `EpisodeSummary` that the format stores: seed, reason, policy, ...
     """
 
     observations: Any
@@ -122,7 +122,7 @@ def _times(episodes: Sequence[EpisodeArrays]) -> NDArray[np.int64]:
 
 
 def _last_rows(lengths: NDArray[np.int64], flags: Sequence[bool]) -> NDArray[np.bool_]:
-    """Return a column (N,) with the flag of each episode in its last row, otherwise False."""
+    """Return a column (N,): each episode's flag in its last row, and False in all other rows."""
     column = np.zeros(int(lengths.sum()), bool)
     column[np.cumsum(lengths) - 1] = flags
     return column

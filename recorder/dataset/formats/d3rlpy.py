@@ -42,7 +42,7 @@ _KEYS = ("observations", "actions", "rewards", "terminated")
 
 
 def matches(path: Path) -> bool:
-    """Return whether a path is a file of d3rlpy's `dump`."""
+    """Return whether a path is a file that d3rlpy's `dump` wrote."""
     if not nodes.is_hdf5(path):
         return False
     with nodes.opened(path) as file:
@@ -61,8 +61,8 @@ def to_mdp_dataset(dataset: Dataset) -> Any:
         d3rlpy = import_extra("d3rlpy", "")
     except MissingExtraError as error:
         raise MissingExtraError(
-            "d3rlpy is not installed: pip install --no-deps d3rlpy, and what it imports:"
-            " docs/formats.md lists it"
+            "d3rlpy is not installed: run pip install --no-deps d3rlpy, and install the"
+            " dependencies that docs/formats.md lists"
         ) from error
     space, kinds = dataset.action_space, d3rlpy.ActionSpace
     # Without these arguments, d3rlpy treats all integer actions as discrete, and infers the number
@@ -126,13 +126,15 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     h5py = import_extra("h5py", nodes.EXTRA)
     infos, lost = stored_infos(infos_of(dataset))
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the others")
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
     try:
         _check_action_space(dataset.action_space)
     except SpaceError as error:
         if not lossy:
-            raise SpaceError(f"{error}; pass --lossy (lossy=True in Python) to write it") from error
-        lost.append(f"{error}: they are written as they are")
+            raise SpaceError(
+                f"{error}; pass --lossy (lossy=True in Python) to write them unchanged"
+            ) from error
+        lost.append(f"{error}; they are written unchanged")
     with h5py.File(path, "w") as file:
         for index, part in enumerate(_episodes_of(dataset)):
             for name, values in part.items():
@@ -150,7 +152,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
 
 
 def read(path: Path) -> Dataset:
-    """Read a file of d3rlpy's `dump`, or of `write`.
+    """Read a file that d3rlpy's `dump` or `write` wrote.
 
     The file does not state whether actions are discrete. They are read as discrete if each step has
     one integer.
@@ -164,7 +166,7 @@ def read(path: Path) -> Dataset:
         version = str(nodes.array_in(file, "version"))
         if version != VERSION:
             raise LogError(
-                f"{path} is of version {version} of d3rlpy's files; expected {VERSION}:"
+                f"{path} has version {version} of d3rlpy's file format, expected {VERSION}:"
                 " load it with d3rlpy and dump it again"
             )
         count = _whole_number(file, "num_episodes", path)
@@ -179,9 +181,9 @@ def read(path: Path) -> Dataset:
 
 def _check_action_space(space: spaces.Space[Any]) -> None:
     if isinstance(space, spaces.Discrete) and space.start != 0:
-        raise SpaceError(f"the actions are {space}; d3rlpy has discrete actions from 0 only")
+        raise SpaceError(f"the actions are {space}; d3rlpy needs actions that start at 0")
     if isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary):
-        raise SpaceError(f"the actions are {space}; d3rlpy has discrete or continuous actions")
+        raise SpaceError(f"the actions are {space}; d3rlpy supports only Discrete and Box")
 
 
 def _episodes_of(dataset: Dataset) -> Iterator[dict[str, Any]]:
@@ -217,7 +219,7 @@ def _flags(episode: Mapping[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.
 def _dataset_of(
     episodes: Sequence[Mapping[str, Any]], action_space: spaces.Space[Any] | None, where: object
 ) -> Dataset:
-    """Return a dataset of d3rlpy's episodes, whose spaces are inferred if needed."""
+    """Convert d3rlpy's episodes to a dataset; infer the spaces, except a given `action_space`."""
     if not episodes:
         raise LogError(f"{where} has no episodes")
     frames = [_frames(episode) for episode in episodes]
@@ -290,7 +292,9 @@ def _check_arrays(episode: Mapping[str, Any], where: str) -> None:
     parts = [*stored] if isinstance(stored, list) else [stored]
     parts += [episode["actions"], episode["rewards"]]
     if any(part.ndim < 2 for part in parts) or len({len(part) for part in parts}) > 1:
-        raise LogError(f"{where} has arrays of shapes {[part.shape for part in parts]}")
+        raise LogError(
+            f"{where} has arrays of shapes {[part.shape for part in parts]}, expected (steps, ...)"
+        )
     if any(part.dtype.kind not in "biuf" for part in (*parts, episode["terminated"])):
         raise LogError(f"{where} has arrays that are not numbers")
     if not parts[-1].size or parts[-1].shape[1] != 1 or episode["terminated"].ndim:

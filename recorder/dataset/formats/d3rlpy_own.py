@@ -58,7 +58,7 @@ def write_own(group: Any, dataset: Dataset, infos: Mapping[str, StoredInfo]) -> 
 
 
 def read_own(file: Any, episodes: Sequence[Mapping[str, Any]], path: Path) -> Dataset | None:
-    """Return the dataset that `write_own` stored; None if the episodes were changed since."""
+    """Return the dataset that `write_own` stored; None if the episodes were changed later."""
     group = nodes.group_in(file, OWN)
     text = str(nodes.array_in(group, _DESCRIPTION))
     metadata, summaries, names = parse_description(text, path)
@@ -75,7 +75,7 @@ def read_own(file: Any, episodes: Sequence[Mapping[str, Any]], path: Path) -> Da
     same &= all(len(values) == len(times) for values in infos.values())
     if not same or any(len(final) != terminated for final in finals):
         warnings.warn(
-            f"{path}: {OWN} is ignored, because the episodes were changed after it was written",
+            f"{path}: the group {OWN} is ignored, because the episodes were changed afterwards",
             stacklevel=4,
         )
         return None
@@ -121,7 +121,9 @@ def restored_rows(leaf: Leaf, values: NDArray[Any]) -> NDArray[Any]:
     """Convert rows from the form of `stored_rows` back to (N, *shape)."""
     empty = np.empty((1, *leaf.shape), leaf.dtype)
     if values.shape[1:] != stored_rows(leaf, empty).shape[1:]:
-        raise LogError(f"{leaf.name} has rows of shape {values.shape[1:]}")
+        raise LogError(
+            f"{leaf.name} has rows of shape {values.shape[1:]}, which do not fit its space"
+        )
     is_moved = values.ndim == 4 and values.shape[1:] != leaf.shape and len(leaf.shape) == 3
     ordered = np.moveaxis(values, 1, -1) if is_moved else values
     return ordered.reshape(len(values), *leaf.shape)

@@ -25,7 +25,7 @@ NAMES = {
     "next_observations": ("next_observations",),
     "behavior_probs": ("behavior_probs",),
 }
-"""The names of each array of `Dataset.from_arrays`; the first that is there is read."""
+"""Accepted names of each array of `Dataset.from_arrays`; a file may contain only one of them."""
 _REQUIRED = ("observations", "actions", "rewards", "terminated")
 _COLUMNS = ("rewards", "terminated", "truncated", "behavior_probs")
 
@@ -42,8 +42,8 @@ def flat_dataset(
     Args:
         found: Arrays of N rows by the names in `NAMES`. The observations may be nested dicts.
         where: Name of the source, for errors and warnings.
-        infos: Arrays by dotted name. The arrays of N rows are the infos of the N observations; the
-            final observations have no infos.
+        infos: Arrays by dotted name. An array of N rows is read as an info of the N observations;
+            the final observations have no infos. Other arrays are ignored.
 
     Raises:
         LogError: An array is missing.
@@ -69,7 +69,7 @@ def flat_dataset(
 
 
 def rows_of_tree(tree: Any, rows: Any) -> Any:
-    """Return rows of an array or of nested dicts of arrays."""
+    """Index an array, or each array in nested dicts, with `rows`."""
     if isinstance(tree, Mapping):
         return {key: rows_of_tree(part, rows) for key, part in tree.items()}
     return tree[rows]
@@ -94,7 +94,7 @@ def _named(found: Mapping[str, Any], where: object) -> dict[str, Any]:
 
 
 def _one_column(values: Any) -> NDArray[Any]:
-    """Return (N,) for an array (N, 1)."""
+    """Convert an array (N, 1) to (N,); return other arrays unchanged."""
     array = np.asarray(values)
     return array[:, 0] if array.ndim == 2 and array.shape[1] == 1 else array
 
@@ -104,7 +104,7 @@ def _is_info(values: NDArray[Any], count: int) -> bool:
 
 
 def _info_rows(infos: Mapping[str, NDArray[Any]], first: int, last: int, count: int) -> Any:
-    """Return the rows [first, last) of infos, followed by missing rows up to `count` rows."""
+    """Return the rows [first, last) of each info; append masked rows up to `count` rows."""
     is_missing = np.arange(count) >= last - first
     return {
         name: masked(np.resize(values[first:last], (count, *values.shape[1:])), is_missing)
@@ -163,8 +163,8 @@ def _without_next(
 def _warn(where: object, terminal: int, dropped: int) -> None:
     found = []
     if terminal:
-        found.append(f"the {terminal} observations after terminal steps repeat those before")
+        found.append(f"{terminal} terminal steps repeat their observation as next observation")
     if dropped:
-        found.append(f"{dropped} last steps of episodes without a terminal step are left out")
+        found.append(f"the last steps of {dropped} episodes without a terminal step are left out")
     if found:
         warnings.warn(f"{where} has no next_observations: {', and '.join(found)}", stacklevel=5)

@@ -68,16 +68,16 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     info_names, lost_names = nested_names(infos)
     lost += lost_names
     if isinstance(dataset.observation_space, spaces.Dict):
-        lost.append("a Dict observation is one array for each key, which D4RL does not read")
+        lost.append("a Dict observation becomes one array for each key, which D4RL cannot read")
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write it")
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
     slices = episode_slices(dataset)
     lasts = np.array([steps.stop - 1 for steps, _ in slices])
     timeouts = dataset.truncated.copy()
     timeouts[lasts] |= ~dataset.terminated[lasts]
     changed = int((timeouts != dataset.truncated).sum())
     if changed:
-        lost.append(f"{changed} episodes that end without a flag end with a timeout")
+        lost.append(f"{changed} episodes that end without an end flag are written with a timeout")
     space, _ = nodes.with_names_for_hdf5(dataset.observation_space)
     names = ["".join(f"/{key}" for key in leaf.path) for leaf in observation_leaves(space)]
     with h5py.File(path, "w") as file:
@@ -127,7 +127,7 @@ def read(path: Path) -> Dataset:
 
 
 def _own(file: Any, path: Path) -> Dataset | None:
-    """Return the dataset that `write` stored; None if the arrays have different lengths now."""
+    """Return the dataset that `write` stored; None if array lengths were changed afterwards."""
     own = nodes.group_in(file, OWN)
     text = str(nodes.array_in(own, _DESCRIPTION))
     metadata, summaries, names = parse_description(text, path)
@@ -146,7 +146,7 @@ def _own(file: Any, path: Path) -> Dataset | None:
     same = sum(lengths) == count and all(len(array) == count for array in rows)
     if not same or len(parts["log_time_ns"]) != count + len(lengths) or min(lengths) < 1:
         warnings.warn(
-            f"{path}: {OWN} is ignored, because the arrays were changed after it was written",
+            f"{path}: the group {OWN} is ignored, because the arrays were changed afterwards",
             stacklevel=4,
         )
         return None
@@ -189,7 +189,10 @@ def _own_infos(
             for group in (_FINALS, MISSING)
         )
         if len(steps) != sum(lengths) or len(last) != len(finals):
-            raise LogError(f"{file.filename}: {INFOS}/{array} has {len(steps)} rows")
+            raise LogError(
+                f"{file.filename}: {INFOS}/{array} has {len(steps)} rows, which does not fit"
+                " episode_lengths"
+            )
         steps = steps.astype(np.result_type(steps, last))
         rows = np.insert(steps, finals - np.arange(len(finals)), last, axis=0)
         found[name] = masked(rows, missing.astype(bool), dtype)

@@ -21,12 +21,12 @@ from mcaprl.errors import LogError, McaprlError, import_extra
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 EXTRA = "interop"
-# HDF5's filters compress data to 1/1032 of its size at most. If an array is larger than this ratio
-# allows, its shape was declared, but its values were never written.
+# HDF5's filters reach a compression ratio of at most 1032. If the declared size of an array exceeds
+# its stored size by a larger factor, some of its values were never written.
 _MAX_RATIO = 2_000
 _SMALL_BYTES = 1 << 20
 _CHUNK_BYTES = 1 << 18
-_ELSEWHERE = "is stored in another file: copy it into one file"
+_ELSEWHERE = "is stored in another file: copy it into this file"
 
 
 def is_hdf5(path: Path) -> bool:
@@ -43,7 +43,7 @@ def opened(path: Path) -> Iterator[Any]:
     """Open a file for reading.
 
     Raises:
-        LogError: The file is missing, or a part that is read is damaged.
+        LogError: The file is missing, or the caller reads damaged data.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_extra("h5py", EXTRA)
@@ -94,13 +94,13 @@ def group_in(parent: Any, name: str) -> Any:
 
 
 def array_in(parent: Any, name: str) -> NDArray[Any]:
-    """Read an array; text becomes strings.
+    """Read an array; variable-length strings become NumPy strings.
 
     Raises:
         LogError: There is no such array, or it is not stored in this file.
     """
     h5py = import_extra("h5py", EXTRA)
-    # h5py's lower level is used, because it is several times as fast for small arrays.
+    # h5py's low-level API is used, because it is several times as fast for small arrays.
     found = _identifier(parent, name)
     space = found.get_space() if isinstance(found, h5py.h5d.DatasetID) else None
     if space is None or space.get_simple_extent_type() == h5py.h5s.NULL:
@@ -114,7 +114,7 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
             f"{_place(parent, name)} has shape {shape}, but only {stored} bytes are stored"
         )
     if dtype.kind == "V":
-        raise LogError(f"{_place(parent, name)} has fields, not numbers")
+        raise LogError(f"{_place(parent, name)} has a compound type, expected numbers")
     if dtype.kind == "O":
         return _objects(h5py.Dataset(found), _place(parent, name))
     values = np.empty(shape, dtype)
@@ -124,7 +124,7 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
 
 
 def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
-    """Read the array at a path of names; an integer in the path is an index in a Tuple of Minari.
+    """Read the array at a path; an integer k in it means `_index_k`, member k of a Minari Tuple.
 
     Raises:
         LogError: There is no such array, or it is not stored in this file.

@@ -35,7 +35,7 @@ class StoredInfo(NamedTuple):
     dtype: np.dtype[Any]
 
     def rows(self, rows: Any) -> StoredInfo:
-        """Return some of the rows."""
+        """Return this info with only the given rows."""
         return self._replace(values=self.values[rows], is_missing=self.is_missing[rows])
 
 
@@ -90,7 +90,7 @@ def info_type(text: str) -> np.dtype[Any]:
 
 
 def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list[str]]:
-    """Split dotted names into the names of groups and an array.
+    """Split each dotted name into the names of nested groups and of an array.
 
     Returns:
         The parts of each name, and one sentence for each name that cannot be split.
@@ -102,7 +102,7 @@ def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list
         parts = tuple(name.split("."))
         is_group = any(other.startswith(f"{name}.") for other in every)
         if is_group or not all(parts) or re.search(r"[/\0\ud800-\udfff]", name):
-            reason = "another info is below it" if is_group else "HDF5 cannot hold its name"
+            reason = "it is also a group of infos" if is_group else "HDF5 cannot hold its name"
             lost.append(f"the info '{name}' is left out, because {reason}")
         else:
             found[name] = parts

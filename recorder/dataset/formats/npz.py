@@ -51,7 +51,7 @@ _BLOCK_ROWS = 1024
 
 
 def matches(path: Path) -> bool:
-    """Return whether a path is a file of NumPy arrays by name."""
+    """Return whether a path is a .npz file."""
     return path.suffix == ".npz" and path.is_file()
 
 
@@ -71,7 +71,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     """
     infos, lost = stored_infos(infos_of(dataset))
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the others")
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the rest")
     leaves = leaves_of(dataset.observation_space)
     names = [array_name(leaf) for leaf in leaves]
     slices = episode_slices(dataset)
@@ -108,7 +108,7 @@ def read(path: Path) -> Dataset:
         SpaceError: A log cannot store a dtype.
     """
     try:
-        # NumPy does not close a file that is no archive.
+        # NumPy does not close a file that is not an archive.
         with path.open("rb") as file, zipfile.ZipFile(file):
             file.seek(0)
             with np.load(file, allow_pickle=False) as archive:
@@ -167,7 +167,7 @@ def description_text(
 
 
 def parse_description(text: str, where: object) -> tuple[LogMetadata, list[dict[str, Any]], Any]:
-    """Parse what `description_text` wrote: metadata, fields of each summary, and names.
+    """Parse the text of `description_text`: metadata, fields of each summary, and array names.
 
     Raises:
         LogError: The text is damaged.

@@ -7,8 +7,8 @@ fixed-size list in C order; the field's metadata has its shape. The metadata of 
 spaces, as `tables.described` writes them.
 
 `episodes.parquet` has a row for each episode: the fields of `EpisodeSummary`, `final_log_time_ns`
-and the last observation, `final_observation`. The columns `next_observation` are for other tools:
-they are not read.
+and the last observation, `final_observation`. The columns of next observations are for
+other tools; `read` ignores them.
 
 The columns `info.<name>` contain the infos of each step, and `reset_info.<name>` the infos of each
 reset. A null means that the environment returned no info.
@@ -118,7 +118,7 @@ def read(path: Path) -> Dataset:
         np.arange(lengths.sum()) - np.repeat(first_steps, lengths),
     )
     if not all(map(np.array_equal, numbers, expected)):
-        raise LogError(f"{path}: {TRANSITIONS} and {EPISODES} do not have the same steps in order")
+        raise LogError(f"{path}: {TRANSITIONS} and {EPISODES} contain different or reordered steps")
     leaves, action = leaves_of(metadata.observation_space), action_leaf(metadata.action_space)
     columns = Transitions(
         frames=tuple(
@@ -149,7 +149,7 @@ def read(path: Path) -> Dataset:
 
 
 class _Table:
-    """A table that was read from a file, without the columns that are not needed.
+    """A table that was read from a file, without the columns of next observations.
 
     Raises:
         LogError: The file is damaged.
@@ -275,7 +275,7 @@ def _is_number(arrow: Any, kind: Any) -> bool:
 
 
 def _blocks(columns: Transitions) -> Iterator[tuple[int, Transitions]]:
-    """Yield groups of episodes of about `_BLOCK_BYTES`, and the index of the first episode."""
+    """Yield blocks of about `_BLOCK_BYTES`: the index of the first episode, and the columns."""
     frame_bytes = sum(part.nbytes // len(part) for part in (*columns.frames, columns.actions))
     sizes = np.cumsum(columns.lengths * max(frame_bytes, 1)) // _BLOCK_BYTES
     firsts = np.flatnonzero(np.diff(sizes, prepend=-1)).tolist()
@@ -288,7 +288,7 @@ def _settings(arrow: Any, table: Any) -> dict[str, Any]:
 
     Dictionary encoding is only used for columns of bytes, strings and episode indexes. It makes
     columns of bytes smaller, because Parquet stores each byte in four bytes without it. For other
-    columns, it would replace all NaN values by one of them, and many distinct values would be slow.
+    columns, it would give all NaN values the same bits, and would be slow for many distinct values.
     """
     small = []
     for field in table.schema:

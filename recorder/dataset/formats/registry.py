@@ -83,7 +83,7 @@ def recognized(path: str | Path) -> Format | None:
 
 
 def other_format(name: str | Path) -> Format | None:
-    """Return the format of another tool's dataset; None for logs and what is unknown."""
+    """Return the format of another tool's dataset; None for logs and unknown formats."""
     path = Path(name)
     if is_url(name) or path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap"))):
         return None
@@ -113,7 +113,7 @@ def target_format(path: str | Path, name: str | None) -> Format:
 
 
 def target_path(path: str | Path, form: Format) -> Path:
-    """Return the file or folder of a name such as `minari:drive/lane-v0`, or of a path."""
+    """Resolve a path, or a name such as `minari:drive/lane-v0`, to a file or folder."""
     prefix = f"{form.name}:"
     if str(path).startswith(prefix) and hasattr(form.module, "local_path"):
         local: Path = form.module.local_path(str(path).removeprefix(prefix))

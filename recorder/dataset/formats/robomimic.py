@@ -60,7 +60,7 @@ def _demo(group: Any, where: str, notes: dict[str, None]) -> EpisodeArrays:
         _check_follows(observations, following, where)
         frames = joined_trees([observations, rows_of_tree(following, slice(count - 1, count))])
     elif is_done:
-        notes["without next_obs, the observation after the last step repeats the one before"] = None
+        notes["without next_obs, the last observation is also used as next observation"] = None
         frames = rows_of_tree(observations, np.minimum(np.arange(count + 1), count - 1))
     else:
         notes["without next_obs, the last step of a demonstration is left out"] = None
@@ -85,7 +85,7 @@ def _check_follows(here: Any, there: Any, where: str) -> None:
 
 
 def _bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return an array as bytes, because two NaN values only compare as equal in this form."""
+    """Return the bytes of an array; unlike floats, the bytes of two NaN values compare as equal."""
     return np.frombuffer(array.tobytes(), np.uint8)
 
 

@@ -1,9 +1,9 @@
 """Stable-Baselines3's replay buffers, filled as its algorithms fill them.
 
 SB3 stores images with the channels first, actions of a bounded Box scaled to [-1, 1], and rewards
-and float64 actions as float32. It marks the end of an episode in `dones`. If the
-episode was truncated, it also marks the end in `timeouts`, so that the learning target includes the
-value of the last observation.
+and float64 actions as float32. It marks the end of an episode in `dones`. If the episode was
+truncated, it also marks the end in `timeouts`, so that the learning target includes the value of
+the last observation.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def from_buffer(
     if not lossy and not buffer.handle_timeout_termination and buffer.dones[rows].any():
         raise LogError(
             "the replay buffer has handle_timeout_termination=False, so truncations and"
-            " terminations look the same; pass lossy=True to take all for terminations"
+            " terminations look the same; pass lossy=True to read all as terminations"
         )
     order_of = _environment_order if channels_last else _stored_order
     space = _converted(buffer.observation_space, order_of)
@@ -232,31 +232,31 @@ def _check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spa
     if isinstance(observation_space, spaces.Dict):
         for key, part in observation_space.spaces.items():
             if isinstance(part, spaces.Dict):
-                raise SpaceError(f"observation['{key}'] is a Dict; SB3 has no Dicts in Dicts")
+                raise SpaceError(f"observation['{key}'] is a Dict; SB3 cannot nest Dicts")
     for leaf, part in _parts(observation_space):
         if isinstance(part, spaces.Box) and not leaf.shape:
             raise SpaceError(f"{leaf.name} is a Box of shape (); SB3 needs at least (1,)")
         _check_integers(leaf.name, part)
     _check_integers("action", action_space)
     if isinstance(action_space, spaces.MultiBinary) and len(action_space.shape) > 1:
-        raise SpaceError(f"action is {action_space}; SB3 has MultiBinary actions of one dimension")
+        raise SpaceError(f"action is {action_space}; SB3 needs MultiBinary of one dimension")
     if isinstance(action_space, spaces.Box) and action_space.dtype.kind != "f":
-        raise SpaceError(f"action is a Box of {action_space.dtype}; SB3 has Boxes of floats")
+        raise SpaceError(f"action is a Box of {action_space.dtype}; SB3 needs a Box of floats")
 
 
 def _check_integers(name: str, space: spaces.Space[Any]) -> None:
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         return
     if np.any(space.start):
-        raise SpaceError(f"{name} is {space}; SB3 has {type(space).__name__} spaces from 0 only")
+        raise SpaceError(f"{name} is {space}; SB3 needs a {type(space).__name__} that starts at 0")
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
-        raise SpaceError(f"{name} is {space}; SB3 has MultiDiscrete spaces of one dimension")
+        raise SpaceError(f"{name} is {space}; SB3 needs MultiDiscrete of one dimension")
 
 
 def _converted(
     space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
 ) -> spaces.Space[Any]:
-    """Permute the axes of each part of an observation space as `order_of` returns for the part."""
+    """Permute the axes of each Box of a space by `order_of(box)`, unless it is None."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
     order = order_of(space)
@@ -295,7 +295,7 @@ def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
 
 
 def _scaled(space: spaces.Space[Any], actions: NDArray[Any]) -> NDArray[Any]:
-    """Return actions as SB3 stores them: those of a bounded Box in [-1, 1].
+    """Return actions as SB3 stores them: scaled to [-1, 1] for a bounded Box.
 
     Raises:
         SpaceError: An action cannot be scaled.

@@ -25,7 +25,7 @@ ACTION, REWARD, DONE, TRUNCATED = "action", "next.reward", "next.done", "next.tr
 INFO = "complementary_info."
 PROBABILITY = f"{INFO}behavior_prob"
 STEPS = (ACTION, REWARD, DONE, TRUNCATED, PROBABILITY)
-"""Features that have the values of a step, besides infos."""
+"""Features of each step: its action, reward, end flags and action probability."""
 INDEXES = ("frame_index", "episode_index", "index", "task_index")
 DEFAULTS = ("timestamp", *INDEXES)
 """Features of every dataset."""
@@ -35,7 +35,7 @@ DATA_PATH = f"data/{FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{FILE}.mp4"
 EPISODES_PATH = f"meta/episodes/{FILE}.parquet"
 OWN = "meta/mcaprl"
-"""Folder of what LeRobot has no place for."""
+"""Folder for data that LeRobot's format cannot store."""
 _HEIGHT_WIDTH_CHANNELS = ("height", "width", "channels")
 
 
@@ -200,7 +200,7 @@ def image_of(name: str, file: bytes | None) -> NDArray[Any]:
 
 
 def _is_depth(leaf: Leaf) -> bool:
-    """Return whether a leaf is a depth image: 32-bit floats (height, width[, 1])."""
+    """Return whether a leaf is a depth image: float32 (height, width[, 1]), `depth` in its key."""
     is_flat = len(leaf.shape) == 2 or (len(leaf.shape) == 3 and leaf.shape[2] == 1)
     is_named = any("depth" in word.lower() for word in leaf.path[-1:])
     return (

@@ -27,7 +27,7 @@ class Files:
         fps: Frames per second.
         episodes: Rows of the table of episodes, without statistics.
         lengths: Number of frames of each episode.
-        stops: (E,) index of the frame after each episode.
+        stops: (E,) index of the last frame of each episode, plus 1.
     """
 
     def __init__(self, path: Path) -> None:
@@ -134,7 +134,7 @@ class Files:
         rows = arrow.concat_tables(tables, promote_options="default").to_pylist()
         found = sorted(rows, key=lambda row: int(row["episode_index"]))
         if [row["episode_index"] for row in found] != list(range(len(found))):
-            raise LogError(f"{self.path}: the table of episodes has gaps")
+            raise LogError(f"{self.path}: episode_index in meta/episodes is not 0, 1, 2, ...")
         return found
 
 

@@ -21,7 +21,8 @@ from mcaprl.recorder.dataset.formats.lerobot.features import Feature
 from mcaprl.recorder.dataset.formats.lerobot.files import Files
 from mcaprl.recorder.format.metadata import LogMetadata
 
-# LeRobot uses the same tolerance. After half an hour, 32-bit floats are less precise than this.
+# LeRobot uses the same tolerance. In episodes of more than half an hour, the rounding error of the
+# 32-bit timestamps exceeds this tolerance.
 _TIME_TOLERANCE_S = 1e-4
 _OBSERVATION = "observation"
 
@@ -174,7 +175,7 @@ def _parts(files: Files, steps: Mapping[str, NDArray[Any]]) -> list[_Part]:
 
 
 def _stretches(files: Files, ends: NDArray[np.bool_]) -> Iterator[tuple[int, int, int, bool]]:
-    """Divide LeRobot's episodes after each end in `ends`.
+    """Divide LeRobot's episodes after each row in which `ends` (N,) is true.
 
     For each part, yield the index of LeRobot's episode, the first row, the last row + 1, and
     whether the part is the last one of this episode.
@@ -189,14 +190,14 @@ def _warn_of_ends(files: Files, repeated: int, dropped: int) -> None:
     if repeated:
         _warn(
             files,
-            f"the observation after the end is not stored of {repeated} episodes that end in a"
-            " terminal state; the last observation is repeated in its place",
+            f"the final observation is not stored for {repeated} episodes that end in a terminal"
+            " state; the last observation is repeated instead",
         )
     if dropped:
         _warn(
             files,
-            f"the observation after the last action is not stored of {dropped} other episodes;"
-            " that action is left out, and the episodes are marked as truncated",
+            f"the observation after the last action is not stored for {dropped} other episodes;"
+            " this action is left out, and these episodes are marked as truncated",
         )
 
 

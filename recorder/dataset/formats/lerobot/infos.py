@@ -42,7 +42,7 @@ def info_features(infos: Infos, frames: NDArray[np.int64]) -> dict[str, Feature]
 
     Args:
         infos: Infos of the dataset.
-        frames: Row (N,) of the info that each step returned.
+        frames: Indexes (N,) of the rows with the infos that the steps returned.
     """
     found: dict[str, Feature] = {}
     taken = {PROBABILITY}

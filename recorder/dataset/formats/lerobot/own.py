@@ -26,7 +26,7 @@ _SUMMARY = ("reason", "policy", "epsilon", "seed", "options")
 
 @dataclass(frozen=True)
 class Own:
-    """Metadata, final observations and summaries of E episodes.
+    """Data of E episodes that only this package stores: metadata, final observations, summaries.
 
     Attributes:
         metadata: Metadata of the log.
@@ -77,7 +77,7 @@ def write_own(path: Path, dataset: Dataset, observations: Sequence[Feature]) -> 
 
 
 def read_own(path: Path, lengths: Sequence[int]) -> Own | None:
-    """Read what `write_own` stored; None if there is nothing, or if the episodes were changed.
+    """Read the data of `write_own`; return None if it is missing or the episodes were changed.
 
     Args:
         path: Folder of the dataset.

@@ -55,7 +55,7 @@ def _own_dataset(files: Files, own: Own) -> Dataset:
     columns = []
     for leaf, name in zip(leaves, own.features, strict=True):
         values = files.values(files.features[name])
-        # In a video, a gray image has three equal channels.
+        # In a video, a gray image has three equal channels: use the first.
         shown = values[..., 0] if leaf.encoding == "mono8" else values
         columns.append(shown.reshape(len(values), *leaf.shape))
     steps = files.steps()

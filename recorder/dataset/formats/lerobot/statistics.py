@@ -23,11 +23,11 @@ _MAX_IMAGES = 100
 _MAX_ELEMENTS = 1 << 22
 
 Stats = dict[str, NDArray[Any]]
-"""Arrays by the names of `NAMES`."""
+"""Statistics as arrays, by the names in `NAMES`."""
 
 
 def sampled(feature: Feature, count: int) -> NDArray[np.int64]:
-    """Return the indexes of the evenly spaced images of an episode that the statistics use.
+    """Return evenly spaced indexes of an episode's images, from which statistics are computed.
 
     Args:
         feature: Feature of the images.
@@ -59,7 +59,7 @@ def describe(feature: Feature, values: NDArray[Any]) -> Stats:
 
 
 def pooled(episodes: Sequence[Stats]) -> Stats:
-    """Combine the statistics of the episodes to the statistics of all data.
+    """Combine the statistics of the episodes into the statistics of all data.
 
     Each quantile is the mean of the episodes' quantiles, weighted by the number of values of each
     episode.
@@ -97,7 +97,7 @@ def _of_numbers(numbers: NDArray[np.float64]) -> Stats:
 
 
 def _histogram(images: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Count the pixels of each level in each channel of images (T, pixels, C); return (C, 256)."""
+    """Return a histogram (C, 256) of the values in each channel of images (T, pixels, C)."""
     counts = np.zeros((images.shape[2], 256), np.int64)
     for image in images:
         for channel, row in enumerate(counts):
@@ -106,7 +106,7 @@ def _histogram(images: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _of_levels(counts: NDArray[np.int64]) -> Stats:
-    """Return the statistics (C,) of levels in [0, 1] that occur `counts` (C, 256) times."""
+    """Return the statistics (C,) of pixel values k / 255, given their histograms (C, 256)."""
     levels = np.arange(256) / 255
     total = int(counts[0].sum())
     mean = counts @ levels / total

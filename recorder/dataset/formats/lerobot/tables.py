@@ -96,7 +96,7 @@ def write_table(columns: dict[str, Any], path: Path) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON; NaN and infinities have the form that Python reads."""
+    """Write JSON; non-finite numbers become `NaN` and `Infinity`, which Python can read."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"{json.dumps(value, indent=4)}\n")
 

@@ -37,8 +37,8 @@ class VideoWriter:
             folder: Folder of the dataset.
             feature: Feature of the camera.
             rate: Number of images per second.
-            path: Path of a file in the folder, with placeholders for the indexes of the file.
-            max_bytes: Size after which the next file begins.
+            path: Template of file paths in the folder, with placeholders for the file's indexes.
+            max_bytes: Size of a file, in bytes, after which the next file begins.
             chunk_files: Number of files in a folder.
         """
         self._folder, self._feature, self._rate = folder, feature, rate
@@ -47,7 +47,7 @@ class VideoWriter:
         self._container: Any = None
         self._stream: Any = None
         height, width, channels = feature.shape
-        # 4:2:0 stores the color of 2 x 2 pixels, so both edges must be even.
+        # 4:2:0 stores one color for each 2 x 2 pixels, so height and width must be even.
         self._format = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
         self.info = {
             "video.height": height,
@@ -136,7 +136,7 @@ def read_frames(path: Path, times_s: NDArray[np.float64], tolerance_s: float) ->
             for frame in container.decode(stream):
                 if row == len(times_s):
                     break
-                # Several times can select the same image.
+                # Consecutive elements of `times_s` can select the same image.
                 while row < len(times_s) and abs(frame.time - times_s[row]) <= tolerance_s:
                     image = frame.to_ndarray(format="rgb24")
                     if found is None:

@@ -71,7 +71,7 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, video: bool = Fa
 
 
 def frames_per_second(step_duration_ns: int) -> int | float:
-    """Return the frame rate: a whole number if it gives exactly this step duration."""
+    """Return the frame rate, as an integer if this does not change the step duration."""
     rate = 1e9 / step_duration_ns
     whole = round(rate)
     return whole if whole and round(1e9 / whole) == step_duration_ns else rate
@@ -113,7 +113,7 @@ def _losses(dataset: Dataset, *, lossy: bool, video: bool) -> list[str]:
             if features.feature_of(name, leaf, video=True).dtype == "video"
         ]
     if found and not lossy:
-        raise SpaceError(f"{found[0]}; pass --lossy (lossy=True in Python) to write it")
+        raise SpaceError(f"{found[0]}; pass --lossy (lossy=True in Python) to write the dataset")
     return found
 
 

@@ -61,13 +61,16 @@ def array_at(table: Any, path: tuple[str | int, ...], shape: tuple[int, ...] | N
         return column.to_pylist()
     values = _values(column)
     if values is None:
-        raise LogError(f"column {'/'.join(map(str, path))} has type {column.type}")
+        raise LogError(
+            f"column {'/'.join(map(str, path))} has type {column.type}, expected numbers or"
+            " fixed-size lists without nulls"
+        )
     fits = shape is not None and values.size == len(values) * math.prod(shape)
     return values.reshape(len(values), *(shape or ())) if fits else values
 
 
 def infos_of(table: Any) -> dict[str, NDArray[Any]]:
-    """Return the infos of an episode by dotted name; infos of other types are empty arrays."""
+    """Return an episode's infos by dotted name; infos of unsupported types become empty arrays."""
     if "infos" not in table.column_names:
         return {}
     return dict(_infos_below(_whole(table["infos"]), ()))
@@ -131,7 +134,7 @@ def _values(column: Any) -> NDArray[Any] | None:
 
 
 def _whole(column: Any) -> Any:
-    """Return a column as one array."""
+    """Combine the chunks of a column into one array."""
     pyarrow = import_extra("pyarrow", "interop")
     if column.num_chunks == 1:
         return column.chunk(0)

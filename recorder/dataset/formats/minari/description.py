@@ -27,9 +27,9 @@ from mcaprl.recorder.format.spaces import action_leaf, leaves_of
 
 DATA, FILE, MAIN = "data", "metadata.json", "main_data.hdf5"
 OWN = "mcaprl"
-"""Key of what Minari has no place for, in the metadata and in each episode."""
+"""Key of data that Minari's format cannot store, in the metadata and in each episode."""
 MISSING = "missing_infos"
-"""Group of an episode with the rows without an info, in the group `OWN`."""
+"""Subgroup of an episode's group `OWN`: for each info, an array that marks its missing rows."""
 # The first version of Minari that reads images without JPEG. Minari refuses datasets whose version
 # is newer than its own.
 _MINARI_VERSION = "0.5.4"
@@ -44,7 +44,7 @@ _ABOUT = (
     "ref_max_score",
     "num_episodes_average_score",
 )
-"""Facts about a dataset that Minari stores and that mean nothing to a log."""
+"""Fields of Minari's metadata that are only copied, to and from `LogMetadata.about`."""
 _NAMESPACE_FILE = "namespace_metadata.json"
 _ID = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d+")
 
@@ -55,7 +55,7 @@ class Description:
 
     Attributes:
         metadata: Metadata of the log.
-        keys: Where each leaf of the observation is stored; see `StoredSpace`.
+        keys: Path of each leaf of the observation in the files; see `StoredSpace`.
         form: `hdf5`, `arrow` or `parquet`.
         is_jpeg: Whether large images are stored as JPEG.
         episodes: Number of episodes.
@@ -107,7 +107,7 @@ def options_for(path: Path) -> dict[str, Any]:
 
 
 def data_folder(path: Path) -> Path:
-    """Return the folder that contains a dataset's metadata: its folder `data`, or itself."""
+    """Return the folder with a dataset's `metadata.json`: the subfolder `data`, or `path`."""
     return path / DATA if (path / DATA / FILE).exists() else path
 
 
@@ -212,11 +212,13 @@ def _registered(env_id: str) -> gym.Env[Any, Any]:
             return env
     # An environment may raise errors of any type.
     except Exception as error:
-        raise SpaceError(f"{FILE} has no spaces, and '{env_id}' cannot be made: {error}") from error
+        raise SpaceError(
+            f"{FILE} describes no spaces, and '{env_id}' cannot be made: {error}"
+        ) from error
 
 
 def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata:
-    """Return the stored metadata of the log if its spaces equal Minari's, otherwise `found`."""
+    """Return the metadata stored under `OWN` if its spaces equal those of `found`, else `found`."""
     strings = raw.get(OWN)
     if not isinstance(strings, dict):
         return found

@@ -1,7 +1,7 @@
 """Reading of Minari datasets in HDF5, Arrow and Parquet form; Minari need not be installed.
 
-Minari does not return whole episodes of more than 32,767 steps when it reads its Arrow form. This
-reader does.
+Minari truncates episodes of more than 32,767 steps when it reads its Arrow form; this reader reads
+all steps.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Stored:
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
         own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
-        missing: Flags (T + 1,) of the rows without an info, and the info's dtype, by dotted name.
+        missing: By the dotted name of an info: flags (T + 1,) of its missing rows, and its dtype.
     """
 
     observations: Sequence[Any]
@@ -118,7 +118,7 @@ class _Reader:
                 raise LogError(f"{where} has {len(steps[name])} {name}, but {count} rewards")
             flags = steps[name].astype(bool)
             if flags[:-1].any():
-                raise LogError(f"{where} goes on after step {int(flags.argmax())} with {name}")
+                raise LogError(f"{where} has steps after {name} at step {int(flags.argmax())}")
             ends.append(bool(flags.any()))
         observations = [
             self._images(leaf, values, where) if is_jpeg else values
@@ -159,7 +159,7 @@ class _Reader:
         ]
 
     def warn(self) -> None:
-        """Warn of what was changed or left out."""
+        """Warn about data that was changed or left out."""
         images = [leaf.name for leaf, jpeg in zip(self._leaves, self._is_jpeg, strict=True) if jpeg]
         if images:
             warnings.warn(
@@ -175,7 +175,7 @@ class _Reader:
             )
         if self._odd_infos:
             warnings.warn(
-                f"{self._path}: infos whose rows differ or are not one for each step are left out:"
+                f"{self._path}: infos whose type, row shape or row count does not fit are left out:"
                 f" {', '.join(sorted(self._odd_infos))}",
                 stacklevel=4,
             )
@@ -192,7 +192,7 @@ class _Reader:
             rows = np.concatenate([np.zeros((first, *values.shape[1:]), values.dtype), values])
             is_missing, dtype = stored.missing.get(name, (np.arange(count + 1) < first, rows.dtype))
             if len(is_missing) == len(rows):
-                # A string dtype must have the length of the longest string.
+                # The string dtype of `rows` has the length of the longest string.
                 dtype = rows.dtype if rows.dtype.kind == "U" else dtype
                 found[name] = masked(rows, is_missing.astype(bool), dtype)
             else:
@@ -206,7 +206,7 @@ class _Reader:
         images = np.empty((len(values), *leaf.shape), np.uint8)
         for row, data in enumerate(values):
             try:
-                # Pillow reads the size of an image before it decodes the pixels.
+                # Pillow reads the size first, so images of a wrong size are not decoded.
                 with image_module.open(io.BytesIO(bytes(data)), formats=["JPEG"]) as image:
                     if image.size != (leaf.shape[1], leaf.shape[0]):
                         raise OSError(f"{image.size[0]} x {image.size[1]} pixels")

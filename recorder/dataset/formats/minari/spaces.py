@@ -1,7 +1,7 @@
 """Spaces in Minari's JSON text.
 
-Minari does not store the dtype of a Discrete space. It is still written here: Minari ignores the
-dtype, and `space_from_text` reads it.
+Minari does not store the dtype of a Discrete space. This module writes the dtype in addition:
+Minari ignores it, and `space_from_text` reads it.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from mcaprl.errors import SpaceError
 from mcaprl.files import parse_json
 from mcaprl.recorder.format.spaces import Leaf, space_from_json
 
-# Images with both edges at least this long can be JPEG in a Minari dataset.
+# Shortest edge, in pixels, of the images that Minari may store as JPEG.
 _MIN_JPEG_EDGE = 32
 
 
 class StoredSpace(NamedTuple):
-    """A space of a Minari dataset, as a log holds it.
+    """A space of a Minari dataset, converted to a space that a log can store.
 
     Attributes:
         space: Space of the log. A Tuple becomes a Dict with the keys `0`, `1`, ...
@@ -35,7 +35,7 @@ class StoredSpace(NamedTuple):
 
 
 def space_to_text(space: spaces.Space[Any]) -> str:
-    """Write a space as Minari does."""
+    """Return the JSON text of a space in Minari's form."""
     return json.dumps(_to_plain(space))
 
 
@@ -107,11 +107,11 @@ def _to_plain(space: spaces.Space[Any]) -> dict[str, Any]:
             parts = {key: _to_plain(part) for key, part in space.spaces.items()}
             return {"type": "Dict", "subspaces": parts}
         case _:
-            raise SpaceError(f"a {type(space).__name__} space cannot be in a Minari dataset")
+            raise SpaceError(f"a {type(space).__name__} space cannot be stored in a Minari dataset")
 
 
 def _members(plain: dict[str, Any]) -> list[tuple[str | int, dict[str, Any]]] | None:
-    """Return the members of a described Dict or Tuple; None for another space."""
+    """Return the key and description of each member of a Dict or Tuple; None for other spaces."""
     match plain["type"]:
         case "Dict":
             return list(plain["subspaces"].items())

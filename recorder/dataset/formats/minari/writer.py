@@ -61,12 +61,12 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False, dataset_id: str 
     h5py = import_extra("h5py", EXTRA)
     metadata = LogMetadata.from_strings(dataset.metadata)
     space, renamed = with_names_for_hdf5(dataset.observation_space)
-    lost = [f"the key '{key}' is renamed, because HDF5 cannot hold its name" for key in renamed]
+    lost = [f"the key '{key}' is renamed, because it is not a valid HDF5 name" for key in renamed]
     infos, lost_infos = stored_infos(infos_of(dataset))
     info_names, lost_names = nested_names(infos)
     lost += [*_lost_options(dataset), *lost_infos, *lost_names]
     if lost and not lossy:
-        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write it")
+        raise SpaceError(f"{lost[0]}; pass --lossy (lossy=True in Python) to write the dataset")
     leaves = observation_leaves(dataset.observation_space)
     keys = [leaf.path for leaf in observation_leaves(space)]
     columns = [leaf.of(dataset.frames) for leaf in leaves]
@@ -115,7 +115,7 @@ def _put(group: Any, name: str, values: NDArray[Any], **settings: Any) -> None:
 
 
 def _put_info(group: Any, name: str, info: StoredInfo) -> None:
-    """Write an info and the flags of its missing rows; nothing if all rows are missing."""
+    """Write an info and the flags of its missing rows; skip an info without any value."""
     if info.is_missing.all():
         return
     is_text = info.values.dtype.kind == "U"
@@ -127,7 +127,8 @@ def _put_info(group: Any, name: str, info: StoredInfo) -> None:
         chunks=True if values.size else None,
         maxshape=(None, *values.shape[1:]) if values.size else None,
     )
-    # If an info is missing in any episode, all episodes store it as floats.
+    # Integers and flags that are missing in any row are stored as floats in all episodes, so the
+    # original dtype is stored too.
     if info.is_missing.any() or info.values.dtype != info.dtype:
         _put(group, f"{OWN}/{MISSING}/{name}", info.is_missing)
         group[f"{OWN}/{MISSING}/{name}"].attrs["dtype"] = info.dtype.str
