@@ -81,7 +81,7 @@ def test_commands_read_a_bag_by_a_mapping(
     assert "1 file checked, no problems" in capsys.readouterr().out
     assert run(["convert", str(bag), *mapping, "--dry-run"]) == 0
     shown = capsys.readouterr().out
-    assert "11 of 12 of the clock" in shown
+    assert "11 of 12 steps of the clock" in shown
     assert "6 left, 5 right" in shown
     assert "'reward': 0.5" in shown
     out = str(tmp_path / "out.mcap")
@@ -110,7 +110,7 @@ def test_requests_that_lack_something_are_clear_errors(
 ) -> None:
     mapping = ["--mapping", str(tmp_path / "robot.yaml")]
     assert run(["convert", str(bag), "out.mcap"]) == 1
-    assert "is read by a mapping: --mapping" in capsys.readouterr().err
+    assert "pass a mapping: --mapping" in capsys.readouterr().err
     assert run(["convert", str(bag), *mapping]) == 2
     assert "convert needs SRC and DST, or --dry-run" in capsys.readouterr().err
     (tmp_path / "robot.yaml").write_text(MAPPING.replace("/odom.twist", "/odom.twits", 1))

@@ -44,6 +44,7 @@ CASES = [
     (BCQConfig(**TINY), VECTOR),
     (BCConfig(**TINY, frame_stack=2), IMAGE),
     (BCConfig(**TINY, frame_stack=2, normalize=True, channels=(4, 6, 8)), IMAGE),
+    (DQNConfig(**TINY, frame_stack=2, layer_norm=True), spaces.Box(0, 255, (84, 90, 1), np.uint8)),
     (DQNConfig(**TINY), MIXED),
 ]
 

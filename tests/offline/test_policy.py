@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mcaprl.api.policies import load_policies, load_policy
 from mcaprl.errors import PolicyError, ReportError
+from mcaprl.networks import Convolutions
 from mcaprl.offline.algorithms.bc import BC, BCConfig
 from mcaprl.offline.algorithms.bcq import BCQ
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -23,7 +24,6 @@ from mcaprl.offline.algorithms.cql import CQL, CQLConfig
 from mcaprl.offline.algorithms.dqn import DQNConfig
 from mcaprl.offline.algorithms.iql import IQL
 from mcaprl.offline.algorithms.learner import Learner
-from mcaprl.offline.algorithms.networks import NatureConvolutions
 from mcaprl.offline.algorithms.registry import ALGORITHMS
 from mcaprl.offline.batches.buffer import TransitionBuffer
 from mcaprl.offline.batches.observations import Observations
@@ -166,7 +166,7 @@ def test_normalized_images_can_be_loaded(tmp_path: Path) -> None:
     network = learner.network("q", 0)
     convolutions, *layers = cast(torch.nn.Sequential, network.stems[0])
     with torch.no_grad():
-        seen = cast(NatureConvolutions, convolutions).layers(
+        seen = cast(Convolutions, convolutions).layers(
             torch.from_numpy(centered).permute(0, 3, 1, 2).float()
         )
         expected = network.head(network.body(torch.nn.Sequential(*layers)(seen)))

@@ -75,7 +75,7 @@ def test_configs_cannot_be_changed() -> None:
         (BCConfig, "learning_rate", 0.0),
         (BCConfig, "final_learning_rate_fraction", 1.5),
         (BCConfig, "hidden", (256, 0)),
-        (BCConfig, "channels", (32, 64)),
+        (BCConfig, "channels", (32,)),
         (BCConfig, "channels", (32, 64, 0)),
         (BCConfig, "log_interval", 0),
         (BCConfig, "weight_decay", -0.1),

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from mcaprl.networks import Architecture, ImageInput, Network
 from mcaprl.offline.algorithms.models import AnyModel, Model, StackedMLP, build_model
-from mcaprl.offline.algorithms.networks import Architecture, Network
-from mcaprl.offline.batches.observations import ImageInput, Observations
+from mcaprl.offline.batches.observations import Observations
 
 
 def vectors(rows: int, width: int, seed: int = 0) -> Observations:

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaprl.errors import SpaceError
-from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+from mcaprl.networks import ImageInput
+from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 
 IMAGE = spaces.Box(0, 255, (36, 40, 1), np.uint8)
 CAR = spaces.Dict(

@@ -67,8 +67,8 @@ def test_a_valid_dataset_has_no_findings() -> None:
         (
             changed("next_observations", (5, 1), 1.5),
             "problem",
-            "1 element of observation outside its space (observation[1] is 0.07143 to 1.5, its"
-            " space 0 to 1)",
+            "1 element of observation outside its space (observation[1] has values from 0.07143 to"
+            " 1.5, but bounds 0 to 1)",
         ),
         ({"rewards": np.zeros(6)}, "problem", "every reward is 0 (all steps)"),
         (
@@ -79,7 +79,8 @@ def test_a_valid_dataset_has_no_findings() -> None:
         (
             changed("rewards", 5, -10.0),
             "problem",
-            "1 truncated episode end with a reward that no other step has (-10, elsewhere 1 to 3)",
+            "1 truncated episode end with a reward that no other step has (-10; other steps have"
+            " 1 to 3)",
         ),
         (
             {"actions": np.array([0, 1, 0, 0, 1, 0])},

@@ -106,7 +106,7 @@ def test_episodes(log: Path, asked: Any, meant: list[int]) -> None:
 
 @pytest.mark.parametrize("asked", [5, -6, [0, 9]])
 def test_missing_episodes_are_refused(log: Path, asked: Any) -> None:
-    with pytest.raises(UsageError, match="the logs have 5 episodes, counted from 0"):
+    with pytest.raises(UsageError, match="the logs have 5 episodes; indexes start at 0"):
         mcaprl.open(log, episodes=asked)
     with pytest.raises(UsageError, match="no episodes are selected"):
         mcaprl.open(log, episodes=[])

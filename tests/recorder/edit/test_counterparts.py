@@ -126,7 +126,7 @@ def test_chunk_with_wrong_times_is_refused(edited: dict[str, Path], tmp_path: Pa
     wrong[place : place + 8] = (chunk.message_start_time - 1).to_bytes(8, "little")
     wrong[-12:-8] = crc32(bytes(wrong[reader.summary_start : -12])).to_bytes(4, "little")
     (tmp_path / "wrong.mcap").write_bytes(wrong)
-    with pytest.raises(CorruptLogError, match=r"chunk at byte \d+ has other times than its"):
+    with pytest.raises(CorruptLogError, match=r"chunk at byte \d+ has times that do not match"):
         mcaprl.filter("length > 0", tmp_path / "wrong.mcap", tmp_path / "out.mcap")
     assert not (tmp_path / "out.mcap").exists()
 

@@ -109,7 +109,7 @@ def test_damaged_and_unknown_images_are_clear_errors() -> None:
     with pytest.raises(LogError, match="an image of 6 x 4 rgb8 with 18 bytes per row has 3 bytes"):
         read(short, [0])
     uneven = raw_bag([COLORS, COLORS[:2]], "rgb8")
-    with pytest.raises(LogError, match=r"image 1 is \(2, 6, 3\) uint8, the first \(4, 6, 3\)"):
+    with pytest.raises(LogError, match=r"is \(2, 6, 3\) uint8, but the first is \(4, 6, 3\)"):
         read(uneven, [0, 1])
     assert read(uneven, [0, 1], resize=(3, 2)).shape == (2, 2, 3, 3)
     with pytest.raises(UsageError, match="not images: expected sensor_msgs/Image"):

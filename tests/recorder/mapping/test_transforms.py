@@ -80,7 +80,7 @@ def test_wrong_trees_are_clear_errors() -> None:
     with pytest.raises(UsageError, match="gives frame 'base' several parents: a, b"):
         Transforms(bag(two, []))
     one = Transforms(bag([(0.0, [transform("map", "base", 0, 0)])], []))
-    with pytest.raises(UsageError, match="no way from frame 'base' to 'odom'; frames: base, map"):
+    with pytest.raises(UsageError, match="no path from frame 'base' to 'odom'; frames: base, map"):
         one.planar("base", "odom", STEPS_NS.astype(np.int64), "last", None)
     circle = [(0.0, [transform("a", "b", 0, 0), transform("b", "a", 0, 0)])]
     with pytest.raises(UsageError, match="cycle"):

@@ -106,7 +106,7 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
     ("env", "options", "reported"),
     [
         (gym.make("CartPole-v1", sutton_barto_reward=True), {}, "its env_kwargs is"),
-        (gym.make("CartPole-v0"), {}, "its env_id is CartPole-v1, the recording's CartPole-v0"),
+        (gym.make("CartPole-v0"), {}, "env_id is CartPole-v1, but the recording has CartPole-v0"),
         (gym.make("CartPole-v1"), {"step_duration_s": 0.5}, "its step_duration_ns is 20000000"),
         (gym.make("MountainCar-v0"), {}, "cannot be appended to"),
         (gym.make("CartPole-v1"), {"start_time_ns": 1_000}, "must be later"),

@@ -128,7 +128,7 @@ def test_a_value_of_another_type_is_left_out(log_path: Path) -> None:
     recorded.step(0)
     env.infos = ({"n": "text"}, {"n": "text"})
     recorded.reset()
-    with pytest.warns(UserWarning, match="its values are text, and those before are int64"):
+    with pytest.warns(UserWarning, match="its values are text, but earlier values are int64"):
         recorded.step(0)
     recorded.close()
     assert mcaprl.open(log_path).infos["n"].tolist() == [1, 2, None, None]

@@ -118,8 +118,8 @@ def at(number: int, row: int, **values: Any) -> Change:
         (at(1, 3, final=False), "out of order"),
         (at(1, 1, terminated=True), "continues after its end"),
         (at(2, 5, final=False), "6 records of an unfinished episode"),
-        (at(0, 3, terminated=False), "has terminated True, the records False"),
-        (at(1, 2, truncated=False), "has truncated True, the records False"),
+        (at(0, 3, terminated=False), "has terminated True, but the records have False"),
+        (at(1, 2, truncated=False), "has truncated True, but the records have False"),
     ],
 )
 def test_inconsistent_episodes_are_reported(good: Path, change: Change, reported: str) -> None:
@@ -331,5 +331,5 @@ def test_a_cut_log_says_that_viewers_need_a_recovered_copy(good: Path, tmp_path:
     problem = check_log(cut)[0]
     assert "viewers cannot open it" in problem.what
     assert problem.next == f"run `mcaprl recover {cut} OUT`"
-    with pytest.warns(UserWarning, match=f"for a viewer, run `mcaprl recover {cut} OUT`"):
+    with pytest.warns(UserWarning, match=f"to open it in a viewer, run `mcaprl recover {cut} OUT`"):
         assert len(mcaprl.open(cut).episodes) == 3

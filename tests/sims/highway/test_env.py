@@ -184,7 +184,7 @@ def test_a_pose_has_highway_envs_speed_unless_it_says_another() -> None:
 def test_a_pose_off_the_road_or_in_another_car_is_refused() -> None:
     sim = made(road=TRACK)
     with pytest.raises(
-        UsageError, match=r"is 40.0 m from the middle of a lane: the lane ends at 2.5 m"
+        UsageError, match=r"is 40.0 m from the middle of a lane: the lane's edge is at 2.5 m"
     ):
         sim.reset(options={"pose": (60.0, -45.0, 0.0)})
     sim.reset(seed=0)

@@ -213,7 +213,7 @@ def test_actions_that_d3rlpy_does_not_have_are_refused(tmp_path: Path) -> None:
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     for name, value, message in (
-        ("version", "2.0", "is of version 2.0 of d3rlpy's files"),
+        ("version", "2.0", "has version 2.0 of d3rlpy's file format"),
         ("num_episodes", 3, "observations_2"),
         ("num_episodes", [1, 2], "num_episodes is not a whole number"),
         ("num_episodes", 0, "has no episodes"),

@@ -63,7 +63,7 @@ def _write(path: Path, arrays: dict[str, Any]) -> Path:
 def test_a_dataset_comes_back_whole(tmp_path: Path) -> None:
     data = _two_episodes()
     assert data.to_hdf5(tmp_path / "toy.hdf5") == [
-        "1 episodes that end without a flag end with a timeout"
+        "1 episodes that end without an end flag are written with a timeout"
     ]
     _same(Dataset.from_hdf5(tmp_path / "toy.hdf5"), data)
 
@@ -143,7 +143,7 @@ def test_a_file_of_d4rl_without_next_observations(tmp_path: Path) -> None:
             "metadata/algorithm": "SAC",
         },
     )
-    with pytest.warns(UserWarning, match=r"no next_observations: the 1 observations.*2 last steps"):
+    with pytest.warns(UserWarning, match=r"no next_observations: 1 terminal.*last steps of 2"):
         found = mcaprl.open(path)
     assert found.episode_lengths.tolist() == [2, 1, 1]
     assert found.frames.ravel().tolist() == [0, 1, 1, 2, 3, 4, 5]
@@ -182,7 +182,7 @@ def test_demonstrations_of_robomimic_are_read_in_order(tmp_path: Path) -> None:
 
 
 def test_demonstrations_without_next_obs(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match=r"repeats the one before, and .*is left out"):
+    with pytest.warns(UserWarning, match=r"also used as next observation, and .*is left out"):
         found = mcaprl.open(_demos(tmp_path / "lift.hdf5", next_obs=False))
     assert found.episode_lengths.tolist() == [3, 1, 1]
     assert found.frames["eef"].ravel().tolist() == [0, 1, 2, 2, 200, 200, 1000, 1001]

@@ -381,8 +381,8 @@ def test_a_dataset_of_lerobots_writer_with_rewards_and_images() -> None:
     assert [text.partition(" episodes")[0] for text in said] == [
         "'next.done' may also mean truncation, because there is no feature 'next.truncated'; it is"
         " read as termination",
-        "the observation after the end is not stored of 1",
-        "the observation after the last action is not stored of 1 other",
+        "the final observation is not stored for 1",
+        "the observation after the last action is not stored for 1 other",
     ]
     space = dataset.observation_space
     assert isinstance(space, spaces.Dict)
@@ -461,7 +461,7 @@ def written(tmp_path: Path) -> Path:
 def test_a_done_frame_in_the_middle_ends_an_episode(written: Path) -> None:
     shutil.rmtree(written / "meta/mcaprl")
     _edited(written, lambda t: _with(t, "next.done", pa.array([True, False, False, False, False])))
-    with pytest.warns(UserWarning, match="is not stored of 2 other episodes"):
+    with pytest.warns(UserWarning, match="is not stored for 2 other episodes"):
         dataset = Dataset.from_lerobot(written)
     # The frame after the done frame is its next observation, as it was recorded.
     assert dataset.episode_lengths.tolist() == [1, 1, 1]
@@ -644,7 +644,7 @@ def test_lerobot_merges_what_we_write(tmp_path: Path) -> None:
     metadata = LogMetadata(space, spaces.Box(-np.inf, np.inf, (2,), np.float32))
     dataset_of([episode], metadata, "test").to_lerobot(tmp_path / "out")
     _run_lerobot("merge", tmp_path / "out", tmp_path / "merged", home=tmp_path / "home")
-    with pytest.warns(UserWarning, match="is not stored of 2 episodes that end in a"):
+    with pytest.warns(UserWarning, match="is not stored for 2 episodes that end in a"):
         merged = Dataset.from_lerobot(tmp_path / "merged")
     assert merged.rewards.tolist() == [1, 2, 4, 1, 2, 4]
     np.testing.assert_array_equal(merged.observations["front"][3:], values["front"][:3])

@@ -450,7 +450,7 @@ def test_damaged_datasets_give_one_clear_line(tmp_path: Path) -> None:
     _change(path, data_format="hdf5")
     with h5py.File(main, "a") as file:
         file["episode_0/terminations"][0] = True
-    fails("episode 0 goes on after step 0 with terminations")
+    fails("episode 0 has steps after terminations at step 0")
     with h5py.File(main, "a") as file:
         file["episode_0/terminations"][0] = False
         del file["episode_0/rewards"]

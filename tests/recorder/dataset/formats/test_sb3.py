@@ -306,7 +306,7 @@ def test_spaces_that_sb3_does_not_support_are_refused_by_name() -> None:
         (floats, integers, "action is a Box of int64"),
         (floats, grid, "action is .*one dimension"),
         (floats, spaces.MultiBinary((2, 2)), "action is .*one dimension"),
-        (spaces.Discrete(3, start=-1), spaces.Discrete(2), "observation is .*from 0 only"),
+        (spaces.Discrete(3, start=-1), spaces.Discrete(2), "observation is .*that starts at 0"),
         (
             spaces.Box(0, 1, (), np.float32),
             spaces.Discrete(2),
