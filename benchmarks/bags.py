@@ -1,4 +1,4 @@
-"""Measure reading other robots' bags: fields of their messages, images, and a whole mapping."""
+"""Measure reading other robots' bags: fields of messages, images, and bags with a mapping."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ FIELDS = {
     "sensor_msgs/msg/JointState": ("position",),
     "sensor_msgs/msg/LaserScan": ("ranges",),
 }
-"""Fields that are read of each type; the topic is the last part of the type's name."""
+"""Fields to read, by message type; the topic is the last part of the type's name."""
 LIMIT_S = 300.0
-"""Five minutes for a gigabyte, which users ask for."""
+"""Maximum time for reading a gigabyte: users ask for five minutes."""
 
 
 def tables(folder: Path) -> list[Table]:
-    """Measure bags, with files in `folder`."""
+    """Write bags to `folder`, and measure reading them."""
     path, images = folder / "fields.mcap", folder / "images.mcap"
     _write_fields(path)
     encoded = _write_images(images)
@@ -61,7 +61,7 @@ def _fields(path: Path, kind: str) -> Table:
 
 
 def _ours(path: Path, topic: str, fields: Sequence[str]) -> Any:
-    # Each turn is a first opening, which parses the definitions.
+    # Measure the first opening of a bag, which parses the message definitions.
     clear_types()
     with closing(open_bag(path)) as bag:
         return bag.read(topic, fields).columns
@@ -80,7 +80,7 @@ def _rerun(path: Path, topic: str, fields: Sequence[str]) -> list[Any]:
 
 
 def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
-    """Return a field of the messages, which are lists of one struct, as an array."""
+    """Return a field of all messages as an array; each message is a list of one struct."""
     messages = next(
         column
         for name, column in zip(batch.schema.names, batch.columns, strict=True)
@@ -136,12 +136,12 @@ def _open(path: Path) -> Any:
 
 
 def _gigabyte(path: Path) -> Table:
-    """Read images in a separate process, whose peak memory is that of the reading."""
+    """Measure reading images in a separate process, so that no other work uses its memory."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         seconds, memory = pool.submit(_cost, path).result()
     table = Table(
         "A bag of compressed images through a mapping",
-        goal="time less than 1; memory bounded by the result",
+        goal="time less than 1; memory bounded by the size of the result",
         unit="ratio",
     )
     table.ratios = {
@@ -153,7 +153,7 @@ def _gigabyte(path: Path) -> Table:
 
 
 def _cost(path: Path) -> tuple[float, float]:
-    """Return the seconds that reading a bag takes, and the memory relative to the result.
+    """Return the seconds for reading a bag, and peak memory divided by the size of the result.
 
     Pages of the mapped file do not count: the system takes them back when it needs memory.
     """
@@ -177,7 +177,7 @@ def _cost(path: Path) -> tuple[float, float]:
 
 
 def _private_bytes() -> int:
-    """Return the memory of this process without mapped files, bytes."""
+    """Return the memory of this process in bytes, without mapped files."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
 
@@ -197,7 +197,7 @@ def _write_fields(path: Path) -> None:
 
 
 def _write_images(path: Path, count: int = IMAGES) -> list[bytes]:
-    """Write JPEG images of smooth noise, and an action beside each; return the images."""
+    """Write JPEG images of smooth noise, each followed by an action; return the images."""
     from PIL import Image
 
     random = np.random.default_rng(0)
@@ -251,7 +251,7 @@ class _Log:
         self._writer.add_message(self._channels[topic], time_ns, content, time_ns)
 
     def encoded(self, kind: str, random: np.random.Generator) -> bytes:
-        """Return a message with random numbers: 6 joints, 360 ranges, a frame."""
+        """Return an encoded message with random numbers, such as 6 joints or 360 ranges."""
         return bytes(self.store.serialize_cdr(self._message(kind, random), kind))
 
     def _message(self, kind: str, random: np.random.Generator) -> Any:

@@ -2,11 +2,11 @@
 
     python benchmarks/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
 
-5000 updates of batch 64, learning rate 1e-3, gamma .99, hard target update every 200, 256x256. A
-result is the mean return of the last three evaluations (after 4000, 4500 and 5000 updates) of 10
-episodes each. d3rlpy takes part with one seed where it is installed. FOLDER/grid.json has each
-finished cell, so an interrupted run resumes. The table and the results of the gates are written to
-docs/results.md.
+A training has 5000 updates with batch size 64, learning rate 1e-3, gamma .99, a target sync every
+200 updates, and layer widths 256x256. Its result is the mean return of the last three evaluations
+(after 4000, 4500 and 5000 updates) of 10 episodes each. d3rlpy is trained with one seed if it is
+installed. FOLDER/grid.json has each finished cell, so an interrupted run resumes. The table and the
+results of the gates are written to docs/results.md.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def ours(data: mcaprl.Dataset, algo: str, seeds: int) -> list[float]:
 
 
 def greedy(learner: Any, seed: int) -> Act:
-    """Return the greedy action of a seed's current network."""
+    """Return the greedy policy of a seed's current network."""
     networks = {name: learner.network(name, seed) for name in learner.policy_models}
     scores = Scores(networks, learner.acts_by, getattr(learner.config, "threshold", 0.0))
 
@@ -93,7 +93,7 @@ def greedy(learner: Any, seed: int) -> Act:
 
 
 def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
-    """Return d3rlpy's mean return, of one seed."""
+    """Return the mean return of d3rlpy with one seed."""
     import d3rlpy
 
     d3rlpy.seed(0)
@@ -134,7 +134,7 @@ GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
             bool(np.mean(found[name]["double-dqn"]) < 0.5 * behavior[name]) for name in GOOD_LOGS
         )
     ),
-    "CQL keeps .95 of the behavior there, each seed": (
+    "CQL reaches .95 of the behavior on medium and expert data with each seed": (
         lambda found, behavior: all(
             min(found[name]["cql"]) >= 0.95 * behavior[name] for name in GOOD_LOGS
         )
@@ -149,11 +149,11 @@ GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
         )
     ),
 }
-"""What must hold of our own."""
+"""Conditions on our results, by description."""
 
 
 def verdict(gate: str, result: dict[str, Any]) -> str:
-    """Return whether a gate holds, or that its cells are missing."""
+    """Return whether a gate holds, does not hold, or was not run for lack of cells."""
     try:
         return "holds" if GATES[gate](result["mcaprl"], result["behavior"]) else "does not hold"
     except KeyError:
@@ -185,7 +185,7 @@ def main() -> None:
 
 
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
-    """Return side, algorithm and log of each cell: first ours, and those of the gates."""
+    """Return side, algorithm and log of each cell: ours first, then d3rlpy's if installed."""
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
     if importlib.util.find_spec("d3rlpy") is None:

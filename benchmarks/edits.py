@@ -1,4 +1,4 @@
-"""Time to join, filter and split logs beside copies of the same files."""
+"""Time joining, filtering and splitting logs, compared with copying the same files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COPY = "copy of the files"
 
 
 def tables(folder: Path) -> list[Table]:
-    """Compare each command with a copy of its files that is synced to disk, as a log is."""
+    """Compare each command with a copy of its files; both sync their output to disk."""
     log, parts, out = folder / "edited.mcap", folder / "parts", folder / "edits"
     vectors(_TRANSITIONS).save(log)
     episodes = len(mcaprl.open(log, columns=()).episodes)

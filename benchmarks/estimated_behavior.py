@@ -1,10 +1,10 @@
-"""Compare off-policy estimates by logged and by estimated behavior probabilities.
+"""Compare off-policy estimates with logged and with estimated behavior probabilities.
 
     python -m benchmarks.estimated_behavior
 
-On a task whose value is the solution of linear equations (tests/support/two_state_task.py), prints
-for each estimator the mean and the standard deviation of the estimates from several logs, and the
-share of the 95 % intervals that contain the true value.
+The task has a known value, the solution of linear equations (tests/support/two_state_task.py). For
+each estimator, print the mean and the standard deviation of the estimates from several logs, and
+the number of 95 % intervals that contain the true value.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> None:
 def _estimates(
     seed: int, arguments: argparse.Namespace
 ) -> dict[tuple[str, str], tuple[float, float, float]]:
-    """Return value and interval of one log by estimator and kind of probabilities."""
+    """Return the value and interval from one log, by estimator and kind of behavior_prob."""
     data = _log(seed, arguments.episodes)
     estimated = mcaprl.estimate_behavior(data, updates=arguments.updates, seed=seed)
     config = FQEConfig(gamma=task.GAMMA, updates=arguments.updates)
@@ -73,7 +73,7 @@ def _estimates(
 
 
 def _log(seed: int, episodes: int) -> mcaprl.Dataset:
-    """Play the behavior policy of the task."""
+    """Return a log of the task's behavior policy."""
     random = np.random.default_rng(seed)
     rows: list[tuple[int, int, float, int, bool]] = []
     for _ in range(episodes):

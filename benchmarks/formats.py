@@ -1,4 +1,4 @@
-"""Measure conversions to and from the datasets of other tools, beside the tools' own functions."""
+"""Measure conversions to and from datasets of other tools, relative to the tools' functions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from benchmarks.measure import OURS, Side, Table, after, compare
 from benchmarks.workloads import vectors
 
 TRANSITIONS = 100_000
-# Sides that go transition by transition do this share.
+# Fraction of the task that is timed for sides that handle one transition at a time.
 SHARE = 0.05
 
 

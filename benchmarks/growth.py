@@ -33,7 +33,7 @@ print(json.dumps({**best, "kept": kept, "peak": peak}))
 
 
 def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
-    """Read logs of several sizes, and return the cost per transition of each."""
+    """Measure the time and memory for reading, checking and recovering logs of these sizes."""
     found = {}
     for size in sizes:
         path = folder / "growth.mcap"
@@ -50,7 +50,7 @@ def tables(folder: Path, sizes: tuple[int, ...]) -> list[Table]:
         "Reading logs of several sizes",
         {f"{size:,} transitions": per_step[size] / middle for size in sizes},
         goal="linear: the same time per transition at each size",
-        unit=f"CPU time per transition, of {sizes[len(sizes) // 2]:,} = 1",
+        unit=f"CPU time per transition, {sizes[len(sizes) // 2]:,} transitions = 1",
     )
     memory = Table(
         "Memory while reading logs of several sizes",

@@ -3,16 +3,17 @@
     python -m benchmarks.learning [--rounds 7] [--turn-s 1.0] [--only whole]
     python -m benchmarks.learning --only gradients
 
-One process, interleaved, on the same random transitions (19 numbers, 9 actions, 256x256), by CPU
-time on one thread, the best of several turns. The last row covers the whole path: a log of LOG_ROWS
-steps on disk is read and packed, and CQL makes LOG_UPDATES updates of batch 256; the alternative is
-mcap with mcap-ros2-support, and d3rlpy. The alternative does a part of the work, and its time is
-scaled up: a tenth of the log, and as many updates as fit into the turns. Prints the ratios, writes
-them to benchmarks/learning.json, and writes the table to docs/results.md. With --only 256, 32 or
-whole, the other rows keep the values of an earlier run.
+All sides take turns in one process, on the same random transitions (19 numbers, 9 actions) and with
+layer widths 256x256. The measure is CPU time on one thread, the best of several turns. The last row
+covers all steps from a log to a policy: a log of LOG_ROWS steps on disk is read and packed, and CQL
+makes LOG_UPDATES updates with batch size 256. The alternative is mcap with mcap-ros2-support, and
+d3rlpy; it reads a tenth of the log, and its time is scaled up. The time of LOG_UPDATES updates is
+calculated from the rates in the turns. The ratios are printed and written to
+benchmarks/learning.json, and the table to docs/results.md. With --only 256, 32 or whole, the other
+rows keep the values of an earlier run.
 
---only gradients compares updates with autograd and the same updates with closed-form gradients,
-which are written here. It prints the ratios of their speeds, and needs none of the libraries.
+--only gradients compares updates with autograd to the same updates with closed-form gradients,
+which this file implements. It prints the ratios of their speeds, and needs none of the libraries.
 """
 
 from __future__ import annotations
@@ -234,7 +235,7 @@ def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, 
 
 
 def whole_way(folder: Path, turns: Turns) -> float:
-    """Return the ratio of the CPU times from a log on disk to a policy, theirs to ours."""
+    """Return the CPU time of the alternative relative to ours, from a log on disk to a policy."""
     log, part = folder / "log.mcap", folder / "part.mcap"
     vectors(LOG_ROWS).save(log)
     rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
@@ -246,12 +247,12 @@ def whole_way(folder: Path, turns: Turns) -> float:
     their_update = d3rlpys(logged(columns), "DiscreteCQLConfig", 256)
     theirs_s = (time.process_time() - start) / LOG_SHARE
     rates = best_rates({"ours": (update, 1), "theirs": (their_update, 1)}, turns)
-    print(f"reading takes the others {theirs_s / ours_s:.0f} times as long", flush=True)
+    print(f"the alternative takes {theirs_s / ours_s:.0f} times as long to read", flush=True)
     return (theirs_s + LOG_UPDATES / rates["theirs"]) / (ours_s + LOG_UPDATES / rates["ours"])
 
 
 def logged(columns: dict[str, Any]) -> Any:
-    """Return columns under the names of a dataset; the ends of episodes are given."""
+    """Return columns under a dataset's attribute names, as episodes of EPISODE_STEPS steps."""
     rows = len(columns["action"])
     return SimpleNamespace(
         observations=columns["observation"],

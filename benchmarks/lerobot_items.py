@@ -1,9 +1,10 @@
-"""Compare batches of transitions with those of LeRobot's dataset with next observations.
+"""Compare the time to load batches of transitions with that of LeRobot's dataset.
 
     make .venv/.lerobot && python -m benchmarks.lerobot_items
 
-LeRobot runs in its environment, `.venv/lerobot` or MCAPRL_LEROBOT_PYTHON, on a dataset that mcaprl
-writes. Prints the CPU time for each transition, relative to ours.
+LeRobot runs in its own Python environment, `.venv/lerobot` or that of the interpreter
+MCAPRL_LEROBOT_PYTHON, on a dataset that mcaprl writes. Its CPU time for each transition, relative
+to ours, is printed.
 """
 
 from __future__ import annotations

@@ -14,19 +14,19 @@ LEAST_WORK = "mapped file, decompressed, CRCs checked"
 
 
 def plain(path: Path, *topics: str, **times: int) -> Callable[[], None]:
-    """Return a side that decompresses a log's chunks, by default those of `/rl/step`."""
+    """Return a function that decompresses a log's chunks, by default those of `/rl/step`."""
     chunks = compressed_chunks(path, topics or (STEP_TOPIC,), **times)
     return lambda: plain_zstd(chunks)
 
 
 def least(path: Path, *topics: str) -> Callable[[], object]:
-    """Return a side with the least work of a reader of columns."""
+    """Return a function that does the minimum work of a reader of columns."""
     headers = chunk_headers(path, topics or (STEP_TOPIC,))
     return lambda: least_work(path, headers)
 
 
 def plain_level_1(path: Path) -> Callable[[], None]:
-    """Return a side that decompresses the records of `/rl/step`, compressed by zstd at level 1."""
+    """Return a function that decompresses the chunks of `/rl/step`, recompressed at level 1."""
     chunks = level_1_chunks(raw_chunks(path, STEP_TOPIC))
     return lambda: plain_zstd(chunks)
 
@@ -86,7 +86,7 @@ def raw_chunks(path: Path, topic: str) -> list[bytes]:
 
 
 def level_1_chunks(chunks: list[bytes]) -> list[bytes]:
-    """Return chunks, compressed by zstd at level 1."""
+    """Compress the records of each chunk by zstd at level 1."""
     import zstandard
 
     compressor = zstandard.ZstdCompressor(level=1)

@@ -1,4 +1,4 @@
-"""Measure batches of transitions for training loops of PyTorch."""
+"""Measure loading batches of transitions in PyTorch's training loops."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import mcaprl.torch
 from benchmarks.measure import OURS, Side, Table, compare
 
 BATCH = 256
-# The item-by-item sides do this share of the log.
+# Fraction of the log that is timed for sides that load one item at a time.
 SHARE = 0.02
 
 
 class _Plain(torch.utils.data.Dataset[Any]):
-    """Transitions one by one from arrays in memory, as most datasets of PyTorch do it."""
+    """Dataset that returns single transitions from arrays in memory, like most PyTorch datasets."""
 
     def __init__(self, data: mcaprl.Dataset, count: int) -> None:
         self._frames, self._rows, self._count = data.frames, data.frame_of_step, count

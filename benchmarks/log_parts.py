@@ -1,4 +1,4 @@
-"""Measure reading parts of logs and other kinds of logs: short episodes, other writers', images."""
+"""Measure reading short episodes, single episodes, logs of other writers, and image logs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DEPTH = rivals.DEPTH
 def tables(
     folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder
 ) -> list[Table]:
-    """Measure them with files in `folder`; `log` contains the transitions of `data`."""
+    """Return all tables; files are written to `folder`, and `log` has the transitions of `data`."""
     return [
         _short_episodes(folder),
         _episode(folder, log, data, minari),
@@ -37,7 +37,7 @@ def tables(
 
 
 def _short_episodes(folder: Path) -> Table:
-    """Measure a recording with one chunk of `/rl/step`, and others, for each episode."""
+    """Measure reading a recording with separate chunks per episode, one each for `/rl/step`."""
     path, steps = folder / "short.mcap", 20
     run_env(mcaprl.RecordMcap(Constant(steps), path), 1000, steps)
     return compare(
@@ -52,7 +52,7 @@ def _short_episodes(folder: Path) -> Table:
 
 
 def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.MinariFolder) -> Table:
-    """Measure one episode: selected by number in our reader, by time, rows or number in others."""
+    """Measure reading one episode; other readers select it by time, rows or number."""
     episodes = mcaprl.open(log, columns=[]).episodes
     number = len(episodes) // 2
     start, stop = (int(episodes[number].log_time_ns[row]) for row in (0, -1))
@@ -167,7 +167,7 @@ def _images(folder: Path, minari: rivals.MinariFolder) -> list[Table]:
 
 
 def _with_episodes(encoded: list[bytes]) -> list[bytes]:
-    """Number the prebuilt messages, so that they form complete episodes."""
+    """Set the episode and step in prebuilt messages, so that they form complete episodes."""
     dtype = message_dtype(rivals.TEXT)
     assert dtype is not None
     rows = np.frombuffer(b"".join(encoded), dtype).copy()

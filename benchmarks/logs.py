@@ -16,7 +16,7 @@ from mcaprl.recorder import STEP_TOPIC
 
 
 def tables(folder: Path, transitions: int) -> list[Table]:
-    """Measure everything about logs, with files in `folder`."""
+    """Return all tables about logs; files are written to `folder`."""
     data = vectors(transitions)
     part = vectors(int(transitions * SLOW_SHARE))
     encoded = rivals.messages(part)
@@ -166,7 +166,7 @@ def _reading(
 
 
 def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
-    """Measure file sizes for the same transitions; only a log has times and counters."""
+    """Measure file sizes for the same transitions; only a log also stores times and counters."""
     table = Table("File size", unit="bytes, ours = 1")
     ours = log.stat().st_size
     for compression in ("lz4", "none"):
@@ -196,7 +196,7 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 
 
 def _threads(log: Path) -> Table:
-    """Measure wall-clock time: threads use as much CPU time."""
+    """Measure wall-clock time, because threads do not reduce CPU time."""
     return compare(
         "Reading the log of vectors with several threads",
         [
@@ -212,7 +212,7 @@ def _threads(log: Path) -> Table:
 
 
 def _checking(folder: Path, log: Path) -> Table:
-    """Measure checking, which is reading, and recovering, which is reading and writing."""
+    """Measure checking a log, which reads it, and recovering it, which reads and writes it."""
     out = folder / "recovered.mcap"
     return compare(
         "Checking and recovering the log of vectors",

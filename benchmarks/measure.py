@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
-# Sides that go message by message do this share of it, and are scaled up: a turn of each takes some
-# tenths of a second, so that all have many, and a disturbance spoils but one.
+# Fractions of a task that are timed for sides that handle one message at a time. A turn then takes
+# tenths of a second, so that each side has many turns, and a disturbance affects only one of them.
 SLOW_SHARE = 0.1
 SLOWEST_SHARE = 0.01
 
@@ -26,8 +26,8 @@ class Side:
     Attributes:
         name: Name of the library, and of the part that is used.
         run: Function that does the task once.
-        share: Fraction of the task that `run` does; the time is scaled up. For sides that would
-            take minutes.
+        share: Fraction of the task that `run` does; its time is scaled up. It is below 1 for sides
+            that would take minutes.
         floor: Name of a side whose time is subtracted, such as an environment without recorder.
     """
 
@@ -60,7 +60,7 @@ class Table:
         return asdict(self)
 
     def to_markdown(self) -> str:
-        """Return a section of a page."""
+        """Return the title, goal and table as Markdown."""
         lines = [f"## {self.title}", "", *([f"Goal: {self.goal}.", ""] if self.goal else [])]
         lines += [f"| side | {self.unit} |", "|---|---|"]
         lines += [f"| {name} | {ratio:.3g} |" for name, ratio in self.ratios.items()]
@@ -116,7 +116,10 @@ def compare(
 
 
 def after(prepare: Callable[[], object], run: Callable[[], object]) -> Callable[[], object]:
-    """Prepare a run; return one that raises the ImportError if the preparation raises it."""
+    """Call `prepare`, and return `run`.
+
+    If `prepare` raises an ImportError, the returned function raises it.
+    """
     try:
         prepare()
     except ImportError as error:

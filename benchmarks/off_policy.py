@@ -2,14 +2,14 @@
 
     python -m benchmarks.off_policy
 
-Importance sampling: the six estimators on the same logs as SCOPE-RL's, to the last digits. Fitted Q
+Importance sampling: the largest difference to SCOPE-RL's five estimators on the same logs. Fitted Q
 evaluation: compared with d3rlpy's DiscreteFQE on the same log, policy and settings, and with the
 policy's true returns in the sim. Coverage: the fraction of `--logs` logs whose 95 % interval
 contains the true value, on a task whose value is the solution of linear equations
 (tests/support/two_state_task.py).
 
-The first two need d3rlpy and SCOPE-RL (`make bench-learning` installs them); what is not installed
-is reported and left out.
+The first comparison needs SCOPE-RL and the second d3rlpy (`make bench-learning` installs both). A
+comparison without its library is reported and left out.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ SCOPE_RL_NAMES: Final = {
     "WPDIS": "SelfNormalizedPDIS",
     "DR": "DoublyRobust",
 }
-"""Its self-normalized DR leaves the weights of V as they are and is not our WDR."""
+"""Names of the estimators in SCOPE-RL.
+
+Its self-normalized DR does not normalize the weights of V, so it is not our WDR.
+"""
 
 
 def beside_scope_rl(logs: int) -> dict[str, float]:
@@ -46,7 +49,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
     worst = dict.fromkeys(SCOPE_RL_NAMES, 0.0)
     for seed in range(logs):
         table = task.play(None, episodes=300, seed=seed)
-        # Two actions with pi and mu that have the table's ratios, and Q that has its Q and V.
+        # Choose pi, mu and Q of two actions that result in the table's ratios, Q and V.
         given = _as_scope_rl(table)
         for name, theirs in SCOPE_RL_NAMES.items():
             estimator = getattr(basic_estimators, theirs)()
@@ -60,7 +63,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
     """Return an episode table in SCOPE-RL's format; the logged action is always its action 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
-    # Action 1 has what is left of the probability, and the Q that makes V what it is.
+    # Action 1 has the remaining probability, and the Q that results in the table's V.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
     return {
         "step_per_trajectory": table.rewards.shape[1],
@@ -104,7 +107,7 @@ EPSILON: Final = 0.5
 
 
 def cartpole(policy: Balance, epsilon: float, episodes: int, seed: int) -> dict[str, Any]:
-    """Return columns of episodes of a partly random policy, for `Dataset.from_arrays`."""
+    """Run an epsilon-greedy policy, and return the columns for `Dataset.from_arrays`."""
     random = np.random.default_rng(seed)
     rows = []
     with closing(gym.make("CartPole-v1")) as env:
@@ -128,12 +131,12 @@ def true_value(policy: Balance, episodes: int = 200) -> float:
     played = cartpole(policy, 0.0, episodes, seed=9)
     ends = np.flatnonzero(played["terminated"] | played["truncated"])
     lengths = np.diff(ends, prepend=-1)
-    # Each step pays 1.
+    # Each step has a reward of 1.
     return float(((1 - FQE.gamma**lengths) / (1 - FQE.gamma)).mean())
 
 
 def ours(columns: dict[str, Any], policy: Balance, seed: int) -> float:
-    """Return the FQE estimate, with the settings of `evaluate --data`."""
+    """Return our FQE estimate."""
     data = mcaprl.Dataset.from_arrays(**columns, env_id="CartPole-v1")
     return OffPolicyEvaluator(data, FQE, seed).evaluate(policy, "").estimates[0].value or 0.0
 
@@ -180,7 +183,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print both FQE estimates, on separate logs and networks for each seed, and the true value."""
+    """Print both FQE estimates, with a separate log and network per seed, and the true value."""
     print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
     for name, policy in POLICIES.items():
         found = []
@@ -197,7 +200,8 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
     """Return the fraction of logs whose interval contains the true value, for each estimator.
 
     Returns:
-        For our intervals, and for percentiles of the same bootstrap samples.
+        Fractions for our intervals (`ours`), and for percentile intervals (`percentiles`) of the
+        same bootstrap samples.
     """
     held = {kind: dict.fromkeys(ESTIMATORS, 0.0) for kind in ("ours", "percentiles")}
     for seed in range(logs):

@@ -1,9 +1,10 @@
 """Measure what recording and the live view add to a training: `python -m benchmarks.online`.
 
-The same training runs plainly, with a log, and with a viewer (Node, see tests/node), in turns, by
-the CPU time of all its threads; the best of several counts. It is the whole training of the lane
-sim with its default settings. `--steps` shortens it and increases the share of recording: the first
-episodes last twenty steps, and each is written at its end.
+The same training runs in turns: alone, with a log, and with a viewer (Node, see tests/node). The
+measure is the CPU time of all threads of the training, the best of several turns. By default it is
+the complete training of the lane sim with its default settings. `--steps` shortens the training and
+increases the share of recording, because the first episodes have only about twenty steps, and each
+is written at its end.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _VIEWER = Path(__file__).parent.parent / "tests" / "node" / "watch.mjs"
 
 
 def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
-    """Return the CPU seconds of a training with its one evaluation, and the number of frames."""
+    """Return the CPU seconds of a training, and the number of frames that the viewer received."""
     folder.mkdir()
     path = folder / "log.mcap" if kind == "recorded" else None
     shown = LiveTraining(task, port=0) if kind == "watched" else nullcontext()
@@ -43,7 +44,7 @@ def training_s(task: Task, folder: Path, kind: str) -> tuple[float, int]:
 
 
 def _viewer(url: str) -> subprocess.Popen[str]:
-    """A viewer that subscribes to all topics."""
+    """Start a viewer that subscribes to all topics."""
     viewer = subprocess.Popen(["node", str(_VIEWER), url], stdout=subprocess.PIPE, text=True)
     assert viewer.stdout is not None
     viewer.stdout.readline()
@@ -74,7 +75,7 @@ def main() -> None:
                 taken_s, seen = training_s(task, Path(folder) / f"{turn}-{kind}", kind)
                 best[kind], frames = min(best[kind], taken_s), max(frames, seen)
                 print(f"{kind}: {taken_s:.1f} s", file=sys.stderr, flush=True)
-    print(f"lane, {steps} steps of Double DQN, of the training's CPU time:")
+    print(f"lane, {steps} steps of Double DQN, relative to the training's CPU time:")
     if "recorded" in best:
         print(f"  recording adds {best['recorded'] / best['plain'] - 1:.1%}")
     if "watched" in best:

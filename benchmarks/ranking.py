@@ -7,8 +7,8 @@ Double DQN trains online and records its transitions; its checkpoints are saved.
 then evaluated twice: its greedy policy runs fresh episodes in the sim, which gives its true value,
 and each estimator computes that value from the run's log. The rankings are compared by Spearman's
 correlation and by regret@1, for each training seed; the table has their mean and range over seeds.
-Two simple rules serve as references: the last checkpoint is the best one, and the checkpoint with
-the highest mean Q of the first states is.
+Two simple rules serve as references: the later a checkpoint, the better; and the higher the mean of
+its own Q in the first states, the better.
 
 FOLDER/SIM/ranking.json has all results; finished parts are not repeated.
 """
@@ -36,7 +36,7 @@ from mcaprl.sims import episode_seed, make_sims
 SEEDS: Final = 4
 CHECKPOINTS: Final = 8
 STEPS: Final = {"lane": 16_000, "racer": 8_000}
-"""While learning is under way: later, checkpoints are hardly worse than each other."""
+"""Training steps, by sim: few, because the values of later checkpoints hardly differ."""
 EPISODES: Final = 100
 FIRST_SEED: Final = 5_000_000
 GAMMA: Final = 0.97
@@ -44,7 +44,7 @@ RULES: Final = ("the later the better", "own mean Q")
 
 
 def train(sim: str, folder: Path, seed: int, steps: int) -> tuple[Path, list[Path]]:
-    """Return the log of a training, and its checkpoints."""
+    """Train, unless this was done before; return the log and the checkpoints."""
     log = folder / "training.mcap"
     every = steps // CHECKPOINTS
     kept = [folder / f"step-{every * (k + 1)}.zip" for k in range(CHECKPOINTS)]
@@ -112,7 +112,7 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
 
 
 def agreement(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
-    """Return rank correlations with both returns, regret@1 and the fraction of verdicts."""
+    """Return rank correlations with both returns, regret@1 and the fraction trusted."""
     estimated, discounted, plain = (
         np.array([row["estimates"][estimator] if own is None else row[own] for row in rows])
         for own in (None, "discounted", "return")
@@ -135,11 +135,11 @@ def show(sim: str, by_seed: list[list[dict[str, Any]]]) -> None:
     errors = [row["estimates"]["FQE"] - row["discounted"] for rows in by_seed for row in rows]
     spread = [row["discounted"] for rows in by_seed for row in rows]
     print(f"true discounted values {min(spread):.2f} to {max(spread):.2f};", end=" ")
-    print(f"FQE errs by {np.mean(np.abs(errors)):.2f} in the mean, bias {np.mean(errors):.2f}")
+    print(f"FQE: mean absolute error {np.mean(np.abs(errors)):.2f}, bias {np.mean(errors):.2f}")
 
 
 def rank_correlation(estimated: NDArray[np.floating], true: NDArray[np.floating]) -> float:
-    """Return Spearman's correlation: 1 if the estimates have the policies in their true order.
+    """Return Spearman's correlation: 1 if the estimates rank the policies in their true order.
 
     Equal values share the mean of their ranks. NaN if all estimates or all true values are equal.
 

@@ -86,7 +86,7 @@ def _row(path: Path) -> str:
 
 
 def _peak_mb() -> float:
-    # Not ru_maxrss, which a child takes over from its parent.
+    # Do not use ru_maxrss, which a child process inherits from its parent.
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 

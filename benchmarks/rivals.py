@@ -1,4 +1,4 @@
-"""Do the same tasks with other libraries, each in the way of its documentation."""
+"""Do the same tasks with other libraries, each as its documentation shows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mcaprl.recorder import message_dtype, step_schema
 
 NAME, TEXT = step_schema(OBSERVATION, ACTION)
 Fields = dict[str, tuple[str, ...]]
-"""What is read, by topic."""
+"""Names of the fields to read, by topic."""
 Span = tuple[int | None, int | None]
 """Half-open range of log_times, in nanoseconds; None for all."""
 DEPTH = "/rl/observation/depth"
@@ -26,7 +26,7 @@ IMAGE_FIELDS: Fields = {"/rl/step": ("observation_state", "action", "reward"), D
 
 
 def messages(data: mcaprl.Dataset) -> list[bytes]:
-    """Return prebuilt CDR of `/rl/step`, so that only the writing is timed."""
+    """Return CDR messages of `/rl/step`; they are prebuilt, so that only writing is timed."""
     dtype = message_dtype(TEXT)
     assert dtype is not None
     rows = np.zeros(len(data), dtype)
@@ -194,12 +194,12 @@ class MinariFolder:
         return name
 
     def name(self, data: mcaprl.Dataset, data_format: str) -> str:
-        """Return the name of a dataset that `write` writes."""
+        """Return the name under which `write` stores a dataset."""
         what = "images" if isinstance(data.observations, dict) else "vectors"
         return f"bench/{what}-{data_format}-v0"
 
     def read(self, name: str, episodes: list[int] | None = None) -> list[Any]:
-        """Read observations, actions and rewards into arrays; default: of all episodes."""
+        """Read observations, actions and rewards of episodes into arrays; default: all episodes."""
         import minari
 
         found = list(minari.load_dataset(name).iterate_episodes(episodes))
@@ -210,7 +210,7 @@ class MinariFolder:
 
 
 def _frames(observations: Any, following: Any) -> Any:
-    """Return the observations of an episode as in Minari: one more than steps."""
+    """Return the observations of an episode as in Minari, with the last next observation."""
     if isinstance(observations, dict):
         return {name: _frames(observations[name], following[name]) for name in observations}
     return np.concatenate([observations, following[-1:]])
@@ -230,7 +230,7 @@ class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
-    """Return the columns that the table formats store; next observations are the next rows'."""
+    """Return the columns for table formats; next observations are stored only as next rows."""
     here = data.observations
     return {
         **(here if isinstance(here, dict) else {"observation": here}),
@@ -242,7 +242,7 @@ def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
 
 
 def write_h5py(data: mcaprl.Dataset, path: Path) -> None:
-    """Write with h5py, in one HDF5 file, chunked and with gzip 1: it has no built-in zstd."""
+    """Write with h5py, in one HDF5 file, chunked and with gzip 1: HDF5 has no built-in zstd."""
     import h5py
 
     with h5py.File(path, "w") as file:

@@ -1,4 +1,4 @@
-"""Runs the benchmarks, and writes results.json and docs/speed.md: `make bench`."""
+"""Run the benchmarks, and write results.json and docs/speed.md: `make bench`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ make bench
 
 
 def main() -> None:
-    """Measure everything that is asked for."""
+    """Run the requested benchmarks, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transitions", type=int, default=1_000_000, help="of the vector log")
     parser.add_argument("--largest", type=int, default=10_000_000, help="log of the growth table")
@@ -84,13 +84,13 @@ def main() -> None:
 
 
 def _last_tables() -> dict[str, Table]:
-    """Those of the last run, by title."""
+    """Return the tables of the last run, by title."""
     results = json.loads(RESULTS.read_text())
     return {table["title"]: Table(**table) for table in results["tables"]}
 
 
 def write_results(tables: list[Table], transitions: int) -> None:
-    """Write results.json, and the page of the docs from it."""
+    """Write results.json and docs/speed.md."""
     results = {
         "python": platform.python_version(),
         "machine": platform.machine(),

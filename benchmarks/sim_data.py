@@ -3,14 +3,14 @@
 random   random actions
 medium   an online policy that scores half of the pilot, with 10 % random actions
 expert   the sim's pilot
-replay   all transitions of this online training until then
+replay   all transitions of the medium policy's online training
 mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and random actions
-weak     a pilot that mostly does the wrong thing: the drone's and the racer's do nothing, the
-         car's brakes above 5 m/s
+weak     a pilot that mostly does the wrong thing: drone and racer do nothing, the car brakes
+         above 5 m/s
 
-Most actions of the weak pilot are bad ones, in most states, so imitation performs as badly. The
-better actions are in the log, and its rewards identify them. A car that does nothing would leave
-its lane within eight seconds, and its log would show little of the course.
+In most states, most actions of the weak pilot are bad, so a policy that imitates it is also bad.
+The better actions are in the log, and its rewards identify them. A car that does nothing would
+leave its lane within eight seconds, and its log would show little of the course.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from mcaprl.sims import EpsilonGreedy, LaneKeepingEnv, make_pilot, make_sim, rol
 STEPS = 20_000
 NAMES = ("random", "medium", "expert", "replay", "mixed", "weak")
 MEDIUM_SCORE = 0.5
-"""Where random is 0 and the pilot 1, over the 30 episodes of an evaluation while learning."""
+"""Score (random 0, pilot 1) of an evaluation during training at which the training stops."""
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
-"""The action of each sim that its weak pilot prefers."""
+"""Wrong action of the weak pilot, by sim."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
-"""Slower than that, the weak pilot errs as little as when it is awake."""
+"""Speed, by sim, above which the weak pilot does the wrong thing; at any speed if not listed."""
 WEAK, CLUMSY = 0.6, 0.1
-"""How often the weak pilot does the wrong thing, and how often, of the rest, any action."""
+"""Two probabilities: of the wrong action and, if it is not taken, of a random action."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
 MakeBehavior = Callable[[gym.Env[Any, Any]], EpsilonGreedy]
 
@@ -48,7 +48,7 @@ class WeakPilot(EpsilonGreedy):
     """A pilot that does the wrong thing most of the time."""
 
     def __init__(self, env: gym.Env[Any, Any], sim: str) -> None:
-        """Wrap the pilot of `env`; its correct actions include some random ones."""
+        """Wrap the pilot of `env`, and set CLUMSY as the probability of a random action."""
         super().__init__(make_pilot(env), CLUMSY, env.action_space)
         meanings: tuple[str, ...] = env.get_wrapper_attr("action_meanings")
         self.name, self._wrong = "weak pilot", meanings.index(WRONG[sim])
@@ -84,7 +84,7 @@ def make_logs(folder: Path, sim: str) -> dict[str, Path]:
 
 
 def _learn_online(sim: str, out: Path, log: Path) -> None:
-    """Train with the sim's default settings, and stop halfway; `out` has the best policy then."""
+    """Train with default settings until MEDIUM_SCORE is reached; save the best policy in `out`."""
 
     def stop_halfway(now: TrainingProgress) -> None:
         if now.terms["score"] >= MEDIUM_SCORE:
@@ -99,7 +99,7 @@ def _learn_online(sim: str, out: Path, log: Path) -> None:
 
 
 class _HalfwayError(Exception):
-    """Stops an online run."""
+    """Exception that stops an online training."""
 
 
 def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
@@ -124,7 +124,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
 
 
 def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes until each behavior has made its part of the steps."""
+    """Record whole episodes until each behavior has made its share of the steps."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,

@@ -3,7 +3,7 @@
     python -m benchmarks.sim_grid FOLDER [--sims lane,racer] [--data weak] [--algos 'cql;bc']
 
 The logs are those of `sim_data`; the settings of each sim are below and the same for all its logs.
-The networks after the last update are scored: nothing is selected by its score in the sim. A score
+The networks after the last update are scored: none is selected by its score in the sim. A score
 is the mean return over 30 episodes of each seed, normalized so that random is 0 and the pilot 1,
 with a 95 % bootstrap interval over seeds and episodes. FOLDER/SIM/scores.json has each finished
 cell, so an interrupted run resumes. At the end the tables are written to docs/results.md, with a
@@ -39,21 +39,21 @@ ALGOS: dict[str, tuple[str, dict[str, Any]]] = {
     "bcq": ("bcq", {}),
     "iql": ("iql", {}),
 }
-"""CQL twice: with the default weight of its penalty, which is 1, and with a tenth of it."""
+"""Algorithm and settings, by column; CQL has a penalty weight of 1, its default, or of 0.1."""
 SHARED: dict[str, Any] = {"updates": 4_000, "batch_size": 128}
 TARGET_INTERVAL = 150
-"""Updates between two copies into the target: with the default, values would not get far ahead."""
+"""Updates between two target syncs; the default has too few syncs for the effective horizon."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "lane": {"gamma": 0.97},
     "powerline": {"gamma": 0.95, "n_steps": 3, "learning_rate": 3e-4},
     "racer": {"gamma": 0.98, "n_steps": 3},
 }
-"""Of the learners of values; behavior cloning takes of these the learning rate alone."""
+"""Settings of each sim; behavior cloning uses only the learning rate."""
 Cell = dict[str, Any]
 
 
 def main() -> None:
-    """Compute the requested missing cells, and the tables if all cells exist."""
+    """Compute the requested missing cells, and write the tables."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sims", default=",".join(SETTINGS))
@@ -121,7 +121,7 @@ def learn(
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:
-    """Run the same episodes for each policy; in `env` one by one, or in a batch."""
+    """Run the same episodes for each policy: one by one in `env`, or as a batch without `env`."""
     with closing(make_sim(sim)) as own, closing(make_sims(sim, EPISODES)) as envs:
         return evaluate(
             env or own,
@@ -134,7 +134,7 @@ def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyS
 
 
 def normalize_mean(mean_return: float, random: PolicyScore, pilot: PolicyScore) -> float:
-    """Return the mean return on the scale random = 0, pilot = 1."""
+    """Return a mean return normalized so that random is 0 and the pilot 1."""
     return (mean_return - random.mean_return) / (pilot.mean_return - random.mean_return)
 
 

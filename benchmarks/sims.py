@@ -17,7 +17,7 @@ from mcaprl.sims import encode_depth, make_sim, make_sims
 
 CARS, DRONES, RACERS = 1024, 64, 256
 QUADROTOR_STEPS = 5
-"""A drone's decision of 0.5 s is five steps of 0.1 s, each of 50 steps of its equations."""
+"""Number of steps of 0.1 s in one drone action (0.5 s); a step has 50 integration steps."""
 
 
 STEPS = 1_000_000
@@ -35,7 +35,7 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """Return our sims as sides, with turns of some hundredths of a second to limit disturbances.
+    """Return the sides for our sims; turns take hundredths of a second, to limit disturbances.
 
     An episode that is not finished at the end of a turn continues in the next one.
     """
@@ -90,7 +90,7 @@ def _cpu_s(side: Side) -> float:
 
 def _highway(env_id: str) -> gym.Env[Any, Any]:
     with warnings.catch_warnings():
-        # Its spaces are float64 here and there; Gymnasium says so when they are made.
+        # Gymnasium warns about the float64 in some of highway-env's spaces.
         warnings.simplefilter("ignore")
         return gym.make(env_id, disable_env_checker=True)
 

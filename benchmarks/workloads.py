@@ -38,7 +38,7 @@ class Constant(gym.Env[Any, Any]):
 
 
 def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -> None:
-    """Step through episodes."""
+    """Run episodes with a constant action, and close the environment."""
     for _ in range(episodes):
         env.reset()
         for _ in range(steps):
@@ -47,7 +47,7 @@ def run_env(env: gym.Env[Any, Any], episodes: int, steps: int = EPISODE_STEPS) -
 
 
 def vectors(transitions: int) -> mcaprl.Dataset:
-    """Return random numbers, which hardly compress: 19 float32 and 9 actions."""
+    """Return transitions of random numbers, which hardly compress: 19 float32, 9 actions."""
     random = np.random.default_rng(0)
     episodes = transitions // EPISODE_STEPS
     frames = random.standard_normal((episodes, EPISODE_STEPS + 1, 19), np.float32)

@@ -1,4 +1,4 @@
-"""`mcaprl convert`: logs from and to other robots' bags and other tools' datasets."""
+"""`mcaprl convert`: convert logs, other robots' bags or datasets to logs or datasets."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mcaprl.texts import counted
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]")
 @mapping_options
-@click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not clear.")
+@click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not detected.")
 @click.option("--to", metavar="FORMAT", help="Format of DST if its name does not say it.")
-@click.option("--lossy", is_flag=True, help="Convert or leave out what the format cannot hold.")
-@click.option("--suggest", is_flag=True, help="Print a mapping to begin with; there is no DST.")
-@click.option("--dry-run", is_flag=True, help="Write nothing; there is no DST.")
+@click.option("--lossy", is_flag=True, help="Convert or omit data that the format cannot store.")
+@click.option("--suggest", is_flag=True, help="Print a mapping for SRC to edit; takes no DST.")
+@click.option("--dry-run", is_flag=True, help="Read SRC and write nothing; takes no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
 @json_option

@@ -18,7 +18,7 @@ _overwrite_option = click.option("--overwrite", is_flag=True, help="Replace exis
 
 @click.command()
 @click.argument("logs", nargs=-1, required=True, metavar="LOG... OUT")
-@click.option("--shift", is_flag=True, help="Move the times of logs that overlap earlier ones.")
+@click.option("--shift", is_flag=True, help="Delay each log that overlaps a previous one in time.")
 @_overwrite_option
 @json_option
 def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) -> None:
@@ -33,7 +33,7 @@ def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) ->
 @click.argument("out")
 @click.option("--episodes", type=int, help="Number of episodes of each part.")
 @click.option("--ratio", metavar="A:B[:C...]", help="Relative sizes of the parts, such as 8:1:1.")
-@click.option("--seed", type=click.IntRange(0), help="Seed; assign episodes to parts at random.")
+@click.option("--seed", type=click.IntRange(0), help="Seed to assign episodes to parts at random.")
 @_overwrite_option
 @json_option
 def split(
@@ -79,7 +79,7 @@ def slice_(
 ) -> None:
     """Copy the part of LOG between two steps or times to the new log OUT.
 
-    Episodes that the part begins or ends within become shorter. A or B may be empty.
+    Episodes that contain A or B are shortened. If A or B is empty, the start or end of LOG is used.
     """
     found = mcaprl.slice(
         log,
@@ -106,7 +106,7 @@ def _bounds(option: str, text: str) -> tuple[float | None, float | None]:
     """Parse A:B; an empty bound is None.
 
     Raises:
-        UsageError: The text has another form.
+        UsageError: The text does not have the form A:B, or a bound is not a number.
     """
     parts = text.split(":")
     if len(parts) != 2:

@@ -135,7 +135,7 @@ def _print_scores(found: Evaluation, episodes: int) -> None:
         rows,
     )
     print_table(
-        "probability that an episode of one policy has a higher return than one of the other",
+        "probability that an episode of one policy has a higher return than an episode of another",
         ["policy", "than", "probability", "95 % interval"],
         [
             [one.better, one.than, f"{one.probability:.2f}", _interval(one.interval)]

@@ -81,7 +81,7 @@ def recover(file: Path, out: Path, keep_unfinished: bool, overwrite: bool, as_js
     if as_json:
         print_json(found.to_json())
     else:
-        ended = f", {found.ended} of them without their end" if found.ended else ""
+        ended = f", {found.ended} of them unfinished" if found.ended else ""
         episodes = counted(found.episodes, "episode")
         echo(f"{out}: {episodes}{ended}, {counted(found.messages, 'message')}")
         print_problems(found.problems)

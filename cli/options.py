@@ -49,6 +49,6 @@ def sim_options(command: F) -> F:
 def integer_option(
     name: str, help: str, *, least: int, most: int | None = None, default: int | None = None
 ) -> Callable[[F], F]:
-    """Return an option for an integer from `least` to `most`; without `default`, it is `least`."""
+    """Return an option for an integer from `least` to `most`; a `default` of None means `least`."""
     default, kind = least if default is None else default, click.IntRange(least, most)
     return click.option(name, default=default, show_default=True, type=kind, help=help)

@@ -41,7 +41,7 @@ from mcaprl.texts import counted, size
 @sim_options
 @click.option("--no-scene", is_flag=True, help="Omit the topics that only viewers use.")
 @click.option("--camera", is_flag=True, help="Record metric depth images on /camera/depth.")
-@click.option("--infos", is_flag=True, help="Record what the environment returns as info.")
+@click.option("--infos", is_flag=True, help="Record the info dicts that the environment returns.")
 @click.option(
     "--compression",
     default="zstd",

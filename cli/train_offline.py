@@ -66,7 +66,7 @@ def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
         echo(f"curves: {out / CURVES_NAME}, or tensorboard --logdir {out}")
     else:
         echo(
-            f"curves: tensorboard --logdir {out}; for an image: matplotlib is not installed:"
+            f"curves: tensorboard --logdir {out}; an image of the curves needs matplotlib:"
             " pip install 'mcaprl[report]'"
         )
 

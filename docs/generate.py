@@ -46,8 +46,8 @@ class Sheet(NamedTuple):
     Attributes:
         sim: Short name of the sim.
         steps: Maximum number of steps.
-        start: Name of the start.
-        columns: Number of frames.
+        start: Value of the sim's argument `start`.
+        columns: Number of columns, one for each frame.
         cameras: Arguments that select a depth camera, for each row.
         road: Road of highway-lane.
     """
@@ -132,7 +132,7 @@ def _default(value: Any) -> str:
 
 
 def _members(value: type) -> list[str]:
-    """Return the documented methods and properties that a class and its bases of ours define."""
+    """Return the documented methods and properties of a class and its bases in this package."""
     ours = [base for base in value.__mro__ if base.__module__.startswith("mcaprl")]
     return [
         name
@@ -140,7 +140,7 @@ def _members(value: type) -> list[str]:
         for name, member in vars(base).items()
         if not name.startswith("_")
         and inspect.getdoc(getattr(value, name))
-        # Fields of a dataclass are described in the docstring of the class.
+        # Skip the fields of a dataclass: the docstring of the class describes them.
         and (
             isinstance(member, property | cached_property | classmethod | staticmethod)
             or callable(member)
@@ -155,7 +155,7 @@ def _member(value: type, name: str) -> str:
 
 
 def _signature(value: Any) -> str:
-    """Return the arguments of a function or class; one per line if they fill more than a line."""
+    """Return the signature of a function or class, with one argument per line if it is long."""
     if not callable(value) or value is mcaprl.McaprlError:
         return ""
     signature = inspect.signature(value)
@@ -198,7 +198,7 @@ def contact_sheet(sheet: Sheet, policy: str) -> Figure:
         policy: `pilot` or `random`.
     """
     arguments = {"start": sheet.start} | ({"road": sheet.road} if sheet.road else {})
-    # They differ in the camera only: the same seed and actions produce the same episode.
+    # The environments differ only in the camera, so all of them run the same episode.
     envs = [
         make_sim(sheet.sim, render_mode="rgb_array", **arguments, **camera)
         for camera in sheet.cameras or ({},)
@@ -221,7 +221,7 @@ def contact_sheet(sheet: Sheet, policy: str) -> Figure:
 
 
 def _episode(envs: list[gym.Env[Any, Any]], policy: str, steps: int) -> Iterator[str]:
-    """Run one episode in all environments; yield the reason of the end after each observation."""
+    """Run one episode in all environments; yield the end reason, else "", at each step."""
     pilot, actions = make_pilot(envs[0]), envs[0].action_space
     actions.seed(SEED)
     for env in envs:

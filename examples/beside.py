@@ -51,7 +51,7 @@ def start(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 
 
 def scores_while_it_learns(learner: subprocess.Popen[bytes], run: Path) -> dict[int, float]:
-    """Return the score of each policy that a run saves until it ends, by its number of updates."""
+    """Return the score of each policy that a run saves while it trains, by number of updates."""
     found: dict[int, float] = {}
     with closing(make_sim(SIM)) as env:
         scale = measure_scale(env, episodes=EPISODES, seed=SELECTION_SEED)
@@ -108,7 +108,7 @@ def main() -> None:
         raise SystemExit("the offline learner read a part of an episode, or an episode twice")
     grown = len(set(known.values()))
     print(f"the log grew to {whole[-1]} transitions in {len(whole)} episodes; the offline learner")
-    print(f"read it at {grown} sizes, each time whole episodes only, and none twice")
+    print(f"saw it at {grown} different lengths: only complete episodes, and each of them once")
     draw(out / "beside.png", read_curve(online / "seed-0" / "curve.csv"), known, scores)
     print(out / "beside.png")
 

@@ -17,8 +17,7 @@ for mix in "0.05 25" "0.1 50" "0.2 200" "0.3 200"; do
   number=$((number + 1))
 done
 
-# --normalize subtracts the mean image, which carries no information. Half of the default channels take
-# less than half the time.
-mcaprl train-offline "$out/data" --algo cql --seeds 4 --normalize --hidden 256,256 --channels 16,32,32 \
-  --batch-size 32 --target-interval 100 --updates 8000 --out "$out/runs/cql"
+# --normalize centers the images, and also normalizes speed, steering angle and next turn.
+mcaprl train-offline "$out/data" --algo cql --seeds 4 --normalize --hidden 256,256 --batch-size 64 \
+  --target-interval 100 --updates 8000 --out "$out/runs/cql"
 mcaprl evaluate "$out/runs/cql" pilot random --sim lane --observation dashboard --behavior "$out/data"

@@ -128,7 +128,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _numbers(values: Tensor, space: spaces.Space[Any]) -> Tensor:
-    """Return a part of the space as numbers (B, width); discrete values are one-hot encoded."""
+    """Return values of a space as numbers (B, width); discrete values are one-hot encoded."""
     flat = values.reshape(values.shape[0], -1)
     sizes = discrete_sizes(space)
     if sizes is None:

@@ -26,11 +26,11 @@ from torch import Tensor, nn
 
 from mcaprl.errors import PolicyError, SpaceError, TrainingError
 from mcaprl.files import parse_json, write_json
+from mcaprl.networks import ImageInput, Network, architecture_of, check_size
 from mcaprl.offline.algorithms.learner import ActsBy, Learner
 from mcaprl.offline.algorithms.losses import allowed_only, likely_actions, mean_values
-from mcaprl.offline.algorithms.networks import Architecture, Network
 from mcaprl.offline.batches.buffer import discrete_actions
-from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.spaces import (
     check_elements,
     observation_leaves,
@@ -38,7 +38,7 @@ from mcaprl.recorder.format.spaces import (
     space_to_json,
 )
 from mcaprl.runs import POLICY_NAME
-from mcaprl.tensor_files import check_widths, convolved_features, read_tensors, write_tensors
+from mcaprl.tensor_files import read_tensors, write_tensors
 
 FORMAT_VERSION = 2
 _WEIGHTS_NAME = "policy.safetensors"
@@ -48,7 +48,7 @@ _BAD_CONTENT = (ValueError, TypeError, KeyError, AttributeError, RuntimeError, S
 
 
 class Scores(nn.Module):
-    """Networks that map observations to scores of actions; the policy selects the largest."""
+    """Networks that compute a score of each action; the policy selects the highest score."""
 
     def __init__(self, networks: dict[str, Network], acts_by: ActsBy, threshold: float) -> None:
         """Wrap the networks `q` or `logits`, or both."""
@@ -172,7 +172,7 @@ class Policy:
         return self._encode(_flatten(observations)).stacked(self.frame_stack)
 
     def _stack_onto_stored(self, now: Observations) -> Observations:
-        """Store observations; return the stack that ends with them, padded with the first ones."""
+        """Store observations; return the stacks that end with them, padded with the oldest."""
         if self._seen and len(self._seen[-1]) != len(now):
             self.begin()
         self._seen.extend([now] * (1 if self._seen else self.frame_stack))
@@ -213,7 +213,7 @@ def save_policy(
         "acts_by": learner.acts_by,
         "threshold": getattr(learner.config, "threshold", 0.0),
         "updates": learner.step,
-        "architecture": asdict(learner.config.architecture),
+        "architecture": asdict(learner.architecture),
         "outputs": {name: list(network.output_shape) for name, network in networks.items()},
         "frame_stack": buffer.packing.frame_stack,
         "env_id": env_id,
@@ -255,18 +255,13 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
     encoder.scale = weights.pop("observation.scale").numpy()
     stack, shape = int(description["frame_stack"]), description["architecture"]
     check_elements(stack * sum(leaf.size for leaf in observation_leaves(observation_space)))
-    lists = {key: tuple(value) for key, value in shape.items() if isinstance(value, list)}
-    architecture = Architecture(**{**shape, **lists})
+    architecture = architecture_of(shape)
     encoder.image_inputs = [
         _image_input(image, number, weights) for number, image in enumerate(encoder.image_inputs)
     ]
     images = [image.stacked(stack) for image in encoder.image_inputs]
-    inputs = [convolved_features(image.shape, architecture.channels[-1]) for image in images]
-    if images:
-        check_widths(architecture.channels, weights)
     for outputs in description["outputs"].values():
-        for width in filter(None, [*inputs, encoder.width * stack]):
-            check_widths([width, *architecture.hidden, math.prod(outputs)], weights)
+        check_size(architecture, encoder.width * stack, images, math.prod(outputs), weights)
     networks = {
         name: Network(encoder.width * stack, images, tuple(outputs), architecture)
         for name, outputs in description["outputs"].items()
@@ -287,12 +282,12 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
 
 
 def _image_input(image: ImageInput, number: int, weights: dict[str, Tensor]) -> ImageInput:
-    """Move the stored normalization from `weights` into a copy of the input."""
+    """Return the input with its stored normalization, which is removed from `weights`."""
     if _IMAGE_SHIFT.format(number) not in weights:
         return image
     shift = weights.pop(_IMAGE_SHIFT.format(number)).numpy()
     if shift.shape != image.shape:
-        raise ValueError(f"the mean image is {shift.shape}, but images are {image.shape}")
+        raise ValueError(f"the mean image has shape {shift.shape}, but images have {image.shape}")
     return replace(image, shift=shift, scale=float(weights.pop(_IMAGE_SCALE.format(number))))
 
 

@@ -1,11 +1,11 @@
-"""Make a robot's bag of the drives in a log of the lane sim.
+"""Make a robot's bag from the drives in a log of the lane sim.
 
     mcaprl record lane --policy pilot --epsilon 0.1 --episodes 40 --out native.mcap
     python examples/robot_bag/make_bag.py native.mcap bag                     # ROS 2, by rosbags
     python examples/robot_bag/make_bag.py native.mcap drive.mcap --format protobuf   # foxglove-sdk
     python examples/robot_bag/make_bag.py native.mcap drive.mcap --format json
 
-The log gives the starts and the actions alone; `robot.py` lists what the robot publishes.
+Only the seeds and actions are read from the log; `robot.py` lists the topics of the bag.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a car with a lane detector publishes while it drives; it knows nothing of mcaprl's topics.
+"""Topics that a car with a lane detector publishes while it drives; mcaprl defines none of them.
 
 /odom           nav_msgs/Odometry at 50 Hz: pose and speed
 /joint_states   sensor_msgs/JointState at 20 Hz: commanded position of the steering joint
@@ -44,13 +44,13 @@ COMMANDS = (
     ("slightly right", 30.0, -0.25),
     ("slightly left", 30.0, 0.25),
 )
-"""Name, wanted speed and steering (a share of the largest angle, left positive) of each action."""
+"""Name, speed in m/s and steering (fraction of the maximum angle, left positive) of each action."""
 _STEP_S, _SUBSTEP_S = 0.25, 0.05
 _LOOKAHEADS_M = np.repeat([5.0, 10.0, 20.0, 40.0], 2)
 _FULL_STEERING_RAD = math.radians(40.0)
 _ODOMETRY_S, _COMMAND_S, _IMAGE_S, _DIAGNOSTICS_S = 0.02, 0.05, 0.1, 1.0
 _JITTER_S = 0.004
-"""Largest delay of a measurement until it is recorded."""
+"""Largest delay between a measurement and its recording."""
 _LANE_DELAY_S = 0.010
 _COMMAND_DELAY_S = 0.012
 _FAR_MM = 65_535
@@ -103,7 +103,7 @@ class Drive:
 
         Args:
             camera: Camera at the front of the car.
-            start_ns: Time of the start for the stamps of headers, nanoseconds.
+            start_ns: Start time for the header stamps, nanoseconds.
         """
         parts = (
             self._odometry(start_ns),
@@ -193,7 +193,7 @@ class Drive:
         number, share = divmod(time_s / _SUBSTEP_S + 1e-9, 1.0)
         low = self._cars[int(number)]
         if share < 1e-6:
-            # A measurement at the time of a decision precedes it.
+            # A measurement at the time of a decision shows the state before the new action.
             return low
         high = self._cars[int(number) + 1]
         turn = math.remainder(high.yaw_rad - low.yaw_rad, 2 * math.pi)
@@ -206,7 +206,7 @@ class Drive:
 
 
 def _lane(car: Any, seen: NDArray[np.float32]) -> list[float]:
-    """Return what the lane detector publishes, in meters and radians."""
+    """Return the data of the topic `/lane`, in meters and radians."""
     ahead_m = seen[4:] * _LOOKAHEADS_M
     return [car.offset_m, car.heading_error_rad, car.along_m, *ahead_m.tolist()]
 

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 Field = descriptor_pb2.FieldDescriptorProto
 Write = Callable[[str, int, dict[str, Any]], None]
-"""Function of topic, time in nanoseconds and content of a message."""
+"""Function called with the topic, the time in nanoseconds and the content of a message."""
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _KINDS = {
@@ -127,7 +127,7 @@ def _ros_value(node: Any, value: Any) -> Any:
 
 
 def _protobuf_types() -> tuple[bytes, dict[str, Any]]:
-    """Return the descriptors of all types, and the class of each topic's messages."""
+    """Return the serialized descriptors of all types, and the message class of each topic."""
     file = descriptor_pb2.FileDescriptorProto(name="robot.proto", package="robot", syntax="proto3")
     for kind in TYPES.values():
         _describe(file, kind)

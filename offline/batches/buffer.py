@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
+from mcaprl.networks import ImageInput
 from mcaprl.offline.batches.items import n_step_returns
-from mcaprl.offline.batches.observations import ImageInput, ObservationEncoder, Observations
+from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.spaces import check_actions
 
 if TYPE_CHECKING:
@@ -37,12 +38,14 @@ class Packing:
         frame_stack: Number of successive observations in one network input; an episode's
             first observation also pads the stacks.
         normalize: Whether network inputs are normalized to mean 0 and standard deviation 1.
+        center_images: Whether images are normalized even if `normalize` is False.
         gamma: Discount per step.
         n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
     """
 
     frame_stack: int = 1
     normalize: bool = False
+    center_images: bool = False
     gamma: float = 1.0
     n_steps: int = 1
 
@@ -82,7 +85,7 @@ class TransitionBuffer:
         places: (2, N) int64, frame indexes of each transition's observation and next observation.
         actions: (N,) int64 action indexes, starting at 0.
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
-        drawable: (M,) int64, rows with a weight above 0; None if all rows have one.
+        drawable: (M,) int64, rows with a weight above 0; None if all weights are above 0.
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
     """
@@ -111,9 +114,9 @@ class TransitionBuffer:
 
         Args:
             dataset: Dataset with discrete actions.
-            packing: How transitions are built; default: from single steps and single frames.
+            packing: Settings for building transitions; default: single steps and single frames.
             encoder: Encoder of other data, whose normalization is reused; default: a new one.
-            weights: (E,) relative sampling weight per episode, for its transitions; default: all
+            weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
 
         Raises:
@@ -128,6 +131,8 @@ class TransitionBuffer:
             encoder = ObservationEncoder(dataset.observation_space, int(action_space.n))
             if packing.normalize and len(dataset):
                 encoder.normalize_to(dataset.frames)
+            elif packing.center_images and len(dataset):
+                encoder.center_images(dataset.frames)
         if len(dataset) == 0:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths

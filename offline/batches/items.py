@@ -21,7 +21,7 @@ Arrays = dict[str, Any]
 
 @dataclass(frozen=True)
 class ItemOptions:
-    """Form of the items.
+    """Settings that define the items of a dataset.
 
     Attributes:
         n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
@@ -66,7 +66,7 @@ class ItemOptions:
 
 
 class Items:
-    """The items of whole episodes, in order."""
+    """Items of all episodes of a dataset, in order."""
 
     def __init__(self, dataset: Dataset, options: ItemOptions) -> None:
         """Compute the returns of all transitions."""
@@ -90,7 +90,7 @@ class Items:
         return len(self._starts)
 
     def batch(self, items: NDArray[np.int64]) -> Arrays:
-        """Gather the items (B,); see `mcaprl.torch.TransitionDataset` for the arrays."""
+        """Gather items by index (B,); see `mcaprl.torch.TransitionDataset` for the arrays."""
         rows = self._starts[items]
         return self._transitions(rows) if self.options.length is None else self._sequences(rows)
 
@@ -133,7 +133,7 @@ class Items:
         return {**found, "mask": mask}
 
     def _observed(self, frames: NDArray[np.int64], firsts: NDArray[np.int64]) -> Any:
-        """Gather observations, with earlier ones of the episode in a new axis if configured."""
+        """Gather observations or, if configured, stacks of successive ones along a new axis."""
         count = self.options.frame_stack
         if count > 1:
             ages = np.arange(count - 1, -1, -1)
@@ -156,8 +156,9 @@ def n_step_returns(
         gamma: Discount per step.
 
     Returns:
-        (2, N) frames of each transition's observation and of the observation up to n steps later;
-        and (2, N) discounted sums of the rewards, and discounts of the later observation.
+        Frame indexes (2, N) of each transition's observation and of the observation up to n steps
+        later; and an array (2, N): the discounted sum of the rewards between these two
+        observations, and the discount of the value of the later observation.
     """
     n_rows, lengths = len(dataset), dataset.episode_lengths
     rows = np.arange(n_rows)
@@ -193,7 +194,7 @@ def _gathered(column: Frames, frames: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def _clear(arrays: Arrays, where: NDArray[np.bool_]) -> None:
-    """Set the rows of all arrays to zero where the mask is set."""
+    """Set all arrays to zero in the rows that the mask `where` selects."""
     for array in arrays.values():
         if isinstance(array, dict):
             _clear(array, where)

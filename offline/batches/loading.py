@@ -114,8 +114,8 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
 
         Args:
             batch_size: Number of items of a batch.
-            shuffle: Whether each epoch has a new random order; `generator` among the options seeds
-                it.
+            shuffle: Whether each epoch has a new random order; to seed it, pass `generator` in
+                `options`.
             drop_last: Whether a last batch with fewer items is left out.
             options: Further arguments of `torch.utils.data.DataLoader`; `sampler` replaces the
                 order of `shuffle`.
@@ -130,7 +130,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
         return torch.utils.data.DataLoader(self, batch_size=None, sampler=batches, **options)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a worker process needs: tensors, which PyTorch shares without copies.
+        """Return what a worker process needs: paths, or tensors in shared memory.
 
         Raises:
             UsageError: The images are on disk, and the dataset was not made from paths.
@@ -145,8 +145,8 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
                 )
             return {"paths": self._paths, "options": self._items.options}
         if self._shared is None:
-            # From here on this process uses the shared memory, too. Without a reference, PyTorch
-            # would remove it before a worker has opened it.
+            # From here on this process uses the shared memory, too: without a reference to it,
+            # PyTorch would free the memory before a worker has opened it.
             self._shared = _Shared(
                 frames=tuple(_shared(leaf) for leaf in columns.frames),
                 columns={name: _shared(getattr(columns, name)) for name in _COLUMNS},
@@ -168,7 +168,7 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
 
 
 class _Shared(NamedTuple):
-    """Parts of a dataset, with the arrays as tensors, which processes share."""
+    """Contents of a dataset, with arrays as tensors in memory shared between processes."""
 
     frames: tuple[torch.Tensor, ...]
     columns: dict[str, torch.Tensor]
@@ -187,14 +187,14 @@ class _Shared(NamedTuple):
 
 
 def _shared(array: Any) -> torch.Tensor:
-    """Copy an array to memory that processes share."""
+    """Copy an array to a tensor in memory shared between processes."""
     tensor = torch.from_numpy(np.array(array))
     tensor.share_memory_()  # type: ignore[no-untyped-call]
     return tensor
 
 
 def tensors_of(arrays: Arrays) -> Tensors:
-    """Return arrays as tensors with the same memory."""
+    """Return arrays as tensors that share their memory."""
     return {
         name: tensors_of(part) if isinstance(part, dict) else torch.from_numpy(part)
         for name, part in arrays.items()

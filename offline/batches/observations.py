@@ -9,9 +9,8 @@ marks the allowed actions, as in PettingZoo. Logs contain it as part of the obse
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,16 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mcaprl.errors import SpaceError
+from mcaprl.networks import ImageInput
 from mcaprl.recorder.format.spaces import MIN_IMAGE_EDGE, Leaf, observation_leaves
 
 MIN_CONVOLUTION_EDGE = 36
 """Smallest image edge in pixels for which the output of the convolutions is not empty."""
 MASK_KEY = "action_mask"
-_MAX_IMAGES = 10_000
-"""Maximum number of images, evenly spaced, for computing a mean image."""
-_IMAGES_AT_ONCE = 256
-_SMALLEST_VARIANCE = 1e-6
-"""Variance of pixels (0 to 255) up to which images count as equal, because of rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class Observations:
     mask: Tensor | None = None
 
     def __len__(self) -> int:
-        """Return B."""
+        """Return the number of observations, B."""
         return len(self.vector)
 
     def parts(self) -> list[Tensor]:
@@ -57,7 +52,7 @@ class Observations:
         return [self.vector, *self.images, *mask]
 
     def like(self, parts: Sequence[Tensor]) -> Observations:
-        """Return observations made of other tensors, which are in the order of `self.parts`."""
+        """Return observations that consist of `parts`, in the order that `self.parts` returns."""
         n_images = len(self.images)
         mask = None if self.mask is None else parts[-1]
         return Observations(parts[0], tuple(parts[1 : 1 + n_images]), mask)
@@ -88,45 +83,6 @@ class Observations:
     def to(self, device: torch.device) -> Observations:
         """Return the same observations on another device."""
         return self.like([part.to(device) for part in self.parts()])
-
-
-@dataclass(frozen=True, eq=False)
-class ImageInput:
-    """Shape and normalization of one camera's images: (pixels - shift) / scale.
-
-    Attributes:
-        shape: (height, width, channels).
-        shift: (height, width, channels) float32, from 0 to 255; None is all zeros.
-        scale: Divisor of the shifted pixels.
-    """
-
-    shape: tuple[int, ...]
-    shift: NDArray[np.float32] | None = None
-    scale: float = 255.0
-
-    def stacked(self, count: int) -> ImageInput:
-        """Return the input for `count` images that are stacked along the channel axis."""
-        height, width, channels = self.shape
-        shift = None if self.shift is None else np.tile(self.shift, (1, 1, count))
-        return replace(self, shape=(height, width, channels * count), shift=shift)
-
-    def normalized_to(self, images: NDArray[np.uint8]) -> ImageInput:
-        """Return the input with the mean image as shift and the standard deviation as scale.
-
-        All pixels of the images (N, height, width) or (N, height, width, channels) share one scale,
-        so pixels that hardly change stay small.
-        """
-        used = np.linspace(0, len(images) - 1, min(len(images), _MAX_IMAGES)).astype(np.int64)
-        total = np.zeros(self.shape)
-        squares = 0.0
-        for rows in np.split(used, range(_IMAGES_AT_ONCE, len(used), _IMAGES_AT_ONCE)):
-            pixels = np.asarray(images[rows]).reshape(-1, *self.shape).astype(np.float64)
-            total += pixels.sum(0)
-            squares += float(np.square(pixels).sum())
-        mean = total / len(used)
-        variance = squares / (len(used) * mean.size) - float(np.square(mean).mean())
-        scale = math.sqrt(variance) if variance > _SMALLEST_VARIANCE else self.scale
-        return replace(self, shift=mean.astype(np.float32), scale=scale)
 
 
 class ObservationEncoder:
@@ -173,10 +129,7 @@ class ObservationEncoder:
         Each number has its own scale; all pixels of an image share one. Constant inputs keep their
         scale and become 0.
         """
-        self.image_inputs = [
-            image.normalized_to(leaf.of(observations))
-            for image, leaf in zip(self.image_inputs, self.images, strict=True)
-        ]
+        self.center_images(observations)
         self.shift, scale = np.zeros_like(self.shift), self.scale
         self.scale = np.ones_like(scale)
         vector = self._vector(observations).astype(np.float64)
@@ -184,6 +137,13 @@ class ObservationEncoder:
         constant = deviation <= 1e-6 * np.abs(vector).max(0, initial=0)
         self.shift = vector.mean(0).astype(np.float32)
         self.scale = np.where(constant, scale, deviation).astype(np.float32)
+
+    def center_images(self, observations: Any) -> None:
+        """Normalize all images to mean 0 and standard deviation 1 over these observations."""
+        self.image_inputs = [
+            image.normalized_to(leaf.of(observations))
+            for image, leaf in zip(self.image_inputs, self.images, strict=True)
+        ]
 
     def encode(self, observations: Any) -> Observations:
         """Encode B observations of the space: arrays (B, *shape), or nested dicts of these.
@@ -218,7 +178,7 @@ class ObservationEncoder:
         if self.mask is None:
             return None
         allowed = np.asarray(self.mask.of(observations)).astype(bool)
-        # The mask after an episode's end may allow no action; values there are never used.
+        # After an episode's end, a mask may allow no action. Allow all: the values are never used.
         return torch.from_numpy(allowed | ~allowed.any(1, keepdims=True))
 
 
@@ -254,7 +214,7 @@ def _width(space: spaces.Space[Any]) -> int:
 
 
 def _numbers(values: NDArray[Any], space: spaces.Space[Any]) -> NDArray[Any]:
-    """Return a part of the space as numbers (B, width); discrete values are one-hot encoded."""
+    """Return values of a space as numbers (B, width); discrete values are one-hot encoded."""
     sizes = discrete_sizes(space)
     flat = np.asarray(values).reshape(len(values), -1)
     if sizes is None:

@@ -49,7 +49,7 @@ def open_weighted(data: Sequence[str], *, threads: int = 1) -> tuple[Dataset, ND
 
 
 def _readers(name: str, threads: int) -> Iterator[tuple[str, Callable[[], Dataset]]]:
-    """Yield a unique name and a function that reads it, for each log or dataset of a name."""
+    """Yield a unique name and a read function for each log or dataset that `name` refers to."""
     other = other_format(name)
     if other is not None:
         yield name, partial(read_format, name, other)

@@ -23,7 +23,7 @@ from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
 from mcaprl.recorder.dataset.open import find_logs
 
-# Blocks consist of this many parts or more, so that a block has episodes from many places.
+# Approximate number of parts in a block: several, so that a block mixes distant episodes.
 _PARTS_PER_BLOCK = 8
 
 
@@ -53,11 +53,11 @@ class _Share(NamedTuple):
 class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
     """Iterable dataset of shuffled batches; the arrays are those of `TransitionDataset`.
 
-    Pass it to `DataLoader(stream, batch_size=None, num_workers=K)`, or iterate it directly. In an
-    epoch each item comes once over all workers and ranks. All of them have equally many batches,
-    unless there are fewer items than workers, or batches have one item. Parts of the logs are read
-    in random order, several parts at a time as one block of `buffer` items, which is shuffled. The
-    order depends on `seed`, the epoch, and the numbers of workers and ranks alone.
+    Pass it to `DataLoader(stream, batch_size=None, num_workers=K)`, or iterate it directly. An
+    epoch contains each item once over all workers and ranks. All workers of all ranks have the same
+    number of batches, unless there are fewer items than workers, or `batch_size` is 1. Parts of the
+    logs are read in random order, several parts at a time as one block of `buffer` items, which is
+    shuffled. The order depends only on `seed`, the epoch, and the numbers of workers and ranks.
 
     An iteration in the process of the training loop advances the epoch at its end. With workers,
     call `set_epoch` before each epoch.
@@ -88,7 +88,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
             buffer: Number of items that are read and shuffled at a time; at least one episode.
             seed: Seed of the order.
             shuffle: Whether the order is random; otherwise it is that of the logs.
-            drop_last: Whether batches with fewer items are left out.
+            drop_last: Whether batches with fewer than `batch_size` items are left out.
             n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
             gamma: Discount per step.
             frame_stack: Number of successive observations in one item.
@@ -131,24 +131,24 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         """Return the state from which `load_state_dict` continues.
 
         Args:
-            batches: Number of batches of this epoch that the training loop has received, since it
-                began; needed with workers, which read ahead. Default: those of the current
-                iteration in this process.
+            batches: Number of batches that the training loop has received since the start of this
+                epoch; needed with workers, which read ahead. Default: the number counted by the
+                current iteration in this process.
         """
         done = self._done if batches is None else batches
         return {"seed": self._seed, "epoch": self.epoch, "batches": done}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continue with the batch after those that a state counts.
+        """Continue after the last batch that is counted in a state.
 
-        The rest of the epoch is equal to that of the interrupted run if the options, and the
-        numbers of workers and ranks, are.
+        The rest of the epoch is the same as in the interrupted run if the options and the numbers
+        of workers and ranks are the same.
 
         Raises:
-            UsageError: The state is that of another seed.
+            UsageError: The state has another seed.
         """
         if state["seed"] != self._seed:
-            raise UsageError(f"the state has seed {state['seed']}, the stream {self._seed}")
+            raise UsageError(f"the state has seed {state['seed']}, but the stream has {self._seed}")
         self._position[:] = torch.tensor([state["epoch"], state["batches"]])
         self._done = state["batches"]
 
@@ -166,8 +166,8 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
 
     def _batches(self, worker: int, workers: int) -> Iterator[Tensors]:
         epoch, skipped = self._position.tolist()
-        # Batch k comes from worker k modulo the number of workers. After `skipped` batches it is
-        # the turn of another worker than the first, which the first one replaces.
+        # Batch k comes from worker k modulo the number of workers. A resumed epoch begins with
+        # worker 0 again, so worker w takes the role of worker w + skipped.
         number = (worker + skipped) % workers
         mine = len(range(number, skipped, workers))
         shard, shards = self._rank * workers + number, self._world_size * workers
@@ -184,13 +184,13 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         full = [self._batch_size] * min(count // self._batch_size, number - 1)
         rest = count - sum(full)
         if rest == 0 and full and self._batch_size > 1:
-            # Another shard has one item more, in a separate batch.
+            # Other shards have one more item, and thus one more batch: split the last batch.
             full[-1] -= 1
             rest = 1
         return [*full, rest] if rest else full
 
     def _blocks(self, epoch: int, shard: int, shards: int) -> Iterator[_Rows]:
-        """Yield the shard's items in the order of the epoch, block by block, without reading."""
+        """Yield the shard's items in the order of the epoch, as blocks that are not read yet."""
         order = np.arange(len(self._parts))
         if self._shuffle:
             np.random.default_rng([self._seed, epoch]).shuffle(order)
@@ -225,7 +225,7 @@ class _Source:
         self._logs: dict[int, LogReader] = {}
 
     def parts(self, options: ItemOptions, size: int) -> list[_Part]:
-        """Divide the episodes into parts of `size` items or more.
+        """Divide the episodes into parts of `size` or more items; a log's last part may have fewer.
 
         Raises:
             LogError: There are no episodes.
@@ -262,12 +262,12 @@ class _Source:
         return self._logs[number]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out open files, which each process opens for itself."""
+        """Return the state without open files; each process opens its own."""
         return {"_data": self._data, "_paths": self._paths, "_logs": {}}
 
 
 class _Rows:
-    """Items of a block in their order; the block is read when the first ones are gathered."""
+    """Items of a block, in order; the first call of `gather` reads the block."""
 
     def __init__(
         self, source: _Source, options: ItemOptions, parts: list[_Part], rows: NDArray[np.int64]
@@ -285,7 +285,7 @@ class _Rows:
 
 
 def _cut(blocks: Iterator[_Rows], sizes: list[int], skipped: int) -> Iterator[Tensors]:
-    """Yield batches of these sizes from successive blocks, without the first `skipped` ones."""
+    """Yield batches of these sizes from successive blocks; skip the first `skipped` batches."""
     block: _Rows | None = None
     position = 0
     for number, size in enumerate(sizes):
@@ -302,7 +302,7 @@ def _cut(blocks: Iterator[_Rows], sizes: list[int], skipped: int) -> Iterator[Te
 
 
 def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
-    """Yield successive shares in groups of at least `size` items; the last may have fewer."""
+    """Yield successive shares in groups of at least `size` items; the last group may have fewer."""
     group, items = list[_Share](), 0
     for share in shares:
         group.append(share)
@@ -315,10 +315,10 @@ def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
 
 
 def _rank_of(rank: int | None, world_size: int | None) -> tuple[int, int]:
-    """Return rank and number of processes; those of `torch.distributed` where they are None.
+    """Return rank and world size; default: those of `torch.distributed`, or 0 and 1.
 
     Raises:
-        UsageError: Only one of both is given, or the rank is not below the number.
+        UsageError: Only one of the two is given, or the rank is outside the world size.
     """
     if (rank is None) != (world_size is None):
         raise UsageError("pass both rank and world_size, or neither")

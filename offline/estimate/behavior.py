@@ -46,8 +46,8 @@ class FoldScore:
     Attributes:
         episodes: Number of episodes that were predicted.
         log_likelihood: Mean log probability of the actions taken.
-        marginal: The same, if every action had its frequency in the training episodes.
-        uniform: The same, if all actions were equally probable.
+        marginal: `log_likelihood` if the action frequencies of the training episodes are predicted.
+        uniform: `log_likelihood` if equal probabilities of all allowed actions are predicted.
         temperature: Divisor of the network's logits.
         uniform_share: Share of the uniform distribution in the prediction.
     """
@@ -62,7 +62,7 @@ class FoldScore:
 
 @dataclass(frozen=True)
 class ReliabilityRange:
-    """The predictions, one for each step and action, in a range of probabilities.
+    """Calibration of the predictions (one per step and action) in a range of probabilities.
 
     Attributes:
         low, high: Range (low, high].
@@ -141,7 +141,7 @@ def estimate_behavior(
     """
     count = len(dataset.episode_lengths)
     if folds < 2 or updates < 1:
-        raise UsageError(f"folds is {folds} and updates {updates}: expected 2 and 1, or more")
+        raise UsageError(f"folds is {folds} and updates is {updates}: expected at least 2 and 1")
     if count < max(folds, 3):
         raise UsageError(
             f"estimating behavior_prob in {folds} folds needs {max(folds, 3)} episodes or more;"
@@ -198,7 +198,7 @@ def reliability(predicted: Floats, actions: NDArray[np.int64]) -> tuple[Reliabil
 
 
 def _validation(training: NDArray[np.bool_], random: np.random.Generator) -> NDArray[np.bool_]:
-    """Choose some of the training episodes (E,), at least one and not all."""
+    """Choose the training episodes (E,) for validation: at least one, but not all."""
     chosen = np.zeros(len(training), bool)
     episodes = random.permutation(np.flatnonzero(training))
     chosen[episodes[: max(round(_VALIDATED * len(episodes)), 1)]] = True
@@ -220,7 +220,7 @@ def _fitted(
     validated: NDArray[np.bool_],
     on_update: Callable[[], None],
 ) -> tuple[Floats, FoldScore]:
-    """Train a network; return the probabilities (N, A) of its best weights, and their score."""
+    """Train a network; return the predictions (N, A) of its best weights, and their score."""
     buffer, updates = learner.buffer, learner.config.updates
     actions = buffer.actions.numpy()
     checks = set(np.linspace(0, updates, _CHECKS + 1).round().astype(int).tolist())
@@ -252,7 +252,7 @@ def _fitted(
 
 
 def _calibrated(logits: Floats, actions: NDArray[np.int64]) -> tuple[float, float, float]:
-    """Return the best mean log probability, with its temperature and share of the uniform."""
+    """Return the best mean log probability, and its temperature and uniform share."""
     candidates = []
     for temperature in _TEMPERATURES.tolist():
         own = _probabilities(logits, temperature, 0.0)[np.arange(len(actions)), actions]

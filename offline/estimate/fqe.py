@@ -48,7 +48,7 @@ class FQEConfig(TrainingConfig):
 
     @property
     def packing(self) -> Packing:
-        """Settings for single steps; n-step returns would depend on the behavior policy."""
+        """Settings for single-step transitions; n-step returns depend on the behavior policy."""
         return Packing(gamma=self.gamma)
 
     @property
@@ -108,7 +108,7 @@ class FQE(Learner):
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """Return the lowest and highest discounted sum of one or more of these rewards."""
+    """Return the bounds of the discounted return of episodes with only these rewards."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

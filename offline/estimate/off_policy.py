@@ -47,7 +47,7 @@ _STANDARD_ERRORS = 4.0
 
 
 class StochasticPolicy(Protocol):
-    """A policy that can be evaluated."""
+    """Interface of policies that can be evaluated."""
 
     def action_probabilities(self, observations: Any) -> NDArray[np.floating]:
         """Return the probabilities (B, A) of the actions for B observations."""

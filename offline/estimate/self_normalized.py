@@ -35,7 +35,7 @@ _RESAMPLES_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class RatioEstimate:
-    """Estimate sum_k w_k (mean a_k / mean b_k + ...) over E episodes.
+    """Estimate sum_k w_k (mean a_k / mean b_k + ...): one ratio per pair, means over E episodes.
 
     Attributes:
         weights: Weights w (K,).
@@ -99,7 +99,7 @@ class RatioEstimate:
         """Return the degrees of freedom of the standard error, at least 1.
 
         They are (sum_i m_i^2)^2 / sum_i m_i^4 - 1, where m_i is the change of the estimate due to
-        episode i. Equal changes result in E - 1.
+        episode i. If all changes are equal, there are E - 1.
         """
         once = np.ones((1, len(self.pairs[0][0])))
         shares = self._changes(once)[:, 0] ** 2

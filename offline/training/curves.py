@@ -44,7 +44,7 @@ def draw_curves(folder: Path) -> Path:
 
 
 def curve_figures(folder: Path) -> list[tuple[str, Any]]:
-    """Return a title and a small figure for each term, for HTML pages.
+    """Return a title and a small figure for each term of the loss, for HTML pages.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

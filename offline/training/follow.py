@@ -105,7 +105,7 @@ def with_more_data(
 
 
 def _read_from(path: Path, first: int) -> Dataset | None:
-    """Read the episodes of a log from number `first`; return None if there are none."""
+    """Read the episodes of a log from index `first` on; return None if there are none."""
     with warnings.catch_warnings():
         # The warning that a log is still being written is expected here.
         warnings.simplefilter("ignore", UserWarning)

@@ -70,7 +70,7 @@ def train(
         out: Folder of the run; it must be empty or not exist.
         seeds: Number of networks to train in parallel; they are independent of each other.
         seed: Seed of the first network; network k uses seed + k.
-        weights: (E,) relative sampling weight per episode, for its transitions; default: all equal.
+        weights: (E,) relative sampling weight of each transition of an episode; default: all equal.
         resume: Whether to resume from the checkpoints in `out`. Seeds without one start from
             update 0.
         other_data: Whether to accept checkpoints trained on other data when resuming.
@@ -122,7 +122,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Run:
-    """State that all seeds of a run share.
+    """Data and settings shared by all seeds of a run.
 
     Attributes:
         folder: Folder of the run.
@@ -198,7 +198,7 @@ class _Run:
     def _train_to_next_stop(
         self, learner: Learner, metrics: list[MetricsWriter]
     ) -> list[dict[str, float]]:
-        """Update until metrics or a checkpoint is due, and write what is due."""
+        """Run updates until metrics or a checkpoint is due; write metrics, and a due checkpoint."""
         config = learner.config
         while True:
             terms = self._update(learner)
@@ -261,13 +261,13 @@ class _Run:
 
 
 def _earlier_encoder(folder: Path) -> ObservationEncoder | None:
-    """Return the encoder of the run in a folder with its normalization, or None."""
+    """Return the encoder, with normalization, of the run in a folder; None if there is no run."""
     policies = policy_files(folder)
     return read_policy(policies[0].parent).encoder if policies else None
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:
-    """Return a hash of the data; unequal weights are included in it."""
+    """Return a hash of the data, and of the weights unless all weights are equal."""
     if len(set(weights.tolist())) < 2:
         return dataset.fingerprint
     return hashlib.sha256(dataset.fingerprint.encode() + weights.tobytes()).hexdigest()

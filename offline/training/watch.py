@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 MAX_ROWS = 256
 """Number of transitions per validation, spread evenly over the held-out episodes."""
 MIN_HORIZON_FRACTION = 0.3
-"""Fraction of an infinite return below which values hardly distinguish good from bad actions."""
+"""Value of `horizon_fraction` below which values hardly distinguish good from bad actions."""
 MAX_EXCESS = 2.0
-"""Ratio of a mean value to the largest possible return above which values diverge."""
+"""Ratio of a mean value to the largest possible return; a higher ratio counts as divergence."""
 _CUT_OFF = 0.05
-"""Maximum discount of the rewards missing after a truncation."""
+"""Largest discount of the rewards missing after a truncation for which a return is not NaN."""
 
 
 class HeldOut:
@@ -66,7 +66,7 @@ class HeldOut:
 
 
 def choose_held_out(n_episodes: int, fraction: float) -> NDArray[np.int64]:
-    """Choose about `fraction` of the episodes, never all; from ten on, choose at least one.
+    """Choose about `fraction` of the episodes: at least one if there are ten or more, never all.
 
     The choice depends only on the number of episodes, so it is the same for all seeds.
     """
