@@ -1,4 +1,4 @@
-"""Measure reading other robots' bags: fields of messages, images, and bags with a mapping."""
+"""Measure reading robots' bags: message fields, compressed images, and a bag with a mapping."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ FIELDS = {
     "sensor_msgs/msg/JointState": ("position",),
     "sensor_msgs/msg/LaserScan": ("ranges",),
 }
-"""Fields to read, by message type; the topic is the last part of the type's name."""
+"""Fields to read, by message type; each type has a topic of its own, such as `/odometry`."""
 LIMIT_S = 300.0
-"""Maximum time for reading a gigabyte: users ask for five minutes."""
+"""Maximum time for reading a gigabyte, in seconds; users require at most five minutes."""
 
 
 def tables(folder: Path) -> list[Table]:
@@ -80,7 +80,7 @@ def _rerun(path: Path, topic: str, fields: Sequence[str]) -> list[Any]:
 
 
 def _arrow_field(batch: Any, field: str) -> NDArray[Any]:
-    """Return a field of all messages as an array; each message is a list of one struct."""
+    """Return one field of all messages as an array, from lists that contain one struct each."""
     messages = next(
         column
         for name, column in zip(batch.schema.names, batch.columns, strict=True)
@@ -226,7 +226,7 @@ def _write_images(path: Path, count: int = IMAGES) -> list[bytes]:
 
 
 class _Log:
-    """Writer of ROS 2 messages as `ros2 bag record` writes them: MCAP with definitions."""
+    """Writer of ROS 2 messages to MCAP files with message definitions, like `ros2 bag record`."""
 
     def __init__(self, path: Path) -> None:
         from mcap.writer import Writer

@@ -1,8 +1,8 @@
 """Create five CartPole-v1 logs of 50,000 transitions each, from agents of Stable-Baselines3.
 
 random   random actions
-medium   PPO halfway: the first iteration with a mean return of 200, actions sampled
-expert   PPO at the end, greedy actions
+medium   PPO in the first iteration with a mean return of 200, with sampled actions
+expert   PPO after its training, with greedy actions
 replay   all transitions of DQN's training
 mixed    half random, half expert
 """
@@ -29,7 +29,7 @@ Act = Callable[[NDArray[Any]], int]
 
 
 def make_logs(folder: Path) -> dict[str, mcaprl.Dataset]:
-    """Create the missing logs, and read all five."""
+    """Create all five logs if one of them is missing, and read them."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = {name: folder / f"{name}.mcap" for name in NAMES}
     if not all(path.exists() for path in paths.values()):
@@ -77,7 +77,7 @@ def _record_all(paths: dict[str, Path]) -> None:
 
 
 def record(path: Path, act: Act, steps: int) -> None:
-    """Record at least this number of steps, in whole episodes."""
+    """Record whole episodes until the log has at least `steps` steps."""
     env = mcaprl.RecordMcap(gym.make("CartPole-v1"), path)
     done = episode = 0
     while done < steps:

@@ -1,12 +1,12 @@
-"""Train five algorithms on five CartPole logs with four seeds, and d3rlpy's on the same logs.
+"""Train five algorithms on five CartPole logs with four seeds, and compare with d3rlpy.
 
     python benchmarks/cartpole_grid.py FOLDER [--seeds 4] [--only cql,bc]
 
 A training has 5000 updates with batch size 64, learning rate 1e-3, gamma .99, a target sync every
 200 updates, and layer widths 256x256. Its result is the mean return of the last three evaluations
 (after 4000, 4500 and 5000 updates) of 10 episodes each. d3rlpy is trained with one seed if it is
-installed. FOLDER/grid.json has each finished cell, so an interrupted run resumes. The table and the
-results of the gates are written to docs/results.md.
+installed. FOLDER/grid.json has the results of finished trainings, so an interrupted run resumes.
+The table is written to docs/results.md, with conditions on the results and whether they hold.
 """
 
 from __future__ import annotations
@@ -129,12 +129,12 @@ def theirs(data: mcaprl.Dataset, algo: str) -> list[float]:
 
 Found = dict[str, dict[str, list[float]]]
 GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
-    "Double DQN collapses on medium and expert data, to less than half of the behavior": (
+    "Double DQN reaches less than half of the behavior's return on medium and expert data": (
         lambda found, behavior: all(
             bool(np.mean(found[name]["double-dqn"]) < 0.5 * behavior[name]) for name in GOOD_LOGS
         )
     ),
-    "CQL reaches .95 of the behavior on medium and expert data with each seed": (
+    "CQL reaches .95 of the behavior's return on medium and expert data with each seed": (
         lambda found, behavior: all(
             min(found[name]["cql"]) >= 0.95 * behavior[name] for name in GOOD_LOGS
         )
@@ -149,11 +149,11 @@ GATES: dict[str, Callable[[Found, dict[str, float]], bool]] = {
         )
     ),
 }
-"""Conditions on our results, by description."""
+"""Functions that return whether our results satisfy a condition, by its description."""
 
 
 def verdict(gate: str, result: dict[str, Any]) -> str:
-    """Return whether a gate holds, does not hold, or was not run for lack of cells."""
+    """Return `holds` or `does not hold`; `not run` if the condition needs missing results."""
     try:
         return "holds" if GATES[gate](result["mcaprl"], result["behavior"]) else "does not hold"
     except KeyError:
@@ -161,7 +161,7 @@ def verdict(gate: str, result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Run the missing cells of the grid, print it, and evaluate the gates."""
+    """Run the missing trainings; print the table and the conditions, and write them to the docs."""
     parser = argparse.ArgumentParser()
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=4)
@@ -185,7 +185,10 @@ def main() -> None:
 
 
 def cells(algos: list[str]) -> list[tuple[str, str, str]]:
-    """Return side, algorithm and log of each cell: ours first, then d3rlpy's if installed."""
+    """Return library, algorithm and log of each training: mcaprl's first, then d3rlpy's.
+
+    If d3rlpy is not installed, there are only mcaprl's trainings.
+    """
     wanted = sorted(algos, key=ALGOS.index)
     mine = [("mcaprl", algo, name) for algo in wanted for name in NAMES]
     if importlib.util.find_spec("d3rlpy") is None:
@@ -194,12 +197,15 @@ def cells(algos: list[str]) -> list[tuple[str, str, str]]:
 
 
 def summary(result: dict[str, Any]) -> str:
-    """Return the table, followed by the gates."""
+    """Return the table, followed by the verdict on each condition in `GATES`."""
     return "\n".join([table(result), "", *(f"- {verdict(gate, result)}: {gate}" for gate in GATES)])
 
 
 def table(result: dict[str, Any]) -> str:
-    """Return Markdown: our mean, the range of the seeds, and d3rlpy's mean; a dash if not run."""
+    """Return a Markdown table: our mean, the range of our seeds, and d3rlpy's result.
+
+    A cell without a result of ours has a dash.
+    """
     lines = [f"| data (behavior) | {' | '.join(ALGOS)} |", "|---|" + "---|" * len(ALGOS)]
     for name in NAMES:
         texts = []

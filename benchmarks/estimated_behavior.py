@@ -24,7 +24,7 @@ ESTIMATORS = ("PDIS", "WPDIS", "DR", "WDR")
 
 
 class _Evaluated:
-    """The task's evaluated policy."""
+    """Policy that is evaluated in the two-state task."""
 
     def action_probabilities(self, observations: Any) -> NDArray[np.float64]:
         """Return the probabilities (B, 2); an observation is the state, one-hot."""

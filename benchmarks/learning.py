@@ -13,7 +13,7 @@ benchmarks/learning.json, and the table to docs/results.md. With --only 256, 32 
 rows keep the values of an earlier run.
 
 --only gradients compares updates with autograd to the same updates with closed-form gradients,
-which this file implements. It prints the ratios of their speeds, and needs none of the libraries.
+which this file implements. It prints the ratios of the speeds, and runs neither d3rlpy nor SB3.
 """
 
 from __future__ import annotations
@@ -82,19 +82,19 @@ def transitions() -> mcaprl.Dataset:
 
 
 def ours(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Update:
-    """Return a function that makes one update of this number of seeds."""
+    """Return a function that makes one update of mcaprl's learner with `seeds` seeds."""
     return learner_of(data, algo, batch_size, seeds).update
 
 
 def learner_of(data: mcaprl.Dataset, algo: str, batch_size: int, seeds: int = 1) -> Learner:
-    """Return a learner of this number of seeds with default settings."""
+    """Return a learner with `seeds` seeds and, except for the batch size, default settings."""
     config = ALGORITHMS[algo].config_type(batch_size=batch_size)
     buffer = TransitionBuffer.from_dataset(data, config.packing)
     return ALGORITHMS[algo](config, buffer, range(seeds))
 
 
 def d3rlpys(data: Any, config: str, batch_size: int) -> Update:
-    """Return a function that makes one update of d3rlpy, with a batch from its buffer."""
+    """Return a function that draws a batch from d3rlpy's buffer and makes one update."""
     import d3rlpy
 
     log = d3rlpy.dataset.MDPDataset(
@@ -210,7 +210,7 @@ def gradient_rows(size: int, turns: Turns) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Turns:
-    """Number and length of the turns of each side.
+    """Turns in which each side of a comparison is timed.
 
     Attributes:
         rounds: Number of turns of each side.
@@ -235,7 +235,7 @@ def best_rates(sides: dict[str, tuple[Update, int]], turns: Turns) -> dict[str, 
 
 
 def whole_way(folder: Path, turns: Turns) -> float:
-    """Return the CPU time of the alternative relative to ours, from a log on disk to a policy."""
+    """Return the CPU time of mcap and d3rlpy relative to ours, from a log on disk to a policy."""
     log, part = folder / "log.mcap", folder / "part.mcap"
     vectors(LOG_ROWS).save(log)
     rivals.write_mcap(rivals.messages(vectors(int(LOG_ROWS * LOG_SHARE))), part)
@@ -247,12 +247,12 @@ def whole_way(folder: Path, turns: Turns) -> float:
     their_update = d3rlpys(logged(columns), "DiscreteCQLConfig", 256)
     theirs_s = (time.process_time() - start) / LOG_SHARE
     rates = best_rates({"ours": (update, 1), "theirs": (their_update, 1)}, turns)
-    print(f"the alternative takes {theirs_s / ours_s:.0f} times as long to read", flush=True)
+    print(f"mcap and d3rlpy take {theirs_s / ours_s:.0f} times as long to load the log", flush=True)
     return (theirs_s + LOG_UPDATES / rates["theirs"]) / (ours_s + LOG_UPDATES / rates["ours"])
 
 
 def logged(columns: dict[str, Any]) -> Any:
-    """Return columns under a dataset's attribute names, as episodes of EPISODE_STEPS steps."""
+    """Return an object with a dataset's attributes, made of columns of equally long episodes."""
     rows = len(columns["action"])
     return SimpleNamespace(
         observations=columns["observation"],
@@ -264,7 +264,7 @@ def logged(columns: dict[str, Any]) -> Any:
 
 
 def rows_of(size: int, turns: Turns) -> dict[str, float]:
-    """Return the ratios at one batch size."""
+    """Return the ratios of updates per second at one batch size."""
     data = transitions()
     sides = {
         "ddqn": (ours(data, "double-dqn", size), 1),

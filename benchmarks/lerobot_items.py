@@ -44,7 +44,7 @@ print((time.process_time() - start) / count)
 
 
 def main() -> None:
-    """Print the ratio."""
+    """Print LeRobot's CPU time per transition relative to ours."""
     torch.set_num_threads(1)
     data = vectors(TRANSITIONS)
     with tempfile.TemporaryDirectory() as folder:

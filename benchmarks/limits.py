@@ -26,7 +26,7 @@ def least(path: Path, *topics: str) -> Callable[[], object]:
 
 
 def plain_level_1(path: Path) -> Callable[[], None]:
-    """Return a function that decompresses the chunks of `/rl/step`, recompressed at level 1."""
+    """Recompress the chunks of `/rl/step` at level 1; return a function that decompresses them."""
     chunks = level_1_chunks(raw_chunks(path, STEP_TOPIC))
     return lambda: plain_zstd(chunks)
 

@@ -15,7 +15,7 @@ import mcaprl.torch
 from benchmarks.measure import OURS, Side, Table, compare
 
 BATCH = 256
-# Fraction of the log that is timed for sides that load one item at a time.
+# Fraction of the log that is timed for loaders that load one item at a time.
 SHARE = 0.02
 
 

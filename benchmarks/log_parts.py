@@ -37,7 +37,7 @@ def tables(
 
 
 def _short_episodes(folder: Path) -> Table:
-    """Measure reading a recording with separate chunks per episode, one each for `/rl/step`."""
+    """Measure reading a recording in which each episode has its own chunk of `/rl/step`."""
     path, steps = folder / "short.mcap", 20
     run_env(mcaprl.RecordMcap(Constant(steps), path), 1000, steps)
     return compare(
@@ -63,8 +63,11 @@ def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.Minar
         f"Reading one episode of {len(episodes)}",
         [
             Side(OURS, lambda: mcaprl.open(log, episodes=number)),
-            Side("plain zstd of its chunks", limits.plain(log, start_ns=start, stop_ns=stop)),
-            Side("memcpy of its observations", lambda: [one.copy()]),
+            Side(
+                "plain zstd of the episode's chunks",
+                limits.plain(log, start_ns=start, stop_ns=stop),
+            ),
+            Side("memcpy of the episode's observations", lambda: [one.copy()]),
             Side(
                 "mcap + mcap-ros2-support, by time",
                 lambda: rivals.read_mcap(log, span_ns=(start, stop + 1)),
@@ -73,7 +76,7 @@ def _episode(folder: Path, log: Path, data: mcaprl.Dataset, minari: rivals.Minar
             Side("h5py, gzip 1, by rows", lambda: rivals.read_h5py(table, rows)),
             *(
                 Side(
-                    f"Minari, {kind}, of {len(part.episodes)}",
+                    f"Minari, {kind}, one of {len(part.episodes)} episodes",
                     partial(minari.read, minari.name(part, kind), [len(part.episodes) // 2]),
                 )
                 for kind in ("hdf5", "arrow")

@@ -196,7 +196,10 @@ def _space(folder: Path, log: Path, data: mcaprl.Dataset) -> Table:
 
 
 def _threads(log: Path) -> Table:
-    """Measure wall-clock time, because threads do not reduce CPU time."""
+    """Measure the wall-clock time of reading and checking with several threads.
+
+    Threads do not reduce the CPU time.
+    """
     return compare(
         "Reading the log of vectors with several threads",
         [
@@ -218,7 +221,7 @@ def _checking(folder: Path, log: Path) -> Table:
         "Checking and recovering the log of vectors",
         [
             Side(OURS, lambda: mcaprl.check(log)),
-            Side("reading it into columns", lambda: mcaprl.open(log)),
+            Side("reading the log into columns", lambda: mcaprl.open(log)),
             Side(PLAIN, limits.plain(log)),
             Side("recovering it", lambda: mcaprl.recover(log, out, overwrite=True)),
         ],

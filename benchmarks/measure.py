@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 OURS = "mcaprl"
-# Fractions of a task that are timed for sides that handle one message at a time. A turn then takes
-# tenths of a second, so that each side has many turns, and a disturbance affects only one of them.
+# Fractions of a task that are timed for libraries that handle one message at a time. A turn then
+# takes tenths of a second, so that each library has many turns and a disturbance affects only one.
 SLOW_SHARE = 0.1
 SLOWEST_SHARE = 0.01
 
@@ -56,7 +56,7 @@ class Table:
     unit: str = "CPU time, ours = 1"
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the attributes as a dict of JSON types."""
         return asdict(self)
 
     def to_markdown(self) -> str:

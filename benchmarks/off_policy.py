@@ -8,8 +8,8 @@ policy's true returns in the sim. Coverage: the fraction of `--logs` logs whose 
 contains the true value, on a task whose value is the solution of linear equations
 (tests/support/two_state_task.py).
 
-The first comparison needs SCOPE-RL and the second d3rlpy (`make bench-learning` installs both). A
-comparison without its library is reported and left out.
+The first comparison needs SCOPE-RL, the second one needs d3rlpy (`make bench-learning` installs
+both). If a library is not installed, its comparison is left out with a message.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SCOPE_RL_NAMES: Final = {
 }
 """Names of the estimators in SCOPE-RL.
 
-Its self-normalized DR does not normalize the weights of V, so it is not our WDR.
+WDR is missing: SCOPE-RL's self-normalized DR differs, because it does not normalize V's weights.
 """
 
 
@@ -61,7 +61,7 @@ def beside_scope_rl(logs: int) -> dict[str, float]:
 
 
 def _as_scope_rl(table: EpisodeTable) -> dict[str, Any]:
-    """Return an episode table in SCOPE-RL's format; the logged action is always its action 0."""
+    """Return an episode table in SCOPE-RL's format, with all logged actions numbered 0."""
     pi = np.minimum(0.5, table.ratios / 4).ravel()
     # Action 1 has the remaining probability, and the Q that results in the table's V.
     other = (table.v.ravel() - pi * table.q.ravel()) / (1 - pi)
@@ -148,7 +148,7 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
     from d3rlpy.ope.fqe import FQEConfig as TheirConfig
 
     class Acting:
-        """The interface that DiscreteFQE needs of the algorithm that it evaluates."""
+        """Evaluated policy, with the methods that DiscreteFQE calls."""
 
         @property
         def impl(self) -> Acting:
@@ -183,8 +183,8 @@ def d3rlpys(columns: dict[str, Any], policy: Balance, seed: int) -> float:
 
 
 def beside_d3rlpy(seeds: int) -> None:
-    """Print both FQE estimates, with a separate log and network per seed, and the true value."""
-    print("| policy | true | ours, mean and spread | d3rlpy's | our error | its error |")
+    """Print our and d3rlpy's FQE estimates, with one log and network per seed, and true values."""
+    print("| policy | true | ours, mean and spread | d3rlpy's | our error | d3rlpy's error |")
     for name, policy in POLICIES.items():
         found = []
         for seed in range(seeds):
@@ -220,10 +220,10 @@ def coverage(logs: int, episodes: int) -> dict[str, dict[str, float]]:
 
 
 def main() -> None:
-    """Compare and print."""
+    """Run the comparisons and measure the coverage; print all results."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--logs", type=int, default=1000, help="of the coverage")
-    parser.add_argument("--seeds", type=int, default=4, help="of both FQEs")
+    parser.add_argument("--logs", type=int, default=1000, help="number of logs for the coverage")
+    parser.add_argument("--seeds", type=int, default=4, help="number of seeds of both FQEs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
@@ -238,7 +238,7 @@ def main() -> None:
     else:
         print("d3rlpy is not installed: not compared")
     for episodes in (50, 300):
-        print(f"{arguments.logs} logs of {episodes} episodes; 95 % intervals that hold the truth:")
+        print(f"{arguments.logs} logs of {episodes} episodes; 95 % intervals with the true value:")
         for kind, shares in coverage(arguments.logs, episodes).items():
             text = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
             print(f"  {kind}: {text}", flush=True)

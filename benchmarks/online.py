@@ -3,8 +3,8 @@
 The same training runs in turns: alone, with a log, and with a viewer (Node, see tests/node). The
 measure is the CPU time of all threads of the training, the best of several turns. By default it is
 the complete training of the lane sim with its default settings. `--steps` shortens the training and
-increases the share of recording, because the first episodes have only about twenty steps, and each
-is written at its end.
+increases the share of recording, because the first episodes have only about twenty steps, and an
+episode is written when it ends.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _silent(_: TrainingProgress) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure the trainings, and print what recording and a viewer add."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=SIM_SETTINGS[SIMS["lane"]]["steps"])
     parser.add_argument("--rounds", type=int, default=3)
@@ -80,7 +80,7 @@ def main() -> None:
         print(f"  recording adds {best['recorded'] / best['plain'] - 1:.1%}")
     if "watched" in best:
         added = best["watched"] / best["plain"] - 1
-        print(f"  being watched adds {added:.1%}, for {frames} frames")
+        print(f"  a viewer adds {added:.1%}, with {frames} frames")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,12 @@ def ask(sim: str, log: Path, kept: list[Path], config: FQEConfig) -> list[dict[s
 
 
 def agreement(rows: list[dict[str, Any]], estimator: str) -> tuple[float, float, float, float]:
-    """Return rank correlations with both returns, regret@1 and the fraction trusted."""
+    """Compare an estimator's values with the true values of the checkpoints.
+
+    Returns:
+        Rank correlations with discounted and with undiscounted returns, regret@1, and the fraction
+        of the checkpoints whose estimate is trusted.
+    """
     estimated, discounted, plain = (
         np.array([row["estimates"][estimator] if own is None else row[own] for row in rows])
         for own in (None, "discounted", "return")
@@ -186,7 +191,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--sim", choices=STEPS, required=True)
-    parser.add_argument("--updates", type=int, default=3_000, help="of the model of FQE")
+    parser.add_argument("--updates", type=int, default=3_000, help="updates of the FQE model")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     config = FQEConfig(

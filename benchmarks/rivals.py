@@ -1,4 +1,4 @@
-"""Do the same tasks with other libraries, each as its documentation shows."""
+"""Do the benchmarks' tasks with other libraries, as the documentation of each library shows."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ class MinariFolder:
 
 
 def _frames(observations: Any, following: Any) -> Any:
-    """Return the observations of an episode as in Minari, with the last next observation."""
+    """Return the observations of an episode, followed by the last next observation."""
     if isinstance(observations, dict):
         return {name: _frames(observations[name], following[name]) for name in observations}
     return np.concatenate([observations, following[-1:]])
@@ -230,7 +230,7 @@ class _NoSpec(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def columns_of(data: mcaprl.Dataset) -> dict[str, NDArray[Any]]:
-    """Return the columns for table formats; next observations are stored only as next rows."""
+    """Return the columns for table formats, without next observations: the next rows have them."""
     here = data.observations
     return {
         **(here if isinstance(here, dict) else {"observation": here}),

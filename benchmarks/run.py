@@ -38,9 +38,9 @@ _PAGE = """\
 in turns, on the same data, in one thread. The measure is CPU time, the best of several turns.
 Seconds depend on the machine, so the tables contain ratios only. Each table includes lower
 limits: a copy in memory; plain decompression of the same chunks by zstd, each into the buffer of
-the previous one; and the minimum of any reader, which maps the file, decompresses it and checks
-the CRCs. A reader also copies the columns into new memory, which the copies of the columns
-measure.
+the previous chunk; and the minimum of any reader, which maps the file, decompresses it and checks
+the CRCs. A reader also copies the columns into new memory; the rows `memcpy of ...`
+measure this copy.
 
 A missed goal stays in its table. For logs of images and other writers' logs, the reasons are the
 minimum of any reader, the copy into new memory, and one pass of NumPy over a chunk for each check
@@ -59,9 +59,11 @@ make bench
 def main() -> None:
     """Run the requested benchmarks, and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--transitions", type=int, default=1_000_000, help="of the vector log")
-    parser.add_argument("--largest", type=int, default=10_000_000, help="log of the growth table")
-    parser.add_argument("--only", choices=PARTS, nargs="+", default=PARTS, help="keep the others")
+    parser.add_argument("--transitions", type=int, default=1_000_000, help="size of the vector log")
+    parser.add_argument("--largest", type=int, default=10_000_000, help="size of the largest log")
+    parser.add_argument(
+        "--only", choices=PARTS, nargs="+", default=PARTS, help="parts to run; the others are kept"
+    )
     arguments = parser.parse_args()
     sizes = tuple(size for size in (10**4, 10**5, 10**6, 10**7) if size <= arguments.largest)
     tables = {} if arguments.only == PARTS else _last_tables()

@@ -1,7 +1,7 @@
 """Create six logs of each sim, of about 20,000 transitions each, for offline training.
 
 random   random actions
-medium   an online policy that scores half of the pilot, with 10 % random actions
+medium   an online policy that scores half as much as the pilot, with 10 % random actions
 expert   the sim's pilot
 replay   all transitions of the medium policy's online training
 mixed    in equal parts: the pilot with 10, 30 and 60 % random actions, and random actions
@@ -37,7 +37,7 @@ MEDIUM_SCORE = 0.5
 WRONG = {"lane": "brake", "powerline": "no change", "racer": "none"}
 """Wrong action of the weak pilot, by sim."""
 TIMID_ABOVE_M_S = {"lane": 5.0}
-"""Speed, by sim, above which the weak pilot does the wrong thing; at any speed if not listed."""
+"""Minimum speed, by sim, at which the weak pilot does the wrong thing; others have no minimum."""
 WEAK, CLUMSY = 0.6, 0.1
 """Two probabilities: of the wrong action and, if it is not taken, of a random action."""
 MIXED_EPSILONS = (0.1, 0.3, 0.6, 1.0)
@@ -103,7 +103,7 @@ class _HalfwayError(Exception):
 
 
 def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
-    """Return the behavior policies of each log, in order."""
+    """Return the behavior policies of each log, in the order in which they are recorded."""
 
     def pilot(epsilon: float) -> MakeBehavior:
         return lambda env: EpsilonGreedy(make_pilot(env), epsilon, env.action_space)
@@ -124,7 +124,7 @@ def _behaviors(sim: str, online: Path) -> dict[str, list[MakeBehavior]]:
 
 
 def _record(path: Path, sim: str, make_behaviors: list[MakeBehavior]) -> None:
-    """Record whole episodes until each behavior has made its share of the steps."""
+    """Record whole episodes; each behavior policy makes an equal share of STEPS."""
     part = path.with_suffix(".part.mcap")
     with (
         closing(make_sim(sim)) as env,

@@ -21,7 +21,7 @@ QUADROTOR_STEPS = 5
 
 
 STEPS = 1_000_000
-"""Number of steps of the task; each side takes a share of them."""
+"""Number of steps to which the measured time of each sim is scaled up."""
 
 
 GOALS = {
@@ -35,9 +35,10 @@ GOALS = {
 
 
 def ours() -> list[Side]:
-    """Return the sides for our sims; turns take hundredths of a second, to limit disturbances.
+    """Return a side for each of our sims.
 
-    An episode that is not finished at the end of a turn continues in the next one.
+    Turns take hundredths of a second, to limit disturbances. An episode that is not finished at the
+    end of a turn continues in the next one.
     """
     return [
         _single("car", make_sim("lane"), 10_000),

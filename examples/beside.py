@@ -84,12 +84,12 @@ def draw(path: Path, curve: Curve, known: dict[int, float], scores: dict[int, fl
     right.step(list(known), list(known.values()), where="post", color=COLORS[1])
     right.axhline(curve["step"][-1], color=INK, lw=1, ls="--", zorder=0)
     right.set_xlabel("updates of the offline learner")
-    right.set_ylabel("transitions that it has read")
+    right.set_ylabel("transitions read by the offline learner")
     save_png(figure, path)
 
 
 def main() -> None:
-    """Run both, compare and plot."""
+    """Run both commands, check what the offline learner read, and plot the scores."""
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "beside")
     out.mkdir()
     log, online, offline = out / "log.mcap", out / "online", out / "offline"

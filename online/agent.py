@@ -211,7 +211,8 @@ class Agent:
     def _load(self, evaluation: Evaluation) -> None:
         extra, best = load_checkpoint(self._checkpoint, self.model, self._task)
         if best:
-            # The file may be newer: the evaluations after the checkpoint are repeated.
+            # The best policy's file may be newer than the checkpoint. Restore the older content,
+            # because the evaluations after the checkpoint are repeated.
             write_atomically(self._folder / BEST_NAME, best, TrainingError)
         self.points = [CurvePoint(**point) for point in extra["points"]]
         if extra["began_with_policy"]:

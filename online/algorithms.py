@@ -101,8 +101,9 @@ def make_model(algo: str, config: OnlineConfig, env: VecEnv, seed: int) -> BaseA
         device="auto",
         **_arguments(config, env.observation_space),
     )
-    if _has_images(env.observation_space):
-        # Convolutions take 25 % less time in this format; files and results do not change.
+    encoder = "nature" if architecture is None else architecture.encoder
+    if encoder == "nature" and _has_images(env.observation_space):
+        # Its convolutions take 25 % less time in channels-last format; results do not change.
         cast(Any, model.policy).to(memory_format=torch.channels_last)
     if isinstance(config, DoubleDQNConfig):
         cast(DoubleDQN, model).alpha = config.alpha

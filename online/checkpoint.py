@@ -116,7 +116,8 @@ def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tens
     for number, parts in moments.items():
         for name, part in parts.items():
             if part.shape == weights[number].shape:
-                # Moments need the memory format of their weights: channels last for convolutions.
+                # Optimizer moments need the memory format of their weights: channels last for
+                # convolutions.
                 parts[name] = torch.empty_like(weights[number]).copy_(part)
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": moments, "param_groups": groups})

@@ -110,7 +110,7 @@ class DQNConfig(OnlineConfig):
         return {
             **super().arguments(),
             **{name: getattr(self, name) for name in same},
-            # SB3 never reaches this interval; a callback counts episodes and updates the network.
+            # SB3 never reaches `sys.maxsize`; a callback updates the target network by episodes.
             **({"target_update_interval": sys.maxsize} if self.target_update_episodes else {}),
             "buffer_size": min(self.buffer_size, self.steps + self.envs),
             # SB3 counts calls of `step`; each call steps every environment.
@@ -140,7 +140,7 @@ class RolloutConfig(OnlineConfig):
     rollout_steps: int = 40
     """environment steps, summed over all environments, between two rounds of updates"""
     gae_lambda: float = 1.0
-    """lambda of GAE; 0 uses one step, 1 the whole return"""
+    """lambda of GAE, from 0 (one step) to 1 (whole return)"""
     entropy_coefficient: float = 0.0
     """weight of the policy's entropy in the loss"""
 

@@ -236,7 +236,7 @@ class WatchedBatch(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             total_reward=self._return_so_far,
             terminated=terminated,
             truncated=truncated,
-            # `LiveStream.end_episode` replaces these times.
+            # `LiveStream.end_episode` replaces the start and end times, which are 0 here.
             start_time_ns=0,
             end_time_ns=0,
             reason=reason_of(None if reasons is None else reasons[WATCHED], terminated),

@@ -99,7 +99,7 @@ class ActionDescriber:
     """Callback for each step that passes the probabilities of the actions to the recorder."""
 
     def __init__(self, recorder: RecordVecMcap, model: BaseAlgorithm) -> None:
-        """Describe the actions of `model` to `recorder`."""
+        """Prepare to pass the probabilities of the actions of `model` to `recorder`."""
         self._recorder, self._model = recorder, model
         self._were_greedy = False
         if isinstance(model, DQN):
@@ -108,7 +108,7 @@ class ActionDescriber:
             model.q_net.register_forward_hook(self._on_forward)
 
     def __call__(self, actions: NDArray[Any]) -> None:
-        """Describe the actions (N,) that the model chose for its last observations."""
+        """Pass probabilities of the actions (N,), epsilon and policy version to the recorder."""
         model, recorder = self._model, self._recorder
         recorder.epsilon = epsilon = exploration(model)
         recorder.policy_version = cast(Any, model)._n_updates

@@ -1,5 +1,7 @@
 """Recording and reading of logs, and their display in viewers.
 
+Arrows show how data flows through the modules:
+
     environment  -> wrapper -> step_rows, display   -> log_writer -> writer -> file
     environments -> vector_wrapper -> vector_rows   -> log_writer -> writer -> file
     dataset      -> save                            -> log_writer -> writer -> file
@@ -30,7 +32,7 @@ __all__ = [
     "step_schema",
 ]
 
-# Imported on first use.
+# The modules below are imported when one of their names is first used.
 __getattr__ = lazy_attributes(
     __name__,
     {

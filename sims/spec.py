@@ -61,7 +61,7 @@ class SimSpec:
             )
 
     def make_pilot(self, env: gym.Env[Any, Any]) -> Any:
-        """Return the sim's scripted policy for an unwrapped environment; requires a pilot."""
+        """Return the sim's scripted policy for an unwrapped environment; the sim must have one."""
         pilot: Any = self.pilot
         if isinstance(pilot, str):
             module, _, attribute = pilot.partition(":")

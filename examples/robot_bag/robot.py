@@ -35,7 +35,7 @@ TYPES = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
 }
 PAUSE_S = 5.0
-"""Time between two drives."""
+"""Time between two drives, in seconds."""
 COMMANDS = (
     ("brake", 0.0, 0.0),
     ("straight", 30.0, 0.0),
@@ -50,7 +50,7 @@ _LOOKAHEADS_M = np.repeat([5.0, 10.0, 20.0, 40.0], 2)
 _FULL_STEERING_RAD = math.radians(40.0)
 _ODOMETRY_S, _COMMAND_S, _IMAGE_S, _DIAGNOSTICS_S = 0.02, 0.05, 0.1, 1.0
 _JITTER_S = 0.004
-"""Largest delay between a measurement and its recording."""
+"""Largest delay between a measurement and its recording, in seconds."""
 _LANE_DELAY_S = 0.010
 _COMMAND_DELAY_S = 0.012
 _FAR_MM = 65_535

@@ -167,7 +167,7 @@ class _Topic:
 
     def _messages(self, rows: NDArray[np.int64] | None) -> Iterator[tuple[int, Any]]:
         """Yield publication time and decoded message of each row, in the order of `rows`."""
-        assert self._decoder is not None, "a topic with a problem is not read"
+        assert self._decoder is not None, "`read` refuses a topic with a problem"
         if rows is None:
             yield from self._rising(np.arange(len(self.times_ns)), self._decoder)
             return
@@ -191,7 +191,7 @@ class _Topic:
 
 
 class _Infos(Mapping[str, TopicInfo]):
-    """Mapping from topic name to description; each definition is parsed at its first access."""
+    """Mapping from topic name to `TopicInfo`; the type of a topic is parsed at the first access."""
 
     def __init__(self, topics: Mapping[str, _Topic]) -> None:
         self._topics = topics

@@ -106,7 +106,7 @@ class ProtobufDecoder:
                 pool.Add(file)
             self._descriptor = pool.FindMessageTypeByName(type_name)
             self._class = factory.GetMessageClass(self._descriptor)
-        # The library raises errors of many types for a wrong schema.
+        # protobuf raises errors of many types for a wrong schema.
         except Exception as error:
             raise LogError(f"the schema of {type_name} cannot be used: {error}") from error
         self.fields, self.constants = dict[str, str](), dict[str, int]()
@@ -146,7 +146,7 @@ def _protobuf_kind(field: Any) -> str:
 
 
 class JsonDecoder:
-    """Decoder of JSON objects, with a JSON schema or without."""
+    """Decoder of JSON objects, with or without a JSON schema."""
 
     def __init__(self, schema: bytes) -> None:
         """Collect the fields of the JSON schema; without a schema, the fields are unknown."""

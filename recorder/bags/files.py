@@ -1,4 +1,4 @@
-"""Files of a bag: found in folders, decompressed, and opened."""
+"""Functions that find the files of a bag, decompress them, and open them."""
 
 from __future__ import annotations
 

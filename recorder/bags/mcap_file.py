@@ -1,4 +1,4 @@
-"""Topics of an MCAP file that any program wrote."""
+"""Topics of MCAP files from any program."""
 
 from __future__ import annotations
 

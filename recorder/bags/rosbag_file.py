@@ -38,7 +38,7 @@ class RosbagFile:
         try:
             self._reader: Any = Reader1(path) if is_ros1 else Reader2(path)
             self._reader.open()
-        # The library raises errors of many types for a damaged file.
+        # rosbags raises errors of many types for a damaged file.
         except Exception as error:
             raise LogError(f"{path} cannot be read as a bag: {error}") from error
         self.topics: dict[str, list[TopicSource]] = {}
@@ -71,7 +71,7 @@ class _RosbagTopic:
         encoding = "ros1" if is_ros1 else "cdr"
         text = found.data.encode()
         self.definition = Definition(connection.msgtype, encoding, known, text, distribution)
-        # The current pass over the messages, and the position of its next message.
+        # Position of the next message, and the iterator that yields this message next.
         self._next = 0
         self._pass: Iterator[tuple[Connection, int, bytes]] = iter(())
 

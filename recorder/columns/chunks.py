@@ -32,7 +32,8 @@ _ZSTD = zstandard.ZstdCompressionParameters.from_level
 # strategy stores them uncompressed if a target length is set. Compared with level 1, files are 2 to
 # 9 % larger, are written in 20 to 50 % less time, and are read in 33 to 50 % less time.
 SHORT_RECORDS = _ZSTD(1, hash_log=10, target_length=1)
-# Images are similar to images much earlier in the chunk, and their bytes are not random.
+# Images need the large hash table of level 1, because they are similar to images much earlier in
+# the chunk; their bytes are not random, so they need no target length.
 LONG_RECORDS = _ZSTD(1)
 # Messages of different lengths are mostly display messages. They repeat so much that a slower
 # search halves their size.
@@ -120,7 +121,7 @@ class ChunkHeader(NamedTuple):
         return b"".join((start, name, data_bytes.to_bytes(8, "little")))
 
     def to_index(self, offset: int, content_bytes: int) -> ChunkIndex:
-        """Describe the Chunk record at `offset` by a ChunkIndex without message indexes."""
+        """Return a ChunkIndex, without message indexes, for the Chunk record at `offset`."""
         return ChunkIndex(
             chunk_start_offset=offset,
             chunk_length=RECORD_HEADER_BYTES + content_bytes,
@@ -193,7 +194,7 @@ def parse_chunk_index(content: memoryview) -> ChunkIndex:
         raise CorruptLogError("a chunk_index record is damaged") from error
     if len(offsets) * _INDEX_MAP_ENTRY.size < map_bytes:
         raise CorruptLogError("a chunk_index record has several indexes of one channel")
-    # Positional arguments: keywords take twice as long.
+    # The arguments are positional, because keyword arguments take twice as long.
     return ChunkIndex(
         length,
         offset,

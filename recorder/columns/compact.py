@@ -34,11 +34,13 @@ from mcaprl.recorder.columns.summary import Summary
 SMALL_CHUNK_BYTES = 2**16
 """Chunks with fewer bytes of uncompressed records than this are merged."""
 _MERGED_BYTES = 2**20
-# Saving fewer chunks than this is not worth the time of rewriting the file.
+# If compaction removes fewer chunks than this, rewriting the file is not worth the time.
 _MIN_CHUNKS_SAVED = 8
-# Maximum number of bytes to copy for each chunk saved. Copying more takes longer than readers save.
+# Maximum number of bytes to copy for each chunk that compaction removes. Copying more bytes takes
+# more time than readers save.
 _MAX_BYTES_PER_CHUNK = 2**20
-# If one of these records is between two listed chunks, the summary omits a chunk.
+# If a Chunk, Message or MessageIndex record is between two chunks that the summary lists, the
+# summary is incomplete.
 _CHUNK_RECORDS = (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX)
 
 

@@ -125,7 +125,7 @@ class Decoder:
         among: NDArray[np.bool_],
         wanted: Collection[str],
     ) -> NDArray[np.bool_]:
-        """Return a mask of the messages in `among` with the same layout as the first of them."""
+        """Return a mask of the messages in `among` that have the layout of its first message."""
         alike = np.zeros(len(index), bool)
         places = np.flatnonzero(among)
         if len(places):

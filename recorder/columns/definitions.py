@@ -15,7 +15,8 @@ from mcaprl.errors import LogError
 TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 ROS1 = "ros1msg"
 # The definition of a service event may lack the definitions of the request and the response. By
-# default, ROS leaves both out of the event; such an event is read without their definitions.
+# default, ROS leaves the request and the response out of the event, so that their definitions are
+# not needed to read it.
 _EVENT, _PARTS = "_Event", ("_Request", "_Response")
 _UNKNOWN: Any = ([], [("unknown", (Nodetype.BASE, ("uint8", 0)))])
 _IDL_LINE = "=" * 80 + "\n"
@@ -71,7 +72,7 @@ class Definitions:
         try:
             decoded = self._store.deserialize_ros1 if is_ros1 else self._store.deserialize_cdr
             return decoded(data, self.name)
-        # The library raises errors of many types; each means that the bytes do not fit.
+        # rosbags raises errors of many types; each means that the bytes do not fit the type.
         except Exception as error:
             raise LogError(f"cannot decode {len(data)} bytes as {self.name}: {error}") from error
 
@@ -162,7 +163,7 @@ def _parsed(name: str, text: str, encoding: str) -> dict[str, Any]:
         # The text contains several definitions, each preceded by a line with the type name.
         parts = [part.split("\n", 1)[1] for part in text.split(_IDL_LINE) if part.strip()]
         return {key: found for part in parts for key, found in get_types_from_idl(part).items()}
-    # The library raises errors of many types when a definition does not parse.
+    # rosbags raises errors of many types when a definition does not parse.
     except Exception as error:
         raise LogError(f"the definition of {name} does not parse: {error}") from error
 

@@ -61,7 +61,8 @@ def check_chunk(reader: McapReader, chunk: ChunkIndex, records: memoryview) -> l
 def _has_only(records: memoryview, indexes: dict[int, NDArray[Any]]) -> bool:
     """Return whether a chunk contains exactly the messages that its indexes list.
 
-    A chunk that also contains other records can be valid; the caller then compares each record.
+    A chunk that also contains other records can be valid. If this function returns False, the
+    caller therefore compares each message with the indexes.
     """
     ids = np.repeat(list(indexes), [len(index) for index in indexes.values()])
     if not len(ids):

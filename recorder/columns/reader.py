@@ -103,7 +103,8 @@ class McapReader:
         self.data_end = 0
         self._counts: dict[int, int] = {}
         unchunked = UnindexedMessages()
-        # Offset and records of the latest chunk: callers usually read all its messages in turn.
+        # Offset and records of the latest chunk, kept because callers usually read all messages of
+        # a chunk one after another.
         self._last_chunk = (-1, memoryview(b""))
         self._contents: dict[int, ChunkContents] = {}
         self._ranges: dict[int, list[MessageRange]] = {}
@@ -144,7 +145,7 @@ class McapReader:
             self._remote.fetch(ranges)
 
     def fetch_chunks(self, parts: Iterable[MessageRange]) -> None:
-        """Fetch the chunks and indexes of these messages of a remote file in parallel."""
+        """Fetch chunks and indexes of message ranges in parallel; no effect on a local file."""
         if self._remote is not None:
             chunks = [part.chunk for part in parts]
             if None in chunks:
@@ -225,7 +226,8 @@ class McapReader:
         """
         if channel.id not in self._ranges:
             if self._remote is not None:
-                # Fetch these indexes together; else each chunk would need its own request.
+                # Fetch the indexes of all chunks with several channels together, to avoid one
+                # request for each chunk.
                 places = [one for one in self.chunks if len(one.message_index_offsets) > 1]
                 starts = [one.chunk_start_offset + one.chunk_length for one in places]
                 self.fetch(zip(starts, map(end_of, places), strict=True))

@@ -109,7 +109,7 @@ def parse_record(opcode: int, content: memoryview) -> Any:
     """
     try:
         return _PARSERS[opcode].read(ReadDataStream(io.BytesIO(content)))
-    # The library raises errors of many types when a record is damaged.
+    # The `mcap` library raises errors of many types when a record is damaged.
     except Exception as error:
         raise CorruptLogError(f"the {Opcode(opcode).name.lower()} record is damaged") from error
 

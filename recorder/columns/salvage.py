@@ -26,7 +26,7 @@ from mcaprl.recorder.columns.message_rows import INDEX_ENTRY, MESSAGE_HEADER, RE
 from mcaprl.recorder.columns.records import RECORD_HEADER, footer_of, parse_record, records_of
 
 ValidRecord = tuple[int, int, memoryview]
-"""Offset, opcode and content."""
+"""Offset, opcode and content of a valid record."""
 
 # Records with content that cannot be recomputed from other records.
 _REWRITTEN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
@@ -75,7 +75,7 @@ def valid_records(view: memoryview, damages: list[Damage]) -> Iterator[ValidReco
             damages.append(Damage(offset, 0, "the data section does not match its CRC"))
         yield offset, opcode, content
         offset += RECORD_HEADER_BYTES + len(content)
-        # Compare the length first: a copy of the remaining file for each record would be slow.
+        # Compare lengths first, so that `bytes` does not copy the rest of the file for each record.
         if len(view) - offset == len(MCAP0_MAGIC) and bytes(view[offset:]) == MCAP0_MAGIC:
             return
 
@@ -181,7 +181,7 @@ def _next_chunk(view: memoryview, start: int, stop: int) -> int:
 
 
 def intact_summary(view: memoryview) -> list[Any]:
-    """Return the schemas, channels and chunk indexes of an intact summary; else []."""
+    """Return the schemas, channels and chunk indexes of the summary; [] if it is not intact."""
     try:
         footer = footer_of(view)
     except CorruptLogError:

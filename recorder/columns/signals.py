@@ -9,7 +9,8 @@ from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
 try:
-    # `signal` wraps these functions to return enums, which takes ten times as long.
+    # The `signal` module wraps the functions of `_signal` to return enums, which takes ten times as
+    # long.
     from _signal import getsignal  # type: ignore[import-not-found]
     from _signal import signal as set_handler
 except ImportError:

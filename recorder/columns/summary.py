@@ -83,7 +83,7 @@ class Summary:
         for opcode, records in every:
             group_start = builder.count
             for record in records:
-                # Use the fast function, because most records of a summary are chunk indexes.
+                # Most records are chunk indexes; `chunk_index_record` is faster than `write`.
                 if isinstance(record, ChunkIndex):
                     builder.write(chunk_index_record(record))
                 else:

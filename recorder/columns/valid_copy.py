@@ -174,8 +174,8 @@ class _Copy:
         self, view: memoryview, writer: McapWriter, topics: _Topics, damages: list[Damage]
     ) -> None:
         self._view, self._writer, self._topics, self._damages = view, writer, topics, damages
-        # Offsets of the chunks so far, by the CRC and length of their records. A chunk with equal
-        # records is dropped as a repetition, unless an intact summary lists it.
+        # Offsets of the chunks read so far, by the CRC and length of their records. A chunk with
+        # equal records is dropped as a repetition, unless an intact summary lists it.
         self._seen: dict[tuple[int, int], list[int]] = {}
         self._listed = {
             record.chunk_start_offset

@@ -74,7 +74,7 @@ class McapWriter(OutputFile):
         if compression not in COMPRESSIONS:
             raise UnknownNameError("compression", compression, COMPRESSIONS)
         self._compressors, self._profile = Compressors(compression), profile
-        # Records at the start of every file, in this order.
+        # Top-level records at the start of every file, in the order of this list.
         self._top_level: list[TopLevelRecord] = []
         if append and Path(path).exists():
             self._continue(Path(path))

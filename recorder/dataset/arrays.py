@@ -95,7 +95,12 @@ def columns_of_arrays(
 def _registered_spaces(
     env_id: str, observations: Any
 ) -> tuple[spaces.Space[Any], spaces.Space[Any]] | tuple[None, None]:
-    """Return the environment's spaces if it is registered and the observation shapes match."""
+    """Return the environment's observation space and action space.
+
+    Returns:
+        (None, None) if the environment is not registered or cannot be created, or if its
+        observation shapes differ from the shapes in `observations`.
+    """
     if env_id not in gym.registry:
         return None, None
     try:
@@ -139,7 +144,13 @@ def action_space_of(actions: NDArray[Any]) -> spaces.Space[Any]:
 
 
 def box_of(array: NDArray[Any]) -> spaces.Box:
-    """Return a Box for rows (N, *shape): bounds of an integer dtype, otherwise infinite bounds."""
+    """Return a Box for the rows of an array (N, *shape).
+
+    For integers, the bounds are the limits of the dtype. For floats, the bounds are infinite.
+
+    Raises:
+        SpaceError: The array contains neither integers nor floats.
+    """
     kind = array.dtype.kind
     if kind in "iu":
         low, high = int(np.iinfo(array.dtype).min), int(np.iinfo(array.dtype).max)

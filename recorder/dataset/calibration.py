@@ -23,9 +23,12 @@ from mcaprl.recorder.format.probability import is_impossible
 EDGES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
 """Edges of the probability ranges (low, high]."""
 _STANDARD_ERRORS = 4.0
-"""Largest deviation attributed to chance, in standard errors."""
+"""Largest accepted excess of the mean of 1 / p over the number of actions, in standard errors."""
 _LEAST_CHANCE = 1e-6
-"""Smallest accepted chance that any step draws an action as rare as the rarest in the log."""
+"""Lower limit for the chance that a log contains an action of its smallest probability.
+
+If the chance `smallest * available * steps` is below this limit, the probabilities are too small.
+"""
 
 
 @dataclass(frozen=True)

@@ -191,8 +191,8 @@ class Conversions:
     def to_d3rlpy(self) -> Any:
         """Return a `d3rlpy.dataset.MDPDataset` with all transitions.
 
-        A truncated episode gets an additional step, because d3rlpy does not use its last step as a
-        transition.
+        A truncated episode gets an additional step, because d3rlpy does not use the last step
+        of a truncated episode as a transition.
 
         Raises:
             SpaceError: d3rlpy cannot hold a space.

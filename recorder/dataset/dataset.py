@@ -157,7 +157,10 @@ class Dataset(Conversions):
 
     @cached_property
     def frame_of_step(self) -> NDArray[np.int64]:
-        """(N,) index k into `frames`: row k is the observation, row k + 1 the next observation."""
+        """(N,) index k of each transition's observation in `frames`.
+
+        Row k is the observation, and row k + 1 is the next observation.
+        """
         return self._transitions.frame_of_step()
 
     @property
@@ -238,7 +241,8 @@ class Dataset(Conversions):
     def action_names(self) -> dict[int, str]:
         """Names of the discrete actions, by value; empty for other action spaces.
 
-        Without distinct `action_meanings`, a small space's names are the numbers as text.
+        If `action_meanings` does not contain a distinct name for each action, the names are the
+        numbers as text, or the dict is empty if there are more than 1,000 actions.
         """
         return self._description.action_names()
 

@@ -19,8 +19,10 @@ from mcaprl.recorder.format.spaces import Leaf
 from mcaprl.recorder.format.topics import IMAGES_PER_CHUNK
 
 Storage = Literal["auto", "memory", "mapped"]
-"""`memory`, `mapped` (on disk), or `auto`: `mapped` if the images exceed
-`MEMORY_SHARE` of the free memory."""
+"""Where images are stored: `memory`, `mapped` (on disk) or `auto`.
+
+`auto` is `mapped` if the images exceed `MEMORY_SHARE` of the free memory, otherwise `memory`.
+"""
 
 IMAGE_TYPE = "sensor_msgs/msg/Image"
 CACHE_METADATA = "mcaprl.images"

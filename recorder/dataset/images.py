@@ -166,7 +166,7 @@ class _Images:
         """Check the size and encoding of images against the leaf.
 
         Raises:
-            CorruptLogError: An image differs.
+            CorruptLogError: The size or encoding of an image differs from the leaf.
         """
         height, width = self._leaf.shape[:2]
         encoding = self._leaf.encoding or ""

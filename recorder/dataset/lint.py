@@ -32,7 +32,9 @@ def lint(dataset: Dataset) -> list[Problem]:
 
 
 def _not_finite(dataset: Dataset) -> Iterator[Problem]:
-    effect = "one such value in a batch makes every weight NaN; training rejects the dataset"
+    effect = (
+        "one NaN or infinite value in a batch makes every weight NaN; training rejects the dataset"
+    )
     counts = {name: c.not_finite for name, c in dataset.statistics.observations.items()}
     for leaf in _leaves(dataset):
         if counts[leaf.name]:
@@ -84,7 +86,8 @@ def _constant(dataset: Dataset) -> Iterator[Problem]:
             yield _note(
                 f"{_count(len(same), 'element')} of {leaf.name} never change",
                 names + (", ..." if len(same) > _SHOWN else ""),
-                "they carry no information, and the network is untrained for other values",
+                "constant elements carry no information, and the network is untrained for other"
+                " values",
             )
 
 
@@ -101,7 +104,8 @@ def _duplicates(dataset: Dataset) -> Iterator[Problem]:
         yield Problem(
             f"{_count(extra, 'episode')} are duplicates of others",
             "; ".join(_listed(indexes) for indexes in copies[:_SHOWN]),
-            "they are overweighted, and held-out episodes can also be in the training data",
+            "duplicate episodes are overweighted, and held-out episodes can also be in the training"
+            " data",
         )
 
 
@@ -116,8 +120,8 @@ def _actions_never_taken(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             f"{_count(len(missing), 'action')} of {int(space.n)} were never taken",
             ", ".join(names) + (", ..." if len(missing) > _SHOWN else ""),
-            "their Q-values are extrapolated: choose an algorithm that stays close to the behavior"
-            " policy (cql, bcq, bc)",
+            "Q-values of actions that were never taken are extrapolated: choose an algorithm that"
+            " stays close to the behavior policy (cql, bcq, bc)",
         )
 
 
@@ -132,7 +136,7 @@ def _rewards(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             "only the last steps of episodes have a reward",
             f"{int((rewards != 0).sum())} of {len(dataset.episodes)} episodes",
-            "training propagates these rewards to early steps slowly: n-step returns help",
+            "training propagates final rewards to early steps slowly: n-step returns help",
         )
         return
     cut, others = rewards[dataset.truncated], rewards[~last]
@@ -189,7 +193,7 @@ def _unknown_probabilities(dataset: Dataset) -> Iterator[Problem]:
         yield _note(
             "behavior_prob is estimated",
             "all steps",
-            "intervals of off-policy estimates do not include the error of these probabilities",
+            "intervals of off-policy estimates do not include the error of estimated probabilities",
         )
 
 

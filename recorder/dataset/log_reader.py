@@ -65,6 +65,15 @@ class LogReader:
         self._summaries = EpisodeTopic(Topic(self._reader, EPISODE_TOPIC))
 
     @cached_property
+    def description(self) -> LogMetadata:
+        """Metadata of the log; inferred from the first episode if another program wrote the log.
+
+        Raises:
+            LogError: As for `read`, if the metadata is inferred.
+        """
+        return self._metadata or self.read(np.zeros(1, np.int64))._description
+
+    @cached_property
     def lengths(self) -> NDArray[np.int64]:
         """(E,) number of transitions of each finished episode.
 
@@ -247,7 +256,7 @@ def described(reader: McapReader) -> LogMetadata | None:
     """
     record = reader.metadata.get(METADATA_NAME)
     copies = [
-        # This copy is in the summary section, whose CRC detects damage.
+        # This copy of the metadata is in the summary section, whose CRC detects damage.
         channel.metadata
         for channel in reader.channels_of(STEP_TOPIC)
         if "format_version" in channel.metadata
@@ -309,7 +318,7 @@ def _flags(column: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _without(column: NDArray[Any], rows: NDArray[np.int64]) -> NDArray[Any]:
-    """Return a column without these rows; the input may be overwritten."""
+    """Return a column without the given rows; the input column may be overwritten."""
     if len(column) < _LONG_EPISODE * len(rows):
         return np.delete(column, rows, axis=0)
     # Moving long ranges of rows is cheaper than allocating another column.

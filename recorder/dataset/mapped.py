@@ -146,12 +146,12 @@ Frames = NDArray[Any] | MappedImages
 
 
 def rows_of(frames: Frames, rows: Any) -> Frames:
-    """Select rows of an array, or of images on disk without reading them."""
+    """Select rows of an array or of images on disk; images on disk are not read."""
     return frames.rows(rows) if isinstance(frames, MappedImages) else frames[rows]
 
 
 def joined(parts: Sequence[Frames]) -> Frames:
-    """Concatenate the frames of several logs; the result is on disk if all frames are."""
+    """Concatenate the frames of several logs; the result is on disk if all frames are on disk."""
     mapped = [part for part in parts if isinstance(part, MappedImages)]
     if len(mapped) < len(parts):
         return np.concatenate([np.asarray(part) for part in parts])

@@ -49,7 +49,7 @@ def transition_table(
     """
     arrow = import_extra("pyarrow", "tables")
     import_extra("pyarrow.compute", "tables")
-    found = [(name, arrow.array(array)) for name, array in _step_columns(columns).items()]
+    found = [(name, arrow.array(array)) for name, array in step_columns(columns).items()]
     if tensors == "lists":
         found += _tensor_lists(arrow, columns, leaves)
     else:
@@ -119,10 +119,10 @@ def fixed_lists(arrow: Any, values: NDArray[Any]) -> Any:
 
 
 def info_problem(name: str, info: Masked) -> str:
-    """Return why a table cannot hold an info; empty if it can."""
+    """Return the reason why a table cannot store an info; empty if a table can store it."""
     if info.dtype.kind not in "biufU" or not math.prod(info.shape[1:]):
         kind = f"{info.dtype} of shape {info.shape[1:]}"
-        return f"the info '{name}' has {kind}; a table holds numbers, flags and texts"
+        return f"the info '{name}' has {kind}; a table can only store numbers, flags and text"
     if info.dtype.kind == "U":
         try:
             "".join(np.ma.getdata(info).ravel()).encode()
@@ -165,7 +165,8 @@ def _shapes(columns: Transitions, leaves: Sequence[Leaf]) -> dict[str, tuple[int
     return shapes
 
 
-def _step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
+def step_columns(columns: Transitions) -> dict[str, NDArray[Any]]:
+    """Return the columns (N,) of a table of transitions that are numbers or flags, by name."""
     lengths = columns.lengths
     return {
         "episode": np.repeat(np.arange(len(lengths)), lengths),

@@ -33,7 +33,7 @@ from mcaprl.recorder.format.selected_copy import (
 )
 from mcaprl.recorder.format.topics import STEP_TOPIC
 
-# Prefix of topics. Each has messages of only one type, so that they can be read as columns.
+# Each `/rl/` topic has messages of only one type, so that it can be read as columns.
 _OUR_TOPICS = "/rl/"
 
 
@@ -86,7 +86,9 @@ def _common_metadata(logs: Sequence[FinishedLog]) -> LogMetadata | None:
         return None
     without = [log.path for log, one in zip(logs, found, strict=True) if one is None]
     if without:
-        raise LogError(f"{without[0]} has no metadata, but {described_ones[0][0].path} has")
+        raise LogError(
+            f"{without[0]} has no metadata, but {described_ones[0][0].path} has metadata"
+        )
     (first, metadata), *others = described_ones
     for log, other in others:
         _check_same(first.path, metadata, log.path, other)
@@ -157,7 +159,7 @@ def _delays(logs: Sequence[FinishedLog], metadata: LogMetadata | None, *, shift:
                 raise LogError(
                     f"the episodes of {log.path} overlap in time with those of"
                     f" {_overlapped(logs[:number], log)}; pass --shift (shift=True in Python) to"
-                    " delay the later argument until after the end of the earlier ones"
+                    f" delay {log.path} until after the end of the logs before it"
                 )
             delay = end + max(gap, 1) - first
         if log.has_steps:
@@ -180,10 +182,10 @@ def _overlapped(logs: Sequence[FinishedLog], log: FinishedLog) -> Path:
 
 
 def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) -> None:
-    """Let each source omit the messages that an earlier source has with the same time and bytes.
+    """Exclude from each source the messages that an earlier source also has.
 
-    If a log was split, several parts contain the messages that are valid in all of them, such as
-    the static scene.
+    Two messages of a channel are the same if their times and bytes are equal. If a log was split,
+    several parts contain the messages that are valid in all of them, such as the static scene.
     """
     bounds = [log.span_of_messages() for log in logs]
     starts_ends = [

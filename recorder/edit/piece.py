@@ -92,7 +92,7 @@ def slice_log(
 
 
 def _window_of_steps(log: FinishedLog, steps: Bounds) -> tuple[int, int]:
-    """Return the first and last log_time of transitions that are counted over all episodes.
+    """Return the first and last log_time of a part; `steps` are counted over all episodes.
 
     Raises:
         UsageError: A bound is not an integer, or no transition is between the bounds.

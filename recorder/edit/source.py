@@ -21,7 +21,7 @@ from mcaprl.recorder.format.writing import finished_state
 from mcaprl.recorder.record.display import CAMERA_INFO, SCENE, SCENE_STATIC, TF, TF_STATIC
 from mcaprl.remote import as_path
 
-# The latest message of these topics is valid until the next one.
+# Topics on which each message is valid until the next message on the same topic.
 _STATES = (SCENE, SCENE_STATIC, TF, TF_STATIC, CAMERA_INFO, PHASE_TOPIC)
 _LAST_TIME = np.iinfo(np.int64).max
 
@@ -149,7 +149,7 @@ class FinishedLog:
         return min(starts, default=0), max(ends, default=0)
 
     def spans_of(self, episodes: NDArray[np.int64]) -> Times:
-        """Return (S, 2) time ranges, first and last log_time, that contain the episodes' messages.
+        """Return (S, 2) first and last log_times of the time ranges with the episodes' messages.
 
         The messages of an episode are those from its first record up to the next episode. Messages
         before the first episode belong to the first one. The ranges of adjacent episodes are

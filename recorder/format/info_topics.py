@@ -1,4 +1,4 @@
-"""Writer of infos; `infos` describes the topics and reads them."""
+"""Writer of the infos of an environment; the module `infos` describes the topics."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def info_array(values: Sequence[Any] | NDArray[Any]) -> NDArray[Any] | None:
 class InfoTopics:
     """Writer of infos to a log; the topic of an info is added with its first value.
 
-    An appended recording continues the topics of the log.
+    A recording that is appended to a log uses the log's existing topics.
 
     Attributes:
         refused: Names of the infos that were not written, with the reason.
@@ -103,7 +103,7 @@ class InfoTopics:
         dtype, shape = values.dtype, values.shape[1:]
         topic = INFO_TOPICS + re.sub(r"[^A-Za-z0-9_.]", "_", name).replace(".", "/")
         if not re.fullmatch(r"\w+(\.\w+)*", name, re.ASCII):
-            # The CRC distinguishes names that differ only in replaced characters.
+            # The CRC distinguishes names that differ only in characters replaced by `_`.
             topic += f"_{zlib.crc32(encodable(name).encode()):08x}"
         while topic in self._topics:
             topic += "_"

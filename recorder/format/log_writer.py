@@ -151,7 +151,7 @@ class LogTopics:
         return TopicRows.of_text(LEARNER_TEXT, channel, most, self.sink.write_rows)
 
     def values_rows(self, topic: str, actions: int, most: int = STEPS_PER_CHUNK) -> TopicRows:
-        """Announce a topic of `schema.values_schema` and preallocate its rows."""
+        """Announce a topic with the message type of `values_schema`, and preallocate its rows."""
         name, text = values_schema(actions, self._action_names)
         channel = self.sink.add_channel(topic, name, text)
         return TopicRows.of_text(text, channel, most, self.sink.write_rows)
@@ -176,7 +176,8 @@ class LogTopics:
 
         Args:
             summaries: Summaries of the episodes.
-            log_lines: Whether to write the starts and ends to `/rosout` and `/rl/phase` as well.
+            log_lines: Whether to write the starts and ends of the episodes to `/rosout` and
+                `/rl/phase` as well.
         """
         written = [
             (self._episode_channel, summary.end_time_ns, summary.to_message())
@@ -224,7 +225,7 @@ class LogWriter(LogTopics):
     """Writer of one log of format version 1.
 
     Attributes:
-        mcap: Writer of the file, which is the sink.
+        mcap: Writer of the file; the same object as `sink`.
     """
 
     def __init__(

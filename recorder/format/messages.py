@@ -1,7 +1,8 @@
 """ROS 2 messages of variable length: episodes, log lines, markers, frames.
 
-These topics have few messages or are read only by viewers, so rosbags encodes them. The messages at
-the end of an episode are encoded here without rosbags, because the environment waits for them.
+Topics with such messages have few of them or are read only by viewers, so rosbags encodes the
+messages. The messages that are written at the end of an episode are encoded here without rosbags,
+to save time, because the environment waits until they are written.
 Transitions and images are encoded as fixed-size rows (`schema`).
 """
 
@@ -85,7 +86,7 @@ def decode(data: bytes, type_name: str) -> Any:
     """
     try:
         return typestore().deserialize_cdr(data, type_name)
-    # The library raises errors of many types when the bytes do not fit the type.
+    # rosbags raises errors of many types when the bytes do not fit the type.
     except Exception as error:
         raise CorruptLogError(f"cannot decode {len(data)} bytes as {type_name}: {error}") from error
 

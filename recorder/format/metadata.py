@@ -13,7 +13,7 @@ header, and as the channel metadata of `/rl/step`. Both are string maps; other v
                         derived from the space by `spaces.observation_leaves`
     observation_names   JSON list: names of the elements of a vector observation; may be empty
     action_meanings     JSON list: names of the discrete actions; may be empty
-    success_reasons     JSON list of the reasons with which an episode succeeds; empty if unknown
+    success_reasons     JSON list of the end reasons of successful episodes; empty if unknown
     view                JSON object of numbers for viewers; see `LogMetadata.view`
     step_duration_ns    simulated time between two records
     policy, epsilon, seed   values at the start of the recording; empty if unknown
@@ -85,13 +85,13 @@ class LogMetadata:
         env_kwargs: Keyword arguments of `gymnasium.make`; JSON types only.
         observation_names: Names of a vector observation's elements; empty if unknown.
         action_meanings: Names of the discrete actions; empty if unknown.
-        success_reasons: Reasons with which an episode succeeds; empty if unknown.
+        success_reasons: End reasons of successful episodes; empty if unknown.
         view: Numbers for viewers, empty if unknown. `distance_m` and `tilt_deg` place the follow
             camera; `world_m`, `world_x_m` and `world_y_m` are the size and the center of the world;
             `depth_min_m` and `depth_max_m` are the limits of the depth colors; `speed_m_s` is the
             highest speed.
         step_duration_ns: Simulated time between two records, nanoseconds.
-        policy: Name of the first policy; each episode's summary names its own.
+        policy: Name of the first policy; each episode's summary contains the policy of the episode.
         epsilon: Probability of a random action, as text; empty if unknown.
         seed: Seed of the recording, as text; empty if unknown.
         versions: Versions of the packages that the recording ran with.
@@ -298,7 +298,7 @@ def _object(strings: Mapping[str, str], name: str) -> dict[str, Any]:
 
 
 def _numbers(values: Any) -> dict[str, float]:
-    """Return the finite numbers of a mapping by name; empty for anything else."""
+    """Return the finite numbers of a mapping by name; an empty dict for any other value."""
     pairs = values.items() if isinstance(values, Mapping) else ()
     return {
         str(name): float(value)
@@ -320,7 +320,7 @@ def _texts(strings: Mapping[str, str], name: str) -> tuple[str, ...]:
 
 
 def _one_of(env: Any) -> Any:
-    """Return a sub-environment if this process has one that describes `env`; else `env` itself."""
+    """Return the first sub-environment of a `SyncVectorEnv` with unchanged spaces; else `env`."""
     if not isinstance(env, gym.vector.VectorEnv):
         return env
     inner = env.unwrapped

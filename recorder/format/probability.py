@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mcaprl.errors import UsageError
 
 SMALLEST: Final = float(np.finfo(np.float32).smallest_subnormal)
-"""Smallest probability that is above 0 as a float32, the type in a log."""
+"""Smallest positive float32; a log stores probabilities as float32."""
 LARGEST: Final = 1 + 1e-6
 """Largest accepted probability, which allows for the rounding errors of a softmax."""
 

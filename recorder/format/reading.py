@@ -1,4 +1,4 @@
-"""Re-exports of `columns` for packages that read MCAP files."""
+"""Names of the package `columns`, re-exported for packages that read MCAP files."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class TopicRows:
         return type(self)(rows, self._write)
 
     def grown(self, length: int) -> Self:
-        """Return a block with `length` rows per episode, the first of them copied from `self`."""
+        """Return a block with `length` rows per episode; its first rows are copies of `self`."""
         block = self.blank(len(self._rows), length)
         block._rows[:, : len(self)] = self._rows
         return block

@@ -61,8 +61,8 @@ def step_schema(
 ) -> tuple[str, str]:
     """Return the type name and definition of `/rl/step` for a pair of spaces.
 
-    The name contains a hash of the text, because a viewer with several logs open expects one
-    layout for each name.
+    The type name contains a hash of the definition, because a viewer with several open logs expects
+    one layout for each type name.
 
     Args:
         observation_space: Observation space of the environment.
@@ -152,7 +152,7 @@ def values_schema(actions: int, action_names: Mapping[int, str] | None = None) -
 
     Args:
         actions: Number of actions A.
-        action_names: As for `step_schema`, for the constants of `policy_action`.
+        action_names: Names of the discrete actions by value, for the constants of `policy_action`.
     """
     fields = [("int64", 0, "policy_action"), ("float32", actions, "q")]
     fields += [("float32", actions, "preference")]

@@ -52,10 +52,11 @@ class Source:
 
     Attributes:
         reader: Reader of the file.
-        ids: Id in the new file of each channel, by its id in this file.
+        ids: Channel id in the new file, by channel id in this file.
         spans: (S, 2) first and last time of each kept time range, increasing.
         also: Times of additional messages to keep, by channel id.
-        without: Times of messages to drop even if `spans` or `also` has them, by channel id.
+        without: Times of messages to drop although `spans` or `also` contains their times, by
+            channel id.
         changed: (S, 2) first and last time of each time range whose messages are passed to
             `change`, by channel id. Messages that get other times or ids are always passed to it.
         change: Function that changes a message.
@@ -224,7 +225,7 @@ def times_of(reader: McapReader, channel: Channel) -> Times:
 
 
 def _in_time_order(sources: Sequence[Source]) -> Iterator[tuple[Source, ChunkIndex]]:
-    """Merge the chunks of files by their start times; each file keeps its order."""
+    """Merge the chunks of files by start time; the chunks of each file keep their order."""
 
     def chunks_of(source: Source) -> Iterator[tuple[Source, ChunkIndex]]:
         return ((source, chunk) for chunk in source.reader.chunks)
@@ -240,7 +241,7 @@ class _Copy:
     def __init__(self, writer: McapWriter) -> None:
         self.copied = Copied()
         self._writer = writer
-        # One `Scratch` for each reader: `Scratch.kept` identifies a chunk by its offset only.
+        # One `Scratch` per reader, because `Scratch.kept` identifies a chunk only by its offset.
         self._scratches: dict[int, Scratch] = {}
         self._embedding: dict[int, bool] = {}
 
@@ -349,7 +350,11 @@ def _top_level_ids(reader: McapReader) -> set[int]:
 def _taken(
     source: Source, records: memoryview, indexes: Mapping[int, NDArray[Any]]
 ) -> tuple[memoryview, dict[int, NDArray[Any]]]:
-    """Return copies of messages in chunk order with new ids and times, and their new indexes."""
+    """Copy the messages in `indexes`, with the ids, times and changes for the new file.
+
+    Returns:
+        Message records in the order of the chunk; and their index by new channel id.
+    """
     wanted = sorted(
         (offset, channel_id, time_ns)
         for channel_id, index in indexes.items()

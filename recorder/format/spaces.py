@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from mcaprl.errors import SpaceError, UnknownNameError
 from mcaprl.files import parse_json
 
-# Smallest height and width of a uint8 array that is treated as an image. SB3 has no such limit; its
-# Nature CNN needs 36.
+# Smallest height and width of a uint8 array that is treated as an image. SB3 has no such limit, but
+# its Nature CNN needs at least 36 pixels.
 MIN_IMAGE_EDGE = 8
 IMAGE_ENCODINGS = {1: "mono8", 3: "rgb8", 4: "rgba8"}
 # These limits restrict the memory that a reader allocates, since a few bytes of JSON can describe a
@@ -357,7 +357,7 @@ def _elements(plain: dict[str, Any]) -> int:
 
 def _numbers(bounds: NDArray[Any]) -> Any:
     """Return bounds for JSON. Equal bounds become one number, and infinities become strings."""
-    # Image spaces have many bounds, which are nearly always equal: do not build a list then.
+    # Image spaces have many bounds, which are nearly always equal: build no list of equal bounds.
     if bounds.size and (bounds == bounds.flat[0]).all():
         return _number(bounds.flat[0].item())
     flat = [_number(value) for value in bounds.ravel().tolist()]

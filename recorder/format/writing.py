@@ -1,4 +1,4 @@
-"""Re-exports of `columns` for packages that write MCAP files."""
+"""Names of the package `columns`, re-exported for packages that write MCAP files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Actions of a mapping: discrete fields, or commands that are named, binned or continuous."""
+"""Conversion of commands to actions: discrete fields, named commands, bins or Box values."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _nearest(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the index of the named command nearest to each command, and its distance.
 
-    The distance is the largest difference in any field, where 1 is the range of the named commands.
+    The distance is the largest difference of any field, divided by the field's range in `named`.
     """
     span = np.ptp(named, axis=0)
     span = np.where(span > 0, span, 1.0)
@@ -112,7 +112,10 @@ def _nearest(
 def _binned(
     action: Action, commands: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Return the action of each command and all action names; an action is one bin per field."""
+    """Return the action of each command and all action names.
+
+    An action is a combination of bins, one for each field.
+    """
     values = np.zeros(len(commands), np.int64)
     names = []
     for field, edges, column in zip(action.fields, action.edges, commands.T, strict=True):

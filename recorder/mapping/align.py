@@ -46,7 +46,10 @@ def last(
 def nearest(
     times_ns: NDArray[np.int64], steps_ns: NDArray[np.int64], tolerance_s: float | None
 ) -> Matches:
-    """Match each step with the message nearest in time, or with the earlier of two equally near."""
+    """Match each step with the message nearest in time.
+
+    Of two equally near messages, the earlier one matches.
+    """
     if not len(times_ns):
         return _within(times_ns, steps_ns, np.full(len(steps_ns), NONE), tolerance_s)
     after = np.searchsorted(times_ns, steps_ns, side="right")
@@ -62,7 +65,10 @@ def during(
     ends_ns: NDArray[np.int64],
     tolerance_s: float | None,
 ) -> Matches:
-    """Match each step with the last message before the end of the step in `ends_ns`, (N,)."""
+    """Match each step with the last message before the end of the step.
+
+    `ends_ns` contains the (N,) ends of the steps.
+    """
     rows = np.searchsorted(times_ns, ends_ns, side="left") - 1
     return _within(times_ns, steps_ns, rows, tolerance_s)
 

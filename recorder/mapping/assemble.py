@@ -113,7 +113,7 @@ def _summary(
 
 
 def _at_ends(lengths: NDArray[np.int64], flags: list[bool]) -> NDArray[np.bool_]:
-    """Return flags of transitions: the episode flags at last transitions, False at the others."""
+    """Return (T,) flags: the flag of an episode at its last transition, False at all others."""
     found = np.zeros(int(lengths.sum()), bool)
     found[np.cumsum(lengths) - 1] = flags
     return found

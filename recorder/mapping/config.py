@@ -41,7 +41,7 @@ class Quantity(_Part):
     """A named quantity: a field, an image or a transform, aligned with the steps."""
 
     field: str | None = Field(
-        default=None, description="Path of a field, as `/odom.twist.twist.linear.x`."
+        default=None, description="Path of a field, such as `/odom.twist.twist.linear.x`."
     )
     image: str | None = Field(
         default=None, description="Topic of Image or CompressedImage messages."
@@ -54,7 +54,7 @@ class Quantity(_Part):
         default=None,
         alias="as",
         description="`yaw` converts a quaternion to its angle about z, radians; `count` counts the"
-        " messages so far of the topic that `field` names, such as events.",
+        " messages so far on the topic that `field` names, for example a topic of events.",
     )
     align: Alignment = Field(
         default="last",
@@ -106,7 +106,7 @@ class Limits(_Part):
 
 
 class Action(_Part):
-    """The action of each step: a discrete field, or a command that is named, binned or clipped."""
+    """The action of each step: a discrete field, or fields with `actions`, `edges` or `box`."""
 
     field: str | None = Field(
         default=None, description="Path of an integer, boolean or string field."
@@ -115,22 +115,25 @@ class Action(_Part):
         default=[], description="Paths of the fields of a continuous command."
     )
     names: dict[str, int] = Field(
-        default={}, description="Action numbers, by value (string field) or name (other fields)."
+        default={},
+        description="Action numbers: for a string field by its values, otherwise by action name.",
     )
     actions: dict[str, list[float]] = Field(
         default={}, description="Named commands; the nearest one is the action."
     )
     edges: list[list[float]] = Field(
         default=[],
-        description="Bin edges of each field, increasing; an action is one bin of each field.",
+        description="Bin edges of each field, increasing; an action is a combination of bins, one"
+        " for each field.",
     )
     box: Limits | None = Field(
         default=None, description="Limits of a Box action; commands are clipped to them."
     )
     far: Positive = Field(
         default=0.25,
-        description="Distance to the nearest named command above which a command is counted as far;"
-        " 1 is the range of the named commands in a field.",
+        description="Distance to the nearest named command above which a command is counted as far."
+        " The distance is the largest difference of any field, divided by the range of the field in"
+        " the named commands.",
     )
     align: Literal["during", "last", "nearest"] = Field(
         default="during",
@@ -149,7 +152,7 @@ class Action(_Part):
         if self.fields and sum(kinds) != 1:
             raise ValueError("fields need one of actions, edges and box")
         if self.field and any(kinds):
-            raise ValueError("actions, edges and box are for fields, not for a discrete field")
+            raise ValueError("use actions, edges and box with `fields`, not with `field`")
         count = len(self.fields)
         lengths = [len(command) for command in self.actions.values()]
         lengths += [len(self.edges)] if self.edges else []
@@ -252,7 +255,7 @@ MAPPING_SECTIONS: dict[str, type[BaseModel]] = {
     "episodes": Episodes,
     "meta": Meta,
 }
-"""Models of the parts of a mapping, by section title of the reference documentation."""
+"""Pydantic models of the parts of a mapping, by section title of the reference documentation."""
 
 
 class Place:

@@ -1,8 +1,8 @@
 """Images of a bag as observations: decoded, cropped, resized and converted to gray.
 
-Raw `sensor_msgs/Image` messages of the encodings below and compressed images of every format that
-Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes
-float32 meters (H, W, 1), 0 where there is no surface; with `range_m`, it becomes uint8.
+Raw `sensor_msgs/Image` messages of the encodings in `_RAW` and compressed images of every format
+that Pillow reads are supported. Colors become uint8 (H, W, 3) or, if gray, (H, W, 1). Depth becomes
+float32 meters (H, W, 1), 0 where there is no surface; with `range_m`, depth becomes uint8.
 """
 
 from __future__ import annotations
@@ -186,7 +186,10 @@ def _size(image: Any) -> tuple[int, int]:
 
 
 def _resized(image: Any, width: int, height: int) -> Any:
-    """Resize by averaging. For depth, use the nearest pixel: a mean may lie on no surface."""
+    """Resize an image by averaging.
+
+    Depth is resized by the nearest pixel: the mean of two depths may not be on any surface.
+    """
     if _size(image) == (width, height):
         return image
     pillow = import_extra("PIL.Image", "bags")

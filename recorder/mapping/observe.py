@@ -140,7 +140,7 @@ def _match(
 
 
 def _rows(run: Run, match: Matches) -> NDArray[np.int64]:
-    """Return the index in the topic of the message that matches each step, or `NONE`."""
+    """Return, for each step, the index of its message in the topic; `NONE` without a message."""
     rows = np.full(len(match.rows), NONE)
     rows[match.rows != NONE] = run.rows[match.rows[match.rows != NONE]]
     return rows

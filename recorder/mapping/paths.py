@@ -54,7 +54,7 @@ class FieldPath(NamedTuple):
 
 
 def topic_of(bag: Bag, name: str) -> str:
-    """Return the name of a topic of a bag.
+    """Return `name` if it is a readable topic of the bag.
 
     Raises:
         UsageError: There is no such topic, or its messages cannot be read.
@@ -68,7 +68,7 @@ def topic_of(bag: Bag, name: str) -> str:
 
 
 def field_path(bag: Bag, text: str) -> FieldPath:
-    """Resolve the path of a field: the topic is the longest one that the text begins with.
+    """Resolve the path of a field: its topic is the longest topic name at the start of the text.
 
     Raises:
         UsageError: There is no such topic or field; the message names the nearest ones.

@@ -63,8 +63,9 @@ class MappingReport:
         steps: Number of transitions.
         episodes: Number of episodes.
         dropped: Number of transitions of each episode that was too short.
-        ends: Number of episodes by end reason; `condition` counts all conditions of the mapping.
-        clock_resets: Number of times that the clock went back by more than a gap.
+        ends: Number of episodes by end reason; `condition` counts the episodes that a condition of
+            the mapping ended.
+        clock_resets: Number of times that the clock went back by more than `gap_s`.
         fields: Statistics of each quantity, by name.
         missing_actions: Share of the steps of the clock without an action.
         far_actions: Share of the transitions whose command is far from every named action, or
@@ -97,7 +98,7 @@ class MappingReport:
             Problem(
                 f"{name} is missing at {field.missing:.0%} of the steps",
                 field.topic,
-                next="give it `missing` or a larger `tolerance_s`, or leave it out",
+                next="set `missing` or a larger `tolerance_s`, or remove the quantity",
             )
             for name, field in self.fields.items()
             if field.missing > _MUCH

@@ -47,7 +47,7 @@ TF, TF_STATIC, TELEMETRY = "/tf", "/tf_static", "/telemetry"
 DEPTH, CAMERA_INFO = "/camera/depth", "/camera/camera_info"
 # Display messages are written when they exceed this size or the episode ends.
 _CHUNK_BYTES = 2**20
-# The tracks are written again after other messages of this many times the tracks' size.
+# Minimum bytes of display messages between two messages of tracks, per byte of the tracks.
 _BYTES_PER_TRACKS = 4
 # Shapes of a body move with its frame at each step; other moving shapes are written at this period.
 _SCENE_PERIOD_NS = 100_000_000
@@ -210,7 +210,7 @@ class Display:
             self._pending = None
 
     def _emit_motion(self, time_ns: int, frames: Sequence[Frame]) -> None:
-        """Add the poses of the frames from the previous step to the current one, at `time_ns`."""
+        """Add the poses of the frames between the previous step and the step at `time_ns`."""
         end = (time_ns, frames)
         if self._moment is not None:
             inner = self._motion.motion() if self._motion is not None else ()

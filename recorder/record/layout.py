@@ -116,7 +116,7 @@ class _Screens:
         return panels.split(left, beside, "row", 60)
 
     def learning(self) -> Node:
-        """Return the returns or the metrics of training, and the outputs of policies."""
+        """Return panels of training metrics or episode returns, and of the outputs of policies."""
         rows = self._metrics() if self.training else self._returns()
         if LOG_TOPIC in self.topics:
             rows.append((self._put("RosOut!learning", panels.log_lines(LOG_TOPIC)), 0.25))
@@ -268,7 +268,7 @@ class _Screens:
         return [self._put("Indicator!state", panel)]
 
     def _actions(self) -> tuple[Node, float]:
-        """Add recent logged and policy actions; return the panel and its share of the height."""
+        """Add a panel of recent logged and policy actions; return it and its share of height."""
         title = f"actions of the last {_LAST_S} s"
         if not self.metadata.action_names():
             paths = series.action_series(self.metadata)
@@ -315,7 +315,7 @@ class _Screens:
         return rows
 
     def _policy(self, topic: str) -> Node:
-        """Add a policy's outputs over time, its current Q-values, errors, and agreement."""
+        """Add a policy's outputs over time, current Q-values, errors and agreement with the log."""
         title = topic.removeprefix("/rl/")
         names = list(self.metadata.action_names().values())[: series.MAX_SERIES]
         over_time: dict[str, Node] = {}

@@ -21,7 +21,7 @@ Moment = tuple[int, Sequence[Frame]]
 
 _TOLERANCE_M = 0.04
 _TOLERANCE_ROTATION = 0.01
-"""Difference of quaternion components; 0.02 rad for small angles."""
+"""Largest error of a quaternion component; for small angles, a rotation of 0.02 rad."""
 
 
 def motion_transforms(moments: Sequence[Moment], *, thins: bool = True) -> bytes:

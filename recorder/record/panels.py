@@ -16,7 +16,7 @@ FIELD_OF_VIEW_DEG = 45
 
 NEUTRAL, GOOD, BAD = "#4e98e2", "#31b57b", "#d64545"
 _COLORS = ("#4e98e2", "#f5774d", "#31b57b", "#a395e2", "#e8c547", "#d65f8a", "#7fd1d8", "#9c755f")
-# Width of a legend in pixels: of labels, and of labels with the values at the current time.
+# Width in pixels of a legend with labels, and of a legend with labels and current values.
 _LEGEND_PX, _LEGEND_WITH_VALUES_PX = 160, 220
 # Height in pixels of each row of state transitions, and of their title and time axis.
 _TRANSITIONS_ROW_PX, _TRANSITIONS_REST_PX = 64, 60

@@ -1,8 +1,8 @@
 """Conversion of a simulator's scene into ROS messages.
 
 A simulator provides a scene by implementing one or more of the protocols below on its unwrapped
-environment. Shapes and frames are any objects with these attributes, so a simulator does not need
-to import this module. Axes follow REP 103: right-handed, z up, meters.
+environment. Shapes and frames are any objects with the attributes of `Shape` and `Frame`, so a
+simulator does not need to import this module. Axes follow REP 103: right-handed, z up, meters.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ class Shape(Protocol):
 
     @property
     def size(self) -> Vector:
-        """Edge lengths in meters; for lines, the first is the width."""
+        """Edge lengths in meters; for lines, the first length is the width of the line."""
 
     @property
     def position(self) -> Vector:
-        """Position in its frame, meters."""
+        """Position of the shape in its frame, meters."""
 
     @property
     def yaw_rad(self) -> float:
-        """Rotation about z."""
+        """Rotation about the z axis, radians."""
 
     @property
     def frame(self) -> str:
@@ -98,7 +98,7 @@ class Frame(Protocol):
 
     @property
     def rotation(self) -> Quad:
-        """Quaternion (x, y, z, w) in the parent."""
+        """Orientation in the parent, as a quaternion (x, y, z, w)."""
 
 
 @runtime_checkable

@@ -61,10 +61,10 @@ class EpisodeLog:
 
         Raises:
             UsageError: Timestamps would not increase, or `max_file_bytes` is too small.
-            SpaceError, OutputExistsError, LogError: `LogWriter` raises this error.
+            SpaceError, OutputExistsError, LogError: Raised by `LogWriter`.
         """
         self._description = description
-        # Relative paths refer to this folder, even if the working directory changes later.
+        # Relative paths refer to the initial working directory, even if the process leaves it.
         self._folder = Path.cwd()
         self.step_ns = description.step_duration_ns
         first_ns = time.time_ns() if start_time_ns is None else start_time_ns
@@ -118,7 +118,7 @@ class EpisodeLog:
                 raise UsageError(f"seed {seed}: a seed must be from 0 to 2**64 - 2")
 
     def begin(self, display: Display) -> None:
-        """Write the first display messages of the next episode, to a new file if this one is full.
+        """Write the first display messages of the next episode; if the file is full, to a new file.
 
         The layout is written with the first episode.
         """
@@ -153,7 +153,7 @@ class EpisodeLog:
         truncated: bool,
         reason: str,
     ) -> EpisodeSummary:
-        """Return the summary of an episode as if it ended now; its number is the log's next one."""
+        """Return the summary of an episode that ends now and is the next episode of the log."""
         return EpisodeSummary(
             episode=self.episodes,
             length=episode.steps,

@@ -123,7 +123,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         self._action_leaf = action_leaf(self.action_space)
         self._every = np.arange(count)
         self._open = [OpenEpisode("", math.nan) for _ in range(count)]
-        # Number of transitions in each open episode, and whether each environment has one.
+        # For each environment: transitions in its open episode, and whether an episode is open.
         self._steps = np.zeros(count, np.int64)
         self._running = np.zeros(count, np.bool_)
         # Whether each environment resets itself in the next step.
@@ -220,7 +220,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         probs = np.asarray(self.behavior_probs, np.float32)
         if probs.shape not in ((), steps.shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {steps.shape}")
-        # The action of an environment that resets itself is not taken.
+        # An environment that resets itself takes no action, so its entry of `probs` is not checked.
         for number in np.flatnonzero(is_impossible(probs) & self._running):
             prob = float(np.broadcast_to(self.behavior_probs, steps.shape)[number])
             check_probability(prob, f"behavior_probs[{number}]")

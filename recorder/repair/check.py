@@ -49,7 +49,7 @@ def check_log(path: str | Path, *, threads: int = 1) -> list[Problem]:
     try:
         reader = McapReader(path)
     except LogError as error:
-        action = _recover(path) if isinstance(error, CorruptLogError) else "restore it from a copy"
+        action = _recover(path) if isinstance(error, CorruptLogError) else "restore a backup copy"
         what = _without_path(error, path)
         return [Problem(what, "opening the file", next=action, file=str(path))]
     found = Shortlist(check_file(reader))
@@ -80,7 +80,7 @@ def _check_contents(reader: McapReader, found: Shortlist[Problem], *, threads: i
         try:
             log = EpisodeCheck(reader)
         except (LogError, SpaceError) as error:
-            # Raise the error later, because the chunks of any MCAP file are checked.
+            # Raise the error only after the check of the chunks, which works for any MCAP file.
             refusal = error
     for chunk, read in _decompressed(reader, threads):
         try:

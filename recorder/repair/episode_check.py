@@ -38,9 +38,10 @@ from mcaprl.recorder.format.topics import EPISODE_TOPIC, STEP_TOPIC
 
 _FIELDS = ("action", "reward", "terminated", "truncated", *COUNTERS)
 IMPOSSIBLE_ACTION = "leave the episode out of training"
-"""Advice for an action outside its space, which does not mean that the file is damaged."""
+"""Advice for an action outside of the action space; the file itself is not damaged."""
 _IMAGE_FIELDS = ("height", "width", "encoding", "step", "data")
-# A message range, its decoder, and its destination: rows of the step columns, or an image leaf.
+# Decoder, message range, and the place of its values: rows of the step columns, or the image leaf
+# of the observation space.
 _Place = tuple[Decoder, MessageRange, slice | Leaf]
 
 
@@ -67,7 +68,7 @@ class EpisodeCheck:
             )
             if leaf.encoding is not None
         ]
-        # `LogReader` validates logs that were written by other software.
+        # If other software wrote the log in another form, `LogReader` validates it.
         self._has_our_form = self._metadata is not None and self._schema_fits()
         self._columns: Columns = {}
         self._problems = Shortlist[Problem]()

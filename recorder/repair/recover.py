@@ -184,7 +184,7 @@ def _count_messages(reader: McapReader) -> int:
 
 
 def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
-    """Add the episode counts and losses of a plan to the result.
+    """Copy the counts and dropped episodes of an `EpisodePlan` to the result of the recovery.
 
     Raises:
         NoEpisodesError: No episode can be kept.
@@ -193,5 +193,5 @@ def _add_plan(recovery: Recovery, plan: EpisodePlan) -> None:
     recovery.ended, recovery.strays = plan.ended, plan.strays
     if plan.episodes == 0:
         can_end = any(dropped.can_end for dropped in plan.dropped)
-        hint = "; pass --keep-unfinished to keep unfinished ones" if can_end else ""
+        hint = "; pass --keep-unfinished to keep unfinished episodes" if can_end else ""
         raise NoEpisodesError(f"{recovery.source} has no whole episode{hint}")

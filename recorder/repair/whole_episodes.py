@@ -74,7 +74,7 @@ class DroppedEpisode:
 
     @property
     def what(self) -> str:
-        """Description of the loss."""
+        """Description of the dropped episode: its number and the reason."""
         return f"episode {self.number}: {self.why}{', but it can be kept' if self.can_end else ''}"
 
 
@@ -189,7 +189,8 @@ class _Run:
 
     Attributes:
         start: Row of the first record.
-        last: Row of the last record, not counting any records from the first missing image on.
+        last: Row of the last record before the first one that lacks an image; the last record of
+            the run if no image is missing.
         records: Number of records, including records without their images.
         begins: Whether the run begins with step 0.
         is_whole: Whether the run is a whole episode.
@@ -228,7 +229,7 @@ class _Run:
 
 
 def _runs(reader: McapReader, columns: Columns, channel_ids: NDArray[Any]) -> Iterator[_Run]:
-    """Yield the runs of records, which are sorted by channel and time."""
+    """Yield the runs; the records in `columns` are sorted by channel and time."""
     steps, episodes, times = columns["step"], columns["episode"], columns[LOG_TIME]
     follows = (
         (steps[1:] == steps[:-1] + 1)
@@ -275,7 +276,7 @@ def _with_images(reader: McapReader, times: NDArray[np.int64]) -> NDArray[np.boo
 
 
 def _listed_episodes(reader: McapReader) -> dict[int, int]:
-    """Return the episode numbers on `/rl/episode`; the key is the log_time of the last record."""
+    """Return the episode numbers on `/rl/episode` by the log_time of each episode's last record."""
     topic, names = Topic(reader, EPISODE_TOPIC), ("end_time_ns", "episode")
     if not set(names) <= set(topic.fields):
         return {}
@@ -284,7 +285,7 @@ def _listed_episodes(reader: McapReader) -> dict[int, int]:
 
 
 def _missing(columns: Columns, listed: Iterable[int]) -> Iterator[DroppedEpisode]:
-    """Yield episodes without records: those in `listed`, and gaps in the episode numbers."""
+    """Yield episodes without records: their numbers are in `listed` or in gaps of the numbering."""
     known = np.unique(columns["episode"]).astype(np.int64)
     gaps = np.diff(known)
     between = [
@@ -329,7 +330,7 @@ def _is_inside(plan: EpisodePlan, log_times: NDArray[np.uint64]) -> NDArray[np.b
 
 def _end_episode(data: memoryview, dtype: np.dtype[Any] | None, action: RowAction) -> None:
     """Apply `TRUNCATE` or `MAKE_FINAL` to a message."""
-    assert dtype is not None, "only episodes with a known message dtype are ended"
+    assert dtype is not None, "only messages with a known dtype are changed"
     message = np.frombuffer(data, dtype, 1)
     if action == RowAction.TRUNCATE:
         message["truncated"] = True

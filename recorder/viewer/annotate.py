@@ -83,7 +83,7 @@ class AnnotatedCopy:
 
         Args:
             dataset: Dataset of the log.
-            env: New environment of the same kind.
+            env: New environment of the same kind as the logged one.
             camera: Whether to write metric depth images.
 
         Raises:

@@ -54,7 +54,7 @@ class LiveSink(MessageSink):
         return any(channel.has_sinks() for channel in self._channels)
 
     def welcome(self) -> None:
-        """Send the latest messages of the kept topics to all viewers, including a new viewer."""
+        """Send the latest message of each topic in `kept` to all viewers, including new viewers."""
         self._has_newcomers = True
 
     def send(self, channel_id: int, time_ns: int, data: bytes) -> None:

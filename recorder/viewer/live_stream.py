@@ -62,10 +62,10 @@ MAX_STEPS = 2_000
 """Maximum number of steps shown per episode; messages take about 20 kB per step in memory."""
 # Topics whose latest message is sent to each new viewer.
 _KEPT_TOPICS = (SCENE, SCENE_STATIC, TRACKS, TF, TF_STATIC, PHASE_TOPIC)
-# If a step is shorter than this, the poses within the step are not sent.
+# Minimum duration of a step for which poses within the step are sent.
 _SHORTEST_MOTION_NS = 10_000_000
 _ROW = slice(1)
-"""Slice that selects the one row reserved for each topic of fixed-size messages."""
+"""Slice that selects the only row of a `TopicRows`; each topic of fixed-size messages has one."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class LiveStep:
 
 @dataclass
 class Pace:
-    """A limit on the time for frames, that is, for sending data to viewers.
+    """A limit on the time spent on frames. In a frame, one episode is sent to viewers.
 
     Attributes:
         share: Maximum fraction of the run time that is spent on frames.
@@ -187,7 +187,7 @@ class LiveStream(ViewerServer):
         self._topics = dict(self._shown.channels)
         type_name, text = telemetry_schema(tuple(training))
         self._topics[TRAINING_TOPIC] = log.sink.add_channel(TRAINING_TOPIC, type_name, text)
-        # A row is reserved for each topic of fixed-size messages.
+        # Each topic of fixed-size messages has a `TopicRows` with one row, for the current message.
         self._depth: ImageRows | None = None
         self._values: TopicRows | None = None
         if isinstance(source, DepthSource):
@@ -216,7 +216,8 @@ class LiveStream(ViewerServer):
     def begin_episode(self, episode: int, policy: str) -> bool:
         """Return whether to show the episode that begins now.
 
-        Conditions: a viewer subscribes, the last shown episode is sent, and `pace` allows a frame.
+        The episode is shown if a viewer subscribes to a topic, the last shown episode has been
+        sent, and `pace` allows a frame.
         """
         now_ns = time.time_ns()
         if now_ns < self._next_ns or not self._pace.due() or not self._sink.has_viewers():
@@ -229,7 +230,7 @@ class LiveStream(ViewerServer):
         return True
 
     def look(self, source: object, return_so_far: float) -> bool:
-        """Start the timer of the frame, and send the display messages before a step.
+        """Start the timer of the frame; send telemetry, scene and depth image before a step.
 
         Returns:
             Whether shapes and depth images were sent. If so, set `values` of the next `LiveStep`.
@@ -284,7 +285,7 @@ class LiveStream(ViewerServer):
         self._pace.end()
 
     def wants_metrics(self) -> bool:
-        """Return whether metrics are due and a viewer subscribes; if so, start the timer."""
+        """Return whether metrics are due and a viewer subscribes; if so, start the frame timer."""
         now_s = self._pace.clock()
         if now_s < self._metrics_at_s or not self._sink.has_viewers():
             return False
@@ -299,7 +300,7 @@ class LiveStream(ViewerServer):
         self._pace.pause()
 
     def layout(self) -> dict[str, Any]:
-        """Return the layout that shows these topics; see `layout.layout_of`."""
+        """Return the layout that shows the topics of the stream; see `layout.layout_of`."""
         return layout_of(
             self._log.metadata,
             sorted((LOG_TOPIC, PHASE_TOPIC, *self._topics)),
@@ -318,7 +319,7 @@ class LiveStream(ViewerServer):
         super().close()
 
     def _send_scene(self, source: SceneSource, *, is_shown: bool) -> None:
-        """Send frames and, if they are due, shapes."""
+        """Send the poses of coordinate frames and, if `is_shown` is set, the shapes."""
         time_ns = self._time_ns
         if self._steps_shown == 0:
             self._send_static(source, time_ns)
@@ -334,7 +335,7 @@ class LiveStream(ViewerServer):
             self._emit(SCENE, time_ns, marker_array(source.scene()))
 
     def _send_motion(self, moments: Sequence[Moment]) -> None:
-        """Send the poses of the frames from the previous step to the current one."""
+        """Send the poses of coordinate frames from the previous step to the current step."""
         if self._moment is not None:
             self._emit(
                 TF, self._moment[0], motion_transforms([self._moment, *moments], thins=False)

@@ -42,7 +42,8 @@ def is_allowed(head: bytes, origins: Collection[str]) -> bool:
     for line in lines:
         name, colon, value = line.partition(":")
         name = name.lower()
-        # A header name with outer spaces may be a folded line, which servers parse differently.
+        # A header name with leading or trailing spaces may be a folded line, which servers parse
+        # differently.
         if not colon or name != name.strip() or (name in headers and name in ("host", "origin")):
             return False
         headers[name] = value.strip()

@@ -38,7 +38,7 @@ class Played(NamedTuple):
 
 
 class Track:
-    """Messages of one log, by time.
+    """Messages of one log, which are looked up by time.
 
     Attributes:
         reader: Reader of the log.
@@ -77,7 +77,7 @@ class Track:
         self._records = lru_cache(_CHUNKS_KEPT)(self._inflated)
 
     def between(self, start_ns: int, stop_ns: int) -> _Messages:
-        """Yield time, channel and bytes of the messages in [start_ns, stop_ns), by time."""
+        """Yield time, channel and bytes of the messages in [start_ns, stop_ns), sorted by time."""
         start_ns, stop_ns = max(start_ns, self.start_ns), min(stop_ns, self.end_ns + 1)
         found = [place for topic in self._topics for place in topic.between(start_ns, stop_ns)]
         for place in sorted(found, key=lambda place: place.time_ns):
@@ -159,7 +159,9 @@ def _by_time(part: MessageRange) -> MessageRange:
 
 @dataclass
 class Player:
-    """Playback clock of one or more logs, shifted in time to start at the first log's start time.
+    """Playback clock of one or more logs.
+
+    The times of the logs are shifted, so that all logs start at the start time of the first log.
 
     Attributes:
         tracks: Logs to play.
@@ -179,7 +181,7 @@ class Player:
         self.shifts_ns = [self.start_ns - track.start_ns for track in self.tracks]
         self.end_ns = max(t.end_ns + s for t, s in zip(self.tracks, self.shifts_ns, strict=True))
         self.time_ns = self.start_ns
-        # Messages before this time have been played.
+        # Time before which all messages have been played.
         self._next_ns = self.start_ns
 
     @property
@@ -197,7 +199,7 @@ class Player:
         return self._played(lambda track, shift: track.latest(self.time_ns - shift))
 
     def advance(self, elapsed_s: float) -> list[Played]:
-        """Advance the clock and return the messages that are due, by time."""
+        """Advance the clock and return the messages that are due, sorted by time."""
         if not self.playing:
             return []
         self.time_ns = min(self.time_ns + round(elapsed_s * self.speed * 1e9), self.end_ns)
@@ -208,7 +210,7 @@ class Player:
         return sorted(due, key=lambda message: message.time_ns)
 
     def _played(self, found: Callable[[Track, int], _Messages]) -> list[Played]:
-        """Return the messages that `found` yields for each log, timed on the player's clock."""
+        """Return the messages that `found` yields for each log, at times of the player's clock."""
         return [
             Played(number, channel.id, time_ns + shift, data)
             for number, (track, shift) in enumerate(zip(self.tracks, self.shifts_ns, strict=True))

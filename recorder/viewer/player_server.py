@@ -21,8 +21,8 @@ from mcaprl.recorder.viewer.prefix import PREFIXED_TYPES, prefixed_message
 _PERIOD_S = 1 / 30
 # Range of speeds that a viewer may request; requests for other speeds are ignored.
 MIN_SPEED, MAX_SPEED = 1e-3, 1e3
-# Viewers drop all messages when the time goes back, so the new time must arrive first. The server
-# has separate queues for times and messages, so messages are sent this many ticks after a seek.
+# Number of ticks between a seek and the next messages. Viewers drop all messages when the time goes
+# back, so the new time must arrive first. The server has separate queues for times and messages.
 _TICKS_AFTER_SEEK = 2
 # Topics whose messages are events. A viewer that receives an event twice shows the event twice.
 _EVENT_TOPICS = (EPISODE_TOPIC, LOG_TOPIC)
@@ -68,9 +68,9 @@ class LiveServer(ViewerServer):
         # Number of subscribers by channel, and the channels with a new subscriber.
         self._subscribers: Counter[int] = Counter()
         self._joined: set[int] = set()
-        # All events up to this time have been sent.
+        # Time up to which all events have been sent.
         self._sent_ns = -1
-        # After this seek, the first tick sends the messages at the start time, too.
+        # `_latest` returns the messages at the start time; after this seek, `advance` skips them.
         player.seek(player.start_ns)
         self._channels = dict(
             pair for number in range(len(prefixes)) for pair in self._announced(number)
@@ -90,7 +90,7 @@ class LiveServer(ViewerServer):
             self.tick(_PERIOD_S)
 
     def tick(self, elapsed_s: float) -> None:
-        """Send the current messages that viewers lack, then the messages that are due."""
+        """Send the latest messages that viewers still need, then the messages that are due."""
         # The lock is held until all messages are sent. Otherwise a message from before a seek could
         # arrive after the response to the seek.
         with self._lock:
@@ -163,7 +163,7 @@ class LiveServer(ViewerServer):
         """Do nothing."""
 
     def _latest(self) -> list[Played]:
-        """Return the current messages that viewers lack after a seek or a new subscription."""
+        """Return the latest messages that viewers need after a seek or a new subscription."""
         seeked, joined = self._seeked, self._joined
         self._seeked, self._joined = False, set()
         if not (seeked or joined):

@@ -79,7 +79,7 @@ def side_by_side(layouts: Sequence[dict[str, Any]], prefixes: Sequence[str]) -> 
 
 
 def _screens(panels: dict[str, Any], root: Any) -> dict[str, Any]:
-    """Return the nodes of the screens by title; empty if the root is not a panel of tabs."""
+    """Return the layout of each screen by title; empty if the root is not a panel with tabs."""
     panel = panels.get(root) if isinstance(root, str) else None
     tabs = panel.get("tabs", []) if isinstance(panel, dict) else []
     return {tab["title"]: tab["layout"] for tab in tabs}

@@ -29,7 +29,7 @@ _MAX_ROWS = 60
 
 
 def dataset_figure(path: Path, dataset: Dataset, title: str) -> None:
-    """Write a PNG with histograms of returns and lengths, and counts of actions and ends.
+    """Write a PNG with histograms of returns and lengths, and counts of actions and end reasons.
 
     Args:
         path: Path of the PNG; missing parent folders are created.
@@ -185,7 +185,7 @@ def _card(kind: str, episode: Episode, track: Positions, places: Positions, comm
 
 
 def _thumbnail(episode: Episode, track: Positions, places: Positions) -> str:
-    """Plot an episode's track over all positions, or the cumulative reward if it has no track."""
+    """Plot an episode's track on top of all positions; without a track, the cumulative reward."""
     figure, axes = new_figure((3.2, 2.2))
     if len(track):
         stride = max(1, len(places) // 4000)
@@ -261,7 +261,7 @@ def _positions_in(path: Path) -> tuple[NDArray[np.int64], Positions] | None:
 def _positions_at(
     times: NDArray[np.int64], logs: Sequence[tuple[NDArray[np.int64], Positions]]
 ) -> Positions:
-    """Return positions at exactly these times; empty if no single log contains all the times."""
+    """Return the positions at `times`; empty if no single log has positions at all `times`."""
     for known, positions in logs:
         start = int(np.searchsorted(known, times[0]))
         stop = start + len(times)

@@ -114,7 +114,7 @@ def _moments(times_ns: list[int], parts: int) -> Iterator[tuple[int, int]]:
 
 
 def _frames_at(stamped: list[tuple[int, SeenFrame]], time_ns: int) -> list[SeenFrame]:
-    """Interpolate frames at a time; outside the range of their stamps, use the nearest stamp."""
+    """Interpolate the frames at `time_ns`; outside the range of stamps, use the nearest stamp."""
     by_name: dict[str, list[tuple[int, SeenFrame]]] = {}
     for stamp_ns, frame in stamped:
         by_name.setdefault(frame.name, []).append((stamp_ns, frame))

@@ -15,7 +15,7 @@ from mcaprl.recorder.format.topics import STEP_TOPIC
 from mcaprl.recorder.record.layout import is_values_topic
 
 SHOWN = 5
-"""Maximum number of steps for each kind and topic."""
+"""Maximum number of steps for each kind of `Surprise` and each topic."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Surprise:
     value: float
 
     def __str__(self) -> str:
-        """Return a one-line summary, with the time in the viewers' format."""
+        """Return a one-line summary, with the log_time in seconds, as viewers display it."""
         seconds, rest_ns = divmod(self.time_ns, 10**9)
         return (
             f"{self.topic} {self.kind} {self.value:+.3g} in episode {self.episode}, step"
@@ -82,7 +82,7 @@ def _surprises(columns: Columns) -> Iterator[_Ranked]:
 
 
 def _disagreements(columns: Columns) -> Iterator[_Ranked]:
-    """Yield the disagreements with the lowest advantage or, without Q-values, lowest entropy."""
+    """Yield the disagreements of lowest advantage, or of lowest entropy if Q-values are missing."""
     differs = ~columns["agrees"].astype(bool)
     has_values = bool(np.isfinite(columns["advantage"]).any())
     numbers = columns["advantage"] if has_values else columns["entropy"]

@@ -31,7 +31,7 @@ _MOST_EPISODES = 10
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """A value that differs.
+    """A value that differs between the log and the replay.
 
     Attributes:
         name: `reward`, `terminated`, `truncated`, or the name of the observation element.
@@ -46,7 +46,7 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first record that differs.
+    """The first step at which the replay differs from the log.
 
     Attributes:
         episode: Index of the episode in the dataset.
@@ -143,7 +143,7 @@ def verify(
 
 
 def _needed(episodes: tuple[Episode, ...], only: int | None) -> tuple[Episode, ...]:
-    """Return episode `only` and those that its start depends on, or all if `only` is None."""
+    """Return episode `only` and the episodes that its start depends on; if None, all episodes."""
     if only is None:
         return episodes
     first = only

@@ -208,8 +208,8 @@ def _spans(
         polygon: (4, 3) u and v of the corners.
         count: Number of corners.
         middles: (height,) v of each row's middle.
-        left_u: (height,) output, for the rows that the polygon covers.
-        right_u: (height,) output, for the same rows.
+        left_u: (height,) output: leftmost u on each row that the polygon covers.
+        right_u: (height,) output: rightmost u on each row that the polygon covers.
 
     Returns:
         First row that the polygon covers, and the row after the last one.
@@ -249,7 +249,8 @@ def _fill(
     polygon to the right of the edge or below it.
 
     At a pixel (u, v), relative to the middle of the image, the inverse depth of the plane is
-    (x u/f + y v/f + z) / offset. The focal length is f; the other values are fields of `plane`.
+    (x u/f + y v/f + z) / offset. Here, f is the focal length; the fields of `plane` are x, y,
+    z and offset.
 
     Args:
         rows: First row that the polygon covers, and the row after the last one.

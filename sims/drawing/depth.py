@@ -63,7 +63,7 @@ class Overlaps(NamedTuple):
     first: NDArray[np.int64]
     """(new,) index of the first old pixel that overlaps each new one."""
     weights: Floats
-    """(new, K) fraction of each new pixel covered by each of K old pixels from `first` onward."""
+    """(new, K) fraction of each new pixel that old pixel `first` + k covers, for k < K."""
 
 
 def overlaps(old_size: int, new_size: int) -> Overlaps:
@@ -93,8 +93,8 @@ def shrink(
 
     Args:
         inverse: (H, W) 1/m, 0 where there is no surface.
-        rows: Overlaps of H with h pixels.
-        columns: Overlaps of W with w pixels.
+        rows: Result of `overlaps(H, h)`.
+        columns: Result of `overlaps(W, w)`.
         depth_m: (h, w) output, meters.
     """
     width = inverse.shape[1]

@@ -45,7 +45,7 @@ class Shape:
     """Element of a scene.
 
     A `box`, `sphere`, `cylinder` (axis along z) or `text` has its center at `position` and edge
-    lengths `size`, and is rotated by `yaw_rad`. The other kinds are drawn through `points`, which
+    lengths `size`, and is rotated by `yaw_rad`. The other kinds are defined by `points`, which
     are rotated by `yaw_rad` and then translated by `position`.
     """
 
@@ -57,10 +57,11 @@ class Shape:
     """(N, 3) meters. `line`: corners in order; `segments`: pairs of ends; `triangles`: triples of
     corners; `arrow`: start and end; `points` and `spheres`: centers; other kinds: empty."""
     size: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Meters. `line`, `segments` and `points`: the first is the width; `spheres`: the diameters;
-    `arrow`: shaft diameter, head diameter, head length; `text`: the last is the height."""
+    """Three lengths in meters. `line`, `segments` and `points`: the first length is the width;
+    `spheres`: diameters; `arrow`: shaft diameter, head diameter, head length; `text`: the last
+    length is the height."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Meters, in `frame`."""
+    """Position in `frame`, meters."""
     yaw_rad: float = 0.0
     """Rotation about z, counter-clockwise seen from above."""
     frame: str = "map"
@@ -101,7 +102,7 @@ def raised(points_m: NDArray[np.float64], z_m: float) -> NDArray[np.float64]:
 
 
 def coarse(points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Round points that change at each step to 1/8 m, so that they compress well in logs."""
+    """Round points to 1/8 m, so that points that change at each step compress well in logs."""
     rounded: NDArray[np.float64] = np.rint(points_m * _COARSE_PER_M) / _COARSE_PER_M
     return rounded
 

@@ -57,9 +57,12 @@ class Car(NamedTuple):
 
 
 def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
-    """Return the shapes that never change: world in the frame `map`, parts of the car in `car`.
+    """Return the shapes that never change.
 
-    `network` is a `highway_env.road.road.RoadNetwork`.
+    The world is in the frame `map`, and the parts of the car are in the frame `car`.
+
+    Args:
+        network: A `highway_env.road.road.RoadNetwork`.
     """
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M

@@ -138,7 +138,7 @@ class LaneFleet(Fleet):
             self._depth_m.clear()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car. If possible, one compiled call returns reward, end and `info`."""
+        """Advance the only car of the fleet; use a single compiled call if possible."""
         if not self._has_fast_step:
             return super().step_one(action)
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m = self._drive_only(action)

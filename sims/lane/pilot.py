@@ -1,4 +1,7 @@
-"""Pilot of the lane sim: pure pursuit that brakes before corners; a search if pursuit fails."""
+"""Pilot of the lane sim: pure pursuit that brakes before corners.
+
+If pure pursuit would end the episode, the pilot searches for a better action.
+"""
 
 from __future__ import annotations
 

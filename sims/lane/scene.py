@@ -106,7 +106,10 @@ def _car() -> list[Shape]:
 
 @functools.cache
 def static_shapes() -> tuple[Shape, ...]:
-    """Return the shapes that never change: world in the frame `map`, parts of the car in `car`."""
+    """Return the shapes that never change.
+
+    The world is in the frame `map`, and the parts of the car are in the frame `car`.
+    """
     return (*_road(), *_surroundings(), *_car())
 
 

@@ -18,7 +18,8 @@ from mcaprl.sims.vehicle.arguments import pose_from
 from mcaprl.sims.vehicle.draws import spread, take
 
 ALONG, STARTED_AT = Car._fields.index("along_m"), len(Car._fields)
-"""Indices in a car's row: distance along the path, now and at the start of the episode."""
+"""Indices of two values in a car's row: its distance along the path, now and at the start of the
+episode."""
 LINE_M = 2.0
 """Distance of the start line along the path."""
 AFTER_CORNER_M, BEFORE_CORNER_M = 2.0, 8.0
@@ -28,7 +29,8 @@ FASTEST_START_M_S = 10.0
 _CLEAR_M: NDArray[np.float64] = np.concatenate(
     [[0.0], np.cumsum(np.diff(COURSE.along_m) - AFTER_CORNER_M - BEFORE_CORNER_M)]
 )
-"""(legs + 1,) length of the path up to each corner, without the parts that starts avoid."""
+"""(legs + 1,) length of the path up to each corner, counting only parts where random starts are
+allowed."""
 
 
 @compiled
@@ -42,7 +44,7 @@ def start_on_line(shares: NDArray[np.float64]) -> Car:
 
 @compiled
 def start_anywhere(shares: NDArray[np.float64]) -> Car:
-    """Return a car near the path; the four numbers set its position, offset, heading and speed."""
+    """Return a car near the path; four random numbers set position, offset, heading and speed."""
     clear_m = shares[0] * _CLEAR_M[-1]
     leg = 0
     while _CLEAR_M[leg + 1] <= clear_m:

@@ -99,8 +99,8 @@ def _scatter(
 def _advance_block(block: NDArray[np.float64]) -> None:
     """Advance the drones of a block by 2 ms.
 
-    The loop has no branches and no calls, and all offsets are constants. Only then can the compiler
-    prove that lanes do not overlap in memory, and vectorize the loop.
+    The loop has no branches and no calls, and all offsets are constants. Otherwise, the
+    compiler could not prove that lanes do not overlap in memory, and would not vectorize the loop.
     """
     for lane in range(LANES):
         command = _vector_in(block, _COMMAND + lane)

@@ -48,7 +48,7 @@ GROUND_X_M = np.concatenate(
     [np.linspace(-180, -6, 7), np.linspace(0, 54, 10), np.linspace(60, 720, 31)]
 )
 GROUND_Y_M = np.linspace(-260, 345, 23)
-"""NED grid of the ground mesh: densest on the steep hill, up to about 200 m beyond the line."""
+"""NED grid of the ground mesh: densest on the steep hill; it ends about 200 m beyond the line."""
 TREE_SIDE_M = 0.45
 """Side of a fir's base as a fraction of its height."""
 MAST_FOOT_M = 3.0

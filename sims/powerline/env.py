@@ -186,7 +186,7 @@ class PowerlineEnv(VehicleEnv[PowerlineFleet, "PowerlineView"]):
         return powerline_scene.moving_shapes(self.flight, self.trail)
 
     def static_frames(self) -> Sequence[Frame]:
-        """Return the camera's frame in the drone: x right, y down, z along the view."""
+        """Return the camera's frame, relative to the drone: x right, y down, z along the view."""
         return (powerline_scene.camera_frame(self.fleet.camera_view),)
 
     def frames(self) -> Sequence[Frame]:

@@ -42,7 +42,7 @@ from mcaprl.sims.vehicle.fleet import GOING_ON, Fleet
 MAX_WIND_M_S = 8.0
 MAX_GUST_M_S = 3.0
 MOTION = slice(3, 9)
-"""Indices of the state that `motion` contains: velocity, and command minus velocity."""
+"""Slice of the observation `state` in `motion`: velocity, and command minus velocity."""
 _INFO = ("lateral_offset_m", "vertical_offset_m", "line_distance_m", "speed_m_s", "progress_m")
 
 
@@ -103,7 +103,7 @@ class PowerlineFleet(Fleet):
         return flight_at(self._flights[i])
 
     def drones_from(self, before: Flight) -> list[Drone]:
-        """Return the states of the only drone after each 0.05 s of its last decision.
+        """In a fleet of one drone, return its states after each 0.05 s of its last decision.
 
         The decision began in the state `before`; the last returned state is the current one. If the
         episode ended during the decision, the drone keeps its state for the rest of the decision.

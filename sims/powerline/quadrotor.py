@@ -59,7 +59,7 @@ RATE_GAIN_PER_S = 30.0
 
 
 class Rotors(NamedTuple):
-    """One value per rotor; the first two rotate opposite to the last two."""
+    """One value per rotor; the first two rotors rotate opposite to the last two."""
 
     front_right: float
     rear_left: float
@@ -267,7 +267,8 @@ def move(drone: Drone, rotors: Rotors, wind_m_s: Vector) -> Drone:
     q' = q (0, omega) / 2. Here, m is the mass, v the velocity, g gravity, R the rotation from body
     to world axes, f the total thrust in body axes, d the drag coefficient, w the wind, J the
     inertia, omega the angular velocity, and q the attitude. Each thrust follows its command with a
-    lag of 20 ms. The attitude is integrated with the new omega, the position with the new v.
+    lag of 20 ms. The new omega is used to integrate the attitude, and the new v to integrate the
+    position.
     """
     share, old = ROTOR_SHARE, drone.thrusts_n
     thrusts = Rotors(

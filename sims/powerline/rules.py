@@ -192,9 +192,9 @@ def reward_of(furthest_m: float, after: Flight, end: int) -> float:
 
     The reward is min(x, 2 - x) exp(-d / 4 m) with x = ds / 2.5 m. The drone is at distance d from
     the line, and ds is its progress beyond `furthest_m`, the maximum before the decision. Finishing
-    adds 5; a failure has the reward -5 instead. The reward decreases beyond 5 m/s. If it were
-    constant there, an agent that discounts rewards would fly too fast, although a crash forfeits
-    further rewards.
+    adds 5; a failure has the reward -5 instead. Above 5 m/s, the reward decreases with the
+    speed. If the reward were constant above 5 m/s, an agent that discounts rewards would fly too
+    fast, although it gets no rewards after a crash.
     """
     if end in (OFF_LINE, COLLISION):
         return FAILURE_REWARD

@@ -79,7 +79,7 @@ def _shaded(name: str, triangles: Floats, color: tuple[float, float, float]) -> 
 def _fir(tree: course.Tree) -> Floats:
     """Return a fir as a pyramid with three sides in ROS axes, (3, 3, 3) meters."""
     half_m = 0.5 * camera.TREE_SIDE_M * tree.height_m
-    # The drawn ground is up to 1 m too low; without this offset, firs would float.
+    # Firs begin 1 m below the ground, because the drawn ground is up to 1 m too low.
     foot_z_m = course.ground_height(tree.x_m, tree.y_m) - 1.0
     foot = np.array([tree.x_m, -tree.y_m, foot_z_m])
     corners = foot + np.pad(half_m * FIR_CORNERS, ((0, 0), (0, 1)))

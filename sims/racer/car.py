@@ -19,7 +19,7 @@ CAR_LENGTH_PX, CAR_WIDTH_PX = 30.0, 14.0
 
 
 class Car(NamedTuple):
-    """State of one car; a row of a (cars, 12) array."""
+    """State of one car; the first 12 values of a row in an (N, 13) array of cars."""
 
     x_px: float
     y_px: float
@@ -37,7 +37,7 @@ class Car(NamedTuple):
     steps: float
     """Number of steps since the start."""
     along_m: float
-    """Distance of the nearest path point along the path, counted over all laps."""
+    """Distance along the path to the point nearest to the car, summed over all laps."""
     offset_m: float
     """Distance from the path, left positive."""
     heading_error_rad: float
@@ -45,7 +45,7 @@ class Car(NamedTuple):
 
 
 STARTED_AT = len(Car._fields)
-"""Index in a car's row, after the `Car` fields: distance along the path at the episode's start."""
+"""Index of the last value in a car's row: the distance along the path at the episode's start."""
 
 
 @compiled
@@ -92,7 +92,10 @@ def is_beyond(x_px: float, y_px: float, gate: NDArray[np.float64]) -> bool:
 
 @compiled
 def corner_at(car: Car, forward: float, right: float) -> tuple[float, float]:
-    """Return a corner of the car: `forward` is 1 or -1 (rear), `right` is 1 or -1 (left)."""
+    """Return a corner of the car.
+
+    `forward` is 1 (front) or -1 (rear); `right` is 1 (right) or -1 (left).
+    """
     cos, sin = math.cos(car.heading_rad), math.sin(car.heading_rad)
     ahead, aside = 0.5 * CAR_LENGTH_PX * forward, 0.5 * CAR_WIDTH_PX * right
     return car.x_px + ahead * cos - aside * sin, car.y_px + ahead * sin + aside * cos

@@ -175,7 +175,7 @@ def _along(line: Floats) -> Floats:
 
 
 def _at(values: Floats, along: Floats, places: Floats) -> Floats:
-    """Interpolate values (M, 2), known at the distances `along`, at the distances `places`."""
+    """Interpolate values (M, 2) at distances `places`; `along` are the distances of the values."""
     return np.column_stack([np.interp(places, along, values[:, k]) for k in range(2)])
 
 
@@ -225,7 +225,7 @@ def _random_controls(random: np.random.Generator) -> Floats:
 
 
 def _drivable(controls: Floats) -> bool:
-    """Return whether a track through these points fits into the image and is drivable."""
+    """Return whether a track through control points (N, 2) fits into the image and is drivable."""
     center = _spline(controls)
     room = HALF_WIDTH_PX + _MARGIN_PX
     limits = np.array([IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX]) - room
@@ -240,7 +240,7 @@ def _drivable(controls: Floats) -> bool:
 
 
 def _apart(center: Floats) -> bool:
-    """Return whether points far apart along the line are at least a track's width apart."""
+    """Return whether points far apart along the line are a track's width apart in the image."""
     along = _along(center)
     places = np.arange(0.0, along[-1], HALF_WIDTH_PX / 2)
     points = _at(center, along, places)

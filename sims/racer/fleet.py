@@ -102,7 +102,7 @@ class RacerFleet(Fleet):
         self._step()
 
     def step_one(self, action: int) -> tuple[Any, float, int, dict[str, Any]]:
-        """Advance the only car; one compiled call computes reward, end and `info`."""
+        """Advance the car of a one-car fleet; one compiled call computes reward, end and `info`."""
         reward, end, offset_m, heading_error_rad, speed_m_s, progress_m, gates = self._drive_only(
             self._numbers[action]
         )

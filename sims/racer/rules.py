@@ -45,11 +45,11 @@ SPEED_CHANGE_PX = 2.0
 MAX_SPEED_PX = 10.0
 MAX_SPEED_M_S = MAX_SPEED_PX * METERS_PER_PX / STEP_S
 DRIFT_RAD = math.radians(10.0)
-"""Approximate limit of a drifting car's course change per step at top speed. At lower speeds, the
-limit is larger."""
+"""Approximate maximum turn per step of a drifting car's direction of travel at top speed. At lower
+speeds, the maximum is larger."""
 
 BACK_M, AHEAD_M = 4.0, 8.0
-"""Search window for the nearest path point: distances before and after the last one."""
+"""Search window for the nearest path point: distances before and after the last nearest point."""
 
 CORNER_PX_2 = 0.25 * (CAR_LENGTH_PX**2 + CAR_WIDTH_PX**2)
 """Squared distance of a corner from the car's center."""

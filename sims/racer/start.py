@@ -23,7 +23,7 @@ ANYWHERE, ON_LINE, EXACTLY = 4, 2, 0
 
 @compiled
 def start_on_line(track: Track, shares: NDArray[np.float64]) -> Car:
-    """Return a car at rest near the line; two random numbers set its offset and heading."""
+    """Return a car at rest near the start line; two random numbers set its offset and heading."""
     x_px, y_px, heading_rad = track.start_px
     left_px, left_rad = spread(shares[0], 3.0), spread(shares[1], 0.05)
     x_px += left_px * math.sin(heading_rad)
@@ -58,7 +58,7 @@ def start_car(
         track: Track of the cars.
         classic: Whether the classic rules apply.
         shares: Random numbers from 0 to 1: four for a start anywhere, two for a start near the
-            line, none for a start exactly on the line.
+            start line, none for a start exactly on the start line.
         cars: (N, 13) rows of a `Car`, followed by its distance along the path at the start.
         observations: (N, 19) output.
         i: Index of the car.

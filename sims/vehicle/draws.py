@@ -14,7 +14,7 @@ _AHEAD = 32
 
 @compiled
 def take(numbers: NDArray[np.float64], used: NDArray[np.int64], i: int) -> NDArray[np.float64]:
-    """Return the next (size,) numbers of generator i; the arrays are attributes of a `Draws`.
+    """Return the next (size,) numbers of generator i from the arrays of a `Draws`.
 
     Call `draw_ahead` first.
     """
@@ -48,7 +48,7 @@ class Draws:
         self._generators: list[Any] = [None] * count
 
     def use_generator(self, i: int, generator: np.random.Generator) -> None:
-        """Assign a generator to vehicle i; if it is a new one, discard the old one's numbers."""
+        """Assign a generator to vehicle i; discard the numbers drawn from another generator."""
         if self._generators[i] is not generator:
             self._generators[i], self.used[i] = generator, _AHEAD
 

@@ -98,7 +98,8 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         self._n_actions = len(fleet.action_meanings)
         self._trail: deque[tuple[float, ...]] = deque(maxlen=self.trail_length)
         self._is_watched = render_mode == "human"
-        # While watched: the current state; and the last step as (state before the step, action).
+        # Set only if `_is_watched`: the current state; and for the last step, the state before it
+        # and the action.
         self._now: Any = None
         self._last_step: tuple[Any, int] | None = None
 
@@ -130,7 +131,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
         except TypeError:
             number = -1
         if not 0 <= number < self._n_actions:
-            # This call raises the error. The quick test above spares valid actions the slower call.
+            # This call raises the error. It is too slow to be made for valid actions.
             number = check_action(action, self._n_actions)
         if self._noise_size:
             self.fleet.noise[0] = self.np_random.standard_normal(self._noise_size)
@@ -151,7 +152,7 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
     @property
     def trail(self) -> list[tuple[float, ...]]:
-        """Last positions of the vehicle, at least one. Recording begins at the first read."""
+        """Last one or more positions of the vehicle; those before the first read may be missing."""
         if not self._trail:
             self._is_watched = True
             self._trail.append(self.place)
@@ -207,10 +208,12 @@ class VehicleEnv(RenderedEnv[AnyView], Generic[AnyFleet, AnyView]):
 
 
 def before_end(moments: Sequence[Frames], duration_s: float) -> list[tuple[float, Frames]]:
-    """Return the frames within a step, with the times to its end; omit the frames at its end.
+    """Return the frames within a step, with the time from each moment to the end of the step.
+
+    The frames at the end of the step are omitted.
 
     Args:
-        moments: Frames at equal intervals of the step, the last at its end.
+        moments: Frames at equal intervals of the step; the last moment is the end of the step.
         duration_s: Duration of the step.
 
     Returns:

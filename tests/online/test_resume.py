@@ -136,7 +136,7 @@ def test_resuming_a_missing_run_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["train-online", "lane", "--out", str(tmp_path / "rum"), "--resume"]) == 1
-    assert "rum holds no run to resume: check the path" in capsys.readouterr().err
+    assert "rum has no run to resume: check the path" in capsys.readouterr().err
     assert not (tmp_path / "rum").exists()
 
 

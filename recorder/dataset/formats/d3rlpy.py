@@ -132,9 +132,9 @@ def write(dataset: Dataset, path: Path, *, lossy: bool = False) -> list[str]:
     except SpaceError as error:
         if not lossy:
             raise SpaceError(
-                f"{error}; pass --lossy (lossy=True in Python) to write them unchanged"
+                f"{error}; pass --lossy (lossy=True in Python) to write the actions unchanged"
             ) from error
-        lost.append(f"{error}; they are written unchanged")
+        lost.append(f"{error}; the actions are written unchanged")
     with h5py.File(path, "w") as file:
         for index, part in enumerate(_episodes_of(dataset)):
             for name, values in part.items():

@@ -38,7 +38,7 @@ _DESCRIPTION = "description"
 
 
 def write_own(group: Any, dataset: Dataset, infos: Mapping[str, StoredInfo]) -> None:
-    """Write the data that d3rlpy's format cannot store to `group`."""
+    """Write to `group` the data that d3rlpy's format cannot store."""
     lasts = np.cumsum(dataset.episode_lengths) - 1
     ends = dataset.frame_of_step[lasts[dataset.terminated[lasts]]] + 1
     names = []

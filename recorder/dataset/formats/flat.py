@@ -25,7 +25,10 @@ NAMES = {
     "next_observations": ("next_observations",),
     "behavior_probs": ("behavior_probs",),
 }
-"""Accepted names of each array of `Dataset.from_arrays`; a file may contain only one of them."""
+"""Names that a file may use for each array of `Dataset.from_arrays`.
+
+A file must not contain two of the names of the same array.
+"""
 _REQUIRED = ("observations", "actions", "rewards", "terminated")
 _COLUMNS = ("rewards", "terminated", "truncated", "behavior_probs")
 

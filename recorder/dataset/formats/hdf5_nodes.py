@@ -124,7 +124,9 @@ def array_in(parent: Any, name: str) -> NDArray[Any]:
 
 
 def array_at(parent: Any, path: Sequence[str | int]) -> NDArray[Any]:
-    """Read the array at a path; an integer k in it means `_index_k`, member k of a Minari Tuple.
+    """Read the array at a path of names and indexes.
+
+    An index k is read as the name `_index_k`, under which Minari stores member k of a Tuple.
 
     Raises:
         LogError: There is no such array, or it is not stored in this file.

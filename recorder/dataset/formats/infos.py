@@ -102,7 +102,9 @@ def nested_names(names: Iterable[str]) -> tuple[dict[str, tuple[str, ...]], list
         parts = tuple(name.split("."))
         is_group = any(other.startswith(f"{name}.") for other in every)
         if is_group or not all(parts) or re.search(r"[/\0\ud800-\udfff]", name):
-            reason = "it is also a group of infos" if is_group else "HDF5 cannot hold its name"
+            reason = "its name is not valid in HDF5"
+            if is_group:
+                reason = f"another name starts with '{name}.'"
             lost.append(f"the info '{name}' is left out, because {reason}")
         else:
             found[name] = parts
@@ -117,7 +119,7 @@ def _stored(values: Any) -> StoredInfo | str:
     if mask.size:
         is_missing[:] = mask.reshape(len(data), -1).any(axis=1)
     if data.dtype.kind not in "biufU":
-        return f"its values are {data.dtype}"
+        return f"values of dtype {data.dtype} cannot be stored"
     if data.dtype.kind == "U":
         if any(re.search(r"[\0\ud800-\udfff]", text) for text in data[~is_missing].ravel()):
             return "a text is not UTF-8"
@@ -127,7 +129,7 @@ def _stored(values: Any) -> StoredInfo | str:
     elif data.dtype.kind == "f":
         filled = np.where(mask, np.nan, data).astype(data.dtype)
     elif data.dtype.kind in "iu" and _is_large(data[~is_missing]):
-        return "it is missing in some rows, and its integers are too large for floats"
+        return "some rows are missing, and the integers are too large for floats"
     else:
         filled = np.where(mask, np.nan, data.astype(np.float64))
     return StoredInfo(filled, is_missing, data.dtype)

@@ -1,4 +1,4 @@
-"""NumPy archives: those of this package, which contain a whole dataset, and those of other tools.
+"""NumPy archives, written by this package (a whole dataset) or by other tools.
 
 An archive of this package has these arrays, for E episodes with N transitions:
 
@@ -7,10 +7,10 @@ An archive of this package has these arrays, for E episodes with N transitions:
     actions, rewards, terminations, truncations, behavior_probs    (N,) or (N, *shape)
     episode_lengths           (E,)
     log_time_ns               (N + E,)
-    infos/NAME                (N + E, *shape); `missing_infos/NAME` marks the rows without it
+    infos/NAME                (N + E, *shape); `missing_infos/NAME` marks the rows without the info
     mcaprl                    JSON text: metadata, summaries and the names of the observations
 
-Other archives have the arrays of `flat.NAMES`. Nothing is unpickled.
+Other archives have the arrays of `flat.NAMES`. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -195,7 +195,10 @@ def _summary(part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parse_infos(text: str, where: object) -> dict[str, tuple[str, np.dtype[Any]]]:
-    """Parse `infos` of `description_text`: the suffix of the array's name and the dtype, by info.
+    """Parse the descriptions of the infos in the text of `description_text`.
+
+    Returns:
+        For each info, the suffix that follows `infos` in the array's name, and the dtype.
 
     Raises:
         LogError: The text is damaged.

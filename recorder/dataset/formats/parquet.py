@@ -110,7 +110,7 @@ def read(path: Path) -> Dataset:
     metadata = steps.metadata()
     lengths = episodes.values("length", (), _TIME)
     if not len(lengths) or (lengths < 1).any():
-        raise LogError(f"{path / EPISODES} has no episodes, or one without transitions")
+        raise LogError(f"{path / EPISODES} has no episodes, or an episode without transitions")
     numbers = steps.values("episode", (), _TIME), steps.values("step", (), _TIME)
     first_steps = np.cumsum(lengths) - lengths
     expected = (
@@ -258,7 +258,7 @@ def _pyarrow() -> tuple[Any, Any]:
 
 
 def _without_some_infos(columns: Transitions) -> tuple[Transitions, list[str]]:
-    """Return the columns without the infos that a table cannot hold, and a reason for each."""
+    """Leave out the infos that a table cannot store; return the columns and a reason per info."""
     problems = {name: info_problem(name, info) for name, info in columns.infos.items()}
     kept = {name: info for name, info in columns.infos.items() if not problems[name]}
     return dataclasses.replace(columns, infos=kept), list(filter(None, problems.values()))
@@ -275,7 +275,10 @@ def _is_number(arrow: Any, kind: Any) -> bool:
 
 
 def _blocks(columns: Transitions) -> Iterator[tuple[int, Transitions]]:
-    """Yield blocks of about `_BLOCK_BYTES`: the index of the first episode, and the columns."""
+    """Divide the columns into blocks of whole episodes, of about `_BLOCK_BYTES` each.
+
+    For each block, yield the index of its first episode and its columns.
+    """
     frame_bytes = sum(part.nbytes // len(part) for part in (*columns.frames, columns.actions))
     sizes = np.cumsum(columns.lengths * max(frame_bytes, 1)) // _BLOCK_BYTES
     firsts = np.flatnonzero(np.diff(sizes, prepend=-1)).tolist()
@@ -286,9 +289,9 @@ def _blocks(columns: Transitions) -> Iterator[tuple[int, Transitions]]:
 def _settings(arrow: Any, table: Any) -> dict[str, Any]:
     """Return the settings of the writer.
 
-    Dictionary encoding is only used for columns of bytes, strings and episode indexes. It makes
-    columns of bytes smaller, because Parquet stores each byte in four bytes without it. For other
-    columns, it would give all NaN values the same bits, and would be slow for many distinct values.
+    Dictionary encoding is only used for columns of bytes, strings and episode indexes. Without
+    dictionary encoding, Parquet stores each byte in four bytes. In other columns, dictionary
+    encoding would give all NaN values the same bits, and would be slow for many distinct values.
     """
     small = []
     for field in table.schema:

@@ -8,7 +8,7 @@ The module of a format has these functions. A format that can only be written ha
     write(dataset: Dataset, path: Path, *, lossy: bool) -> list[str]
                                                 writes the new file or the empty folder `path`;
                                                 returns one sentence for each thing lost
-    local_path(name: str) -> Path               optional: the folder that `FORMAT:NAME` means
+    local_path(name: str) -> Path               optional: the folder of the dataset `FORMAT:NAME`
     options_for(path: Path) -> dict             optional: further arguments of `write`
 """
 

@@ -55,7 +55,7 @@ def to_buffer(
     observation_space, action_space = dataset.observation_space, dataset.action_space
     _check_spaces(observation_space, action_space)
     if options.pop("n_envs", 1) != 1:
-        raise UsageError("n_envs must be 1: all episodes are stored as those of one environment")
+        raise UsageError("n_envs must be 1: all episodes are stored as episodes of one environment")
     count = len(dataset)
     # With `optimize_memory_usage`, the next observation is the observation of the following row, so
     # the last next observation needs an additional row.
@@ -256,7 +256,7 @@ def _check_integers(name: str, space: spaces.Space[Any]) -> None:
 def _converted(
     space: spaces.Space[Any], order_of: Callable[[spaces.Space[Any]], Order | None]
 ) -> spaces.Space[Any]:
-    """Permute the axes of each Box of a space by `order_of(box)`, unless it is None."""
+    """Permute the axes of each Box of a space by `order_of(box)`, unless this result is None."""
     if isinstance(space, spaces.Dict):
         return spaces.Dict([(key, _converted(part, order_of)) for key, part in space.items()])
     order = order_of(space)
@@ -290,7 +290,7 @@ def _is_image(space: spaces.Space[Any]) -> bool:
 
 
 def _reordered(values: NDArray[Any], order: Order | None) -> NDArray[Any]:
-    """Permute the axes of each row of `values` (N, *shape); None keeps their order."""
+    """Permute the axes of each row of `values` (N, *shape) by `order`; None keeps the order."""
     return values if order is None else values.transpose(0, *(axis + 1 for axis in order))
 
 

@@ -200,7 +200,11 @@ def image_of(name: str, file: bytes | None) -> NDArray[Any]:
 
 
 def _is_depth(leaf: Leaf) -> bool:
-    """Return whether a leaf is a depth image: float32 (height, width[, 1]), `depth` in its key."""
+    """Return whether a leaf is a depth image.
+
+    A depth image has float32 values, the shape (height, width[, 1]), edges of at least
+    `MIN_IMAGE_EDGE` pixels, and a key that contains `depth`.
+    """
     is_flat = len(leaf.shape) == 2 or (len(leaf.shape) == 3 and leaf.shape[2] == 1)
     is_named = any("depth" in word.lower() for word in leaf.path[-1:])
     return (

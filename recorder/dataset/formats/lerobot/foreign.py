@@ -231,7 +231,7 @@ def _frame_times(times: NDArray[np.int64], part: _Part, step_ns: int) -> NDArray
 
 
 def _options(files: Files, episode: int) -> str:
-    """Return the tasks of an episode as the JSON options of its reset; empty if there are none."""
+    """Return reset options with the tasks of an episode, as JSON; empty if it has no tasks."""
     tasks = list(files.episodes[episode].get("tasks") or ())
     if not tasks:
         return ""
@@ -241,7 +241,7 @@ def _options(files: Files, episode: int) -> str:
 def _values_and_space(
     values: NDArray[Any], *, is_action: bool = False
 ) -> tuple[NDArray[Any], spaces.Space[Any]]:
-    """Convert values (N, *shape) to a dtype that a space can have; return them and the space."""
+    """Convert values (N, *shape) to a dtype that a space can have; return values and space."""
     if values.dtype.kind == "b":
         return values.astype(np.int8), spaces.MultiBinary(list(values.shape[1:]))
     is_index = values.shape[1:] == (1,) and values.dtype.kind in "iu" and (values >= 0).all()

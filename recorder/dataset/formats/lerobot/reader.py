@@ -15,7 +15,7 @@ from mcaprl.recorder.dataset.formats.lerobot.foreign import foreign_dataset
 from mcaprl.recorder.dataset.formats.lerobot.own import Own, read_own
 from mcaprl.recorder.format.spaces import action_leaf, leaves_of, nest
 
-# Errors that values in damaged files cause.
+# Types of the errors that invalid values in damaged files cause.
 _DAMAGED = (KeyError, TypeError, ValueError, AttributeError, OSError)
 
 
@@ -55,7 +55,7 @@ def _own_dataset(files: Files, own: Own) -> Dataset:
     columns = []
     for leaf, name in zip(leaves, own.features, strict=True):
         values = files.values(files.features[name])
-        # In a video, a gray image has three equal channels: use the first.
+        # In a video, a gray image has three equal channels: use the first channel.
         shown = values[..., 0] if leaf.encoding == "mono8" else values
         columns.append(shown.reshape(len(values), *leaf.shape))
     steps = files.steps()

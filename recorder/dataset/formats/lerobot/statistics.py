@@ -118,7 +118,7 @@ def _of_levels(counts: NDArray[np.int64]) -> Stats:
         return levels[[int(np.searchsorted(row, rank, side="right")) for row in ends]]
 
     for name, share in QUANTILES.items():
-        # Like NumPy, interpolate between the two values next to this position.
+        # Like `np.quantile`, interpolate linearly between the two values next to the quantile.
         place = share * (total - 1)
         low, high = at(math.floor(place)), at(math.ceil(place))
         found[name] = low + (place - math.floor(place)) * (high - low)

@@ -47,7 +47,7 @@ class VideoWriter:
         self._container: Any = None
         self._stream: Any = None
         height, width, channels = feature.shape
-        # 4:2:0 stores one color for each 2 x 2 pixels, so height and width must be even.
+        # 4:2:0 stores one color for each block of 2 x 2 pixels, so height and width must be even.
         self._format = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
         self.info = {
             "video.height": height,
@@ -121,7 +121,7 @@ def read_frames(path: Path, times_s: NDArray[np.float64], tolerance_s: float) ->
     Args:
         path: Video.
         times_s: (K,) times, seconds since the start of the video.
-        tolerance_s: Largest difference between a time and that of its image.
+        tolerance_s: Largest difference between an element of `times_s` and the time of its image.
 
     Raises:
         LogError: The video is missing or damaged, or has no image at one of the times.

@@ -261,7 +261,7 @@ class _Writer:
 
 
 def _step_features(dataset: Dataset) -> list[Feature]:
-    """Return the features of actions, rewards, ends and probabilities."""
+    """Return the features of actions, rewards, end flags and action probabilities."""
     leaf = action_leaf(dataset.action_space)
     rewards = dataset.rewards
     with np.errstate(over="ignore"):

@@ -27,7 +27,10 @@ from mcaprl.recorder.format.spaces import action_leaf, leaves_of
 
 DATA, FILE, MAIN = "data", "metadata.json", "main_data.hdf5"
 OWN = "mcaprl"
-"""Key of data that Minari's format cannot store, in the metadata and in each episode."""
+"""Key in Minari's metadata and in each episode.
+
+Under this key, the writer stores the data that Minari's format cannot store.
+"""
 MISSING = "missing_infos"
 """Subgroup of an episode's group `OWN`: for each info, an array that marks its missing rows."""
 # The first version of Minari that reads images without JPEG. Minari refuses datasets whose version
@@ -44,7 +47,7 @@ _ABOUT = (
     "ref_max_score",
     "num_episodes_average_score",
 )
-"""Fields of Minari's metadata that are only copied, to and from `LogMetadata.about`."""
+"""Fields of Minari's metadata that are copied to and from `LogMetadata.about`."""
 _NAMESPACE_FILE = "namespace_metadata.json"
 _ID = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d+")
 
@@ -218,7 +221,10 @@ def _registered(env_id: str) -> gym.Env[Any, Any]:
 
 
 def _own_metadata(raw: dict[str, Any], found: LogMetadata) -> LogMetadata:
-    """Return the metadata stored under `OWN` if its spaces equal those of `found`, else `found`."""
+    """Return the metadata that this package's writer stored under the key `OWN`.
+
+    If it is missing, or if its spaces differ from the spaces of `found`, return `found`.
+    """
     strings = raw.get(OWN)
     if not isinstance(strings, dict):
         return found
@@ -243,7 +249,7 @@ def _env_of(raw: dict[str, Any]) -> tuple[str, dict[str, Any]]:
 
 
 def _env_spec(metadata: LogMetadata) -> str | None:
-    """Return the specification of the environment as JSON; None if there is none."""
+    """Return the specification of the environment as JSON; None if it is unknown or malformed."""
     if not metadata.env_id:
         return None
     # The module in the id is not imported, because the data may come from an untrusted source.

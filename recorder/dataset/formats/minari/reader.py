@@ -53,7 +53,8 @@ class _Stored:
         infos: Arrays by dotted name.
         attributes: `seed`, `options` and others.
         own: Arrays that only the writer of this package stores: `behavior_probs` and `log_time_ns`.
-        missing: By the dotted name of an info: flags (T + 1,) of its missing rows, and its dtype.
+        missing: Flags (T + 1,) of the rows in which an info is missing, and the info's dtype, by
+            the info's dotted name.
     """
 
     observations: Sequence[Any]
@@ -181,7 +182,7 @@ class _Reader:
             )
 
     def _infos(self, stored: _Stored, count: int) -> dict[str, Any]:
-        """Return the infos with T + 1 rows; an info of T rows has no value for the reset."""
+        """Return the infos with T + 1 rows; add a first row for the reset to infos of T rows."""
         found: dict[str, Any] = {}
         for name, values in stored.infos.items():
             is_plain = values.ndim > 0 and values.dtype.kind in "biufU"
@@ -209,7 +210,8 @@ class _Reader:
                 # Pillow reads the size first, so images of a wrong size are not decoded.
                 with image_module.open(io.BytesIO(bytes(data)), formats=["JPEG"]) as image:
                     if image.size != (leaf.shape[1], leaf.shape[0]):
-                        raise OSError(f"{image.size[0]} x {image.size[1]} pixels")
+                        width, height = image.size
+                        raise OSError(f"the image has a wrong size: {width} x {height} pixels")
                     images[row] = np.asarray(image)
             except (OSError, ValueError) as error:
                 raise LogError(f"{where}: {leaf.name} of step {row}: {error}") from error

@@ -59,7 +59,7 @@ def space_from_text(text: str, role: str) -> StoredSpace:
         ours, keys = _ours(plain, role), tuple(_leaf_keys(plain))
     except SpaceError:
         raise
-    # The text can have any structure.
+    # The JSON text can have any structure, so these errors can occur.
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise SpaceError(f"not a description of a space: {str(text)[:80]!r}") from error
     return StoredSpace(space_from_json(json.dumps(ours)), keys)

@@ -124,9 +124,9 @@ def test_infos_that_differ_between_episodes_are_left_out(tmp_path: Path) -> None
     ("form", "name", "infos", "message"),
     [
         ("minari", "toy-v0", {"a.b": np.ma.zeros(5), "a": np.ma.zeros(5)}, "'a' is left out"),
-        ("minari", "toy-v0", {"a/b": np.ma.zeros(5)}, "HDF5 cannot hold its name"),
-        ("hdf5", "toy.hdf5", {"a..b": np.ma.zeros(5)}, "HDF5 cannot hold its name"),
-        ("npz", "toy.npz", {"z": np.ma.zeros(5, complex)}, "its values are complex128"),
+        ("minari", "toy-v0", {"a/b": np.ma.zeros(5)}, "its name is not valid in HDF5"),
+        ("hdf5", "toy.hdf5", {"a..b": np.ma.zeros(5)}, "its name is not valid in HDF5"),
+        ("npz", "toy.npz", {"z": np.ma.zeros(5, complex)}, "values of dtype complex128"),
         ("npz", "toy.npz", {"z": np.ma.MaskedArray([2**60] * 5, _MISSING)}, "too large for floats"),
         ("hdf5", "toy.hdf5", {"t": np.ma.MaskedArray(["a\0b"] * 5)}, "a text is not UTF-8"),
     ],
