@@ -1,12 +1,12 @@
-"""Networks from observations to one or more numbers per action, for offline and online learning.
+"""Networks that output one or more numbers per action, for offline and online learning.
 
 image  -> convolutions -> layer -+
 vector -----------------> layer -+-> layers -> outputs
 
 Two encoders of images are available, which `ENCODERS` describes. `nature` has the convolutions of
 "Human-level control through deep reinforcement learning" (https://doi.org/10.1038/nature14236).
-`compact` averages the image to a shorter edge of about 42 pixels and has two small convolutions;
-its update takes a fraction of the time.
+`compact` first averages squares of pixels, so that the image's shorter edge has about 42 pixels; it
+has two small convolutions. A gradient step takes a fraction of the time of a step with `nature`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ _MAX_IMAGES = 10_000
 """Maximum number of images, evenly spaced, for computing a mean image."""
 _IMAGES_AT_ONCE = 256
 _SMALLEST_VARIANCE = 1e-6
-"""Variance of pixels (0 to 255) up to which images count as equal, because of rounding errors."""
+"""Largest variance of pixels (0 to 255) at which images count as equal; because of rounding errors,
+the computed variance of equal images may be above 0."""
 
 
 @dataclass(frozen=True)
@@ -272,6 +273,13 @@ class Network(Trunk):
         """Map observations to outputs."""
         return cast(Tensor, self.head(super().forward(observations))).view(-1, *self.output_shape)
 
+    @torch.no_grad()
+    def scale_outputs(self, factor: float) -> None:
+        """Multiply all outputs by a factor: they are linear in the weights of the last layers."""
+        for layer in last_layers(self.head):
+            layer.weight.mul_(factor)
+            layer.bias.mul_(factor)
+
 
 class Convolutions(nn.Module):
     """Convolutions of an encoder: images (B, height, width, channels) to features (B, n_features).
@@ -314,9 +322,9 @@ class Convolutions(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Map images to features."""
-        pixels = images.permute(0, 3, 1, 2).float()
+        pixels = images.permute(0, 3, 1, 2)
         if pixels.shape[2:] != self.shift.shape[1:]:
-            pixels = self._averaged(pixels)
+            pixels = self._averaged(pixels.float())
         return cast(Tensor, self.layers((pixels - self.shift) / self.scale))
 
     def _averaged(self, pixels: Tensor) -> Tensor:
@@ -385,6 +393,13 @@ def make_head(
     if not architecture.dueling:
         return _linear(n_inputs, output_shape)
     return DuelingHead(n_inputs, architecture.hidden[-1:], output_shape, architecture.layer_norm)
+
+
+def last_layers(head: nn.Module) -> list[nn.Linear]:
+    """Return the last layers of a head: one, or those of the two streams."""
+    if isinstance(head, DuelingHead):
+        return [cast(nn.Linear, stream[-1]) for stream in (head.advantages, head.value)]
+    return [cast(nn.Linear, head)]
 
 
 def _layers(

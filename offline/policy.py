@@ -10,6 +10,7 @@ their weights and the normalization of observations. A policy selects the action
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections import deque
@@ -88,6 +89,8 @@ class Policy:
         frame_stack: Number of successive observations in one input; see `act`.
         encoder: Encoder of observations as tensors.
         scores: Networks that score actions.
+        reward_scale: Divisor of the rewards in the training; Q-values are those of the rewards as
+            they were logged.
     """
 
     name: str
@@ -99,6 +102,7 @@ class Policy:
     frame_stack: int
     encoder: ObservationEncoder = field(repr=False)
     scores: Scores = field(repr=False)
+    reward_scale: float = 1.0
     _seen: deque[Observations] = field(default_factory=deque, init=False, repr=False)
 
     def begin(self) -> None:
@@ -153,7 +157,7 @@ class Policy:
             return cast(NDArray[np.float32], best.float().numpy())
 
     def _is_stack(self, observations: Any) -> bool:
-        """Return whether these are stacks of observations (B, frame_stack, *shape)."""
+        """Return whether `observations` are stacks (B, frame_stack, *shape)."""
         try:
             shapes = [np.shape(leaf.of(observations))[1:] for leaf in self.encoder.leaves]
             return shapes == [(self.frame_stack, *leaf.shape) for leaf in self.encoder.leaves]
@@ -194,7 +198,10 @@ def save_policy(
 ) -> None:
     """Write the current policy of a seed into a folder."""
     buffer = learner.buffer
-    networks = {name: learner.network(name, seed) for name in learner.policy_models}
+    networks = {name: copy.deepcopy(learner.network(name, seed)) for name in learner.policy_models}
+    if "q" in networks:
+        # Saved values are in units of the logged rewards.
+        networks["q"].scale_outputs(buffer.reward_scale)
     weights = {
         f"{name}.{key}": value
         for name, network in networks.items()
@@ -213,6 +220,7 @@ def save_policy(
         "acts_by": learner.acts_by,
         "threshold": getattr(learner.config, "threshold", 0.0),
         "updates": learner.step,
+        "reward_scale": buffer.reward_scale,
         "architecture": asdict(learner.architecture),
         "outputs": {name: list(network.output_shape) for name, network in networks.items()},
         "frame_stack": buffer.packing.frame_stack,
@@ -278,6 +286,7 @@ def _build(folder: Path, description: dict[str, Any], weights: dict[str, Tensor]
         frame_stack=stack,
         encoder=encoder,
         scores=scores.eval(),
+        reward_scale=float(description.get("reward_scale", 1.0)),
     )
 
 

@@ -68,7 +68,7 @@ class BCQ(DQN):
         cloning_loss = cross_entropy(logits_tm1, batch.actions)
         penalty = self.config.logits_penalty * square_penalty(logits_tm1)
         return {
-            "mean_q": chosen(mean_values(q_tm1), batch.actions),
+            "mean_q": self.in_reward_units(chosen(mean_values(q_tm1), batch.actions)),
             "td_loss": td_loss,
             "cloning_loss": cloning_loss,
             "loss": td_loss + cloning_loss + penalty,

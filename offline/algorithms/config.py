@@ -12,7 +12,8 @@ from mcaprl.offline.batches.buffer import Packing
 class TrainingConfig(NetworkSettings):
     """Settings of all offline algorithms; each algorithm adds its own in a subclass.
 
-    The defaults learn lane keeping from 15,000 transitions in half a minute on one CPU core.
+    With the defaults, training for lane keeping on 15,000 transitions takes half a minute on one
+    CPU core.
 
     Raises:
         UsageError: A setting is outside its range.
@@ -60,6 +61,8 @@ class BootstrapConfig(TrainingConfig):
     """number of rewards in a target before the bootstrap value"""
     target_interval: int = 500
     """updates between two updates of the target network"""
+    scale_rewards: bool = True
+    """divide rewards by the standard deviation of the discounted returns of the log"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -70,7 +73,12 @@ class BootstrapConfig(TrainingConfig):
     @property
     def packing(self) -> Packing:
         """Settings for building transitions from the log."""
-        return replace(super().packing, gamma=self.gamma, n_steps=self.n_steps)
+        return replace(
+            super().packing,
+            gamma=self.gamma,
+            n_steps=self.n_steps,
+            scale_rewards=self.scale_rewards,
+        )
 
     @property
     def horizon_fraction(self) -> float:

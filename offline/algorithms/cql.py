@@ -53,7 +53,7 @@ class CQL(DoubleDQN):
         td_loss = temporal_difference_loss(q_tm1, batch.actions, target_tm1)
         penalty = cross_entropy(mean_q_tm1, batch.actions)
         return {
-            "mean_q": chosen(mean_q_tm1, batch.actions),
+            "mean_q": self.in_reward_units(chosen(mean_q_tm1, batch.actions)),
             "td_loss": td_loss,
             "conservative_penalty": penalty,
             "loss": td_loss + self.config.alpha * penalty,

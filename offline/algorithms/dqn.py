@@ -51,7 +51,7 @@ class DQNConfig(BootstrapConfig):
         self._require("hidden", bool(self.hidden) or not self.dueling, "not empty if dueling")
 
     def architecture_for(self, channels: Iterable[int]) -> Architecture:
-        """Return the architecture for images with these numbers of channels in a single frame."""
+        """Return the network's architecture, given the channels of each image in a single frame."""
         return replace(super().architecture_for(channels), dueling=self.dueling)
 
 
@@ -84,18 +84,20 @@ class DQN(Learner):
         q_tm1 = self.outputs("q", batch.observations)
         target_tm1 = self.targets(batch, self.target_outputs(batch))
         td_loss = temporal_difference_loss(q_tm1, batch.actions, target_tm1)
-        return {"mean_q": chosen(mean_values(q_tm1), batch.actions), "loss": td_loss}
+        mean_q = self.in_reward_units(chosen(mean_values(q_tm1), batch.actions))
+        return {"mean_q": mean_q, "loss": td_loss}
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return the values of the logged actions, and their absolute errors.
 
-        The learning network also computes the targets, because the age of the target network
-        differs from one validation to the next.
+        The learning network also computes the targets, because the time since the last update of
+        the target network differs from one validation to the next.
         """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))
         mean_target_tm1 = target_tm1.mean(1) if target_tm1.ndim == 2 else target_tm1
-        return {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
+        terms = {"q": q_a_tm1, "td_error": (mean_target_tm1 - q_a_tm1).abs()}
+        return {name: self.in_reward_units(term) for name, term in terms.items()}
 
     @torch.no_grad()
     def targets(self, batch: Batch, q_t: Tensor) -> Tensor:

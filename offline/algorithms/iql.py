@@ -3,13 +3,15 @@
     https://arxiv.org/abs/2110.06169
         V(s)    expectile regression to Q'(s, a_data): close to the value of the best logged action
         Q(s,a)  regression to r + gamma V(s')
-        pi      behavior cloning, each action weighted with exp(beta (Q'(s, a) - V(s)))
+        pi      behavior cloning, each action weighted with exp(beta A(s, a))
+        A(s, a) Q'(s, a) - V(s), divided by its root mean square in the batch
 
 Q' is the minimum of two target networks, one for each of two networks Q that learn from the same
 targets. The target networks are synced every `target_interval` updates.
 
 Departures from the paper: discrete actions, so the policy is a classifier and Q has one output per
-action; target networks are synced at intervals instead of averaged; Huber loss for Q.
+action; target networks are synced at intervals instead of averaged; Huber loss for Q; advantages
+are normalized, because their size differs by more than ten times between tasks.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ from mcaprl.offline.batches.buffer import Batch, TransitionBuffer
 
 MAX_WEIGHT = 100.0
 """Maximum weight of an action in the policy's loss, as in the paper's code."""
+_SMALLEST_ADVANTAGE = 1e-6
+"""Root mean square up to which advantages count as equal, because of rounding errors."""
 _TWINS = ("q", "q_twin")
 
 
@@ -43,8 +47,8 @@ class IQLConfig(BootstrapConfig):
     """updates between two syncs of the target networks"""
     expectile: float = 0.8
     """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
-    beta: float = 3.0
-    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
+    beta: float = 1.0
+    """inverse temperature of the normalized advantages in cloning; 0 weights all actions equally"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -85,12 +89,12 @@ class IQL(Learner):
             huber_regression(self.outputs(name, batch.observations), batch.actions, target_tm1)
             for name in _TWINS
         )
-        advantage = q_a_tm1 - v_tm1.detach().squeeze(1)
+        advantage = self._normalized(q_a_tm1 - v_tm1.detach().squeeze(1))
         weight = (self.config.beta * advantage).exp().clamp(max=MAX_WEIGHT)
         logits_tm1 = self.outputs("logits", batch.observations)
         policy_loss = weight * cross_entropy(logits_tm1, batch.actions)
         return {
-            "mean_q": q_a_tm1,
+            "mean_q": self.in_reward_units(q_a_tm1),
             "value_loss": v_loss,
             "td_loss": q_loss,
             "policy_loss": policy_loss,
@@ -100,7 +104,14 @@ class IQL(Learner):
     def validate(self, batch: Batch) -> dict[str, Tensor]:
         """Return the values of the logged actions, and their absolute errors."""
         q_a_tm1 = chosen(self.outputs("q", batch.observations), batch.actions)
-        return {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
+        terms = {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
+        return {name: self.in_reward_units(term) for name, term in terms.items()}
+
+    def _normalized(self, advantages: Tensor) -> Tensor:
+        """Return advantages (R,), divided by the root mean square of each seed's batch."""
+        of_seeds = advantages.view(len(self.seeds), -1)
+        size = of_seeds.square().mean(1, keepdim=True).sqrt().clamp_min(_SMALLEST_ADVANTAGE)
+        return (of_seeds / size).flatten()
 
     @torch.no_grad()
     def targets(self, batch: Batch) -> Tensor:

@@ -104,7 +104,7 @@ class Learner(ABC):
         """Return metrics (R,) of a held-out batch, by name.
 
         Algorithms with Q-values return `q`, the value of the logged action, and `td_error`, its
-        absolute difference from the target.
+        absolute difference from the target, both in units of the logged rewards.
         """
         return self.losses(batch)
 
@@ -162,6 +162,10 @@ class Learner(ABC):
     def outputs(self, name: str, observations: Observations) -> Tensor:
         """Return a model's outputs, with minus infinity for actions that are not allowed."""
         return allowed_only(self.models[name](observations), observations.mask)
+
+    def in_reward_units(self, values: Tensor) -> Tensor:
+        """Return values (R,) in units of the logged rewards, which a batch contains scaled."""
+        return values * self.buffer.reward_scale
 
     def all_models(self) -> dict[str, Model]:
         """Return the learning models and the target networks by name."""

@@ -7,6 +7,7 @@ read.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from mcaprl.errors import SpaceError, TrainingError, UnknownNameError, UsageError
 from mcaprl.networks import ImageInput
-from mcaprl.offline.batches.items import n_step_returns
+from mcaprl.offline.batches.items import n_step_returns, returns_to_go
 from mcaprl.offline.batches.observations import ObservationEncoder, Observations
 from mcaprl.recorder.format.spaces import check_actions
 
@@ -41,6 +42,8 @@ class Packing:
         center_images: Whether images are normalized even if `normalize` is False.
         gamma: Discount per step.
         n_steps: Number of rewards in a return; returns at the end of an episode have fewer.
+        scale_rewards: Whether rewards are divided by the standard deviation of the discounted
+            returns of all transitions.
     """
 
     frame_stack: int = 1
@@ -48,6 +51,7 @@ class Packing:
     center_images: bool = False
     gamma: float = 1.0
     n_steps: int = 1
+    scale_rewards: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,8 @@ class Batch:
         rows: (R,) int64, row numbers in the buffer.
         observations: R observations.
         actions: (R,) int64 action indexes, starting at 0.
-        rewards: (R,) float32, discounted sums of up to n rewards.
+        rewards: (R,) float32, discounted sums of up to n rewards, divided by the buffer's
+            `reward_scale`.
         discounts: (R,) float32, gamma to the power of the number of steps between the two
             observations; 0 if the episode terminated, but not if it was truncated.
         next_observations: R observations, up to n steps later.
@@ -85,6 +90,7 @@ class TransitionBuffer:
         places: (2, N) int64, frame indexes of each transition's observation and next observation.
         actions: (N,) int64 action indexes, starting at 0.
         returns: (2, N) float32, n-step rewards and discounts; see `Batch`.
+        reward_scale: Divisor of the rewards in `returns`.
         drawable: (M,) int64, rows with a weight above 0; None if all weights are above 0.
         cumulative: (M,) float64, cumulative weights of the drawable rows; None if the weights are
             equal.
@@ -98,6 +104,7 @@ class TransitionBuffer:
     places: Tensor
     actions: Tensor
     returns: Tensor
+    reward_scale: float = 1.0
     drawable: Tensor | None = None
     cumulative: Tensor | None = None
 
@@ -108,6 +115,7 @@ class TransitionBuffer:
         packing: Packing | None = None,
         *,
         encoder: ObservationEncoder | None = None,
+        reward_scale: float | None = None,
         weights: NDArray[np.float64] | None = None,
     ) -> TransitionBuffer:
         """Pack a dataset.
@@ -116,6 +124,7 @@ class TransitionBuffer:
             dataset: Dataset with discrete actions.
             packing: Settings for building transitions; default: single steps and single frames.
             encoder: Encoder of other data, whose normalization is reused; default: a new one.
+            reward_scale: Divisor of the rewards; default: that of `packing.scale_rewards`.
             weights: (E,) relative sampling weight of each transition of an episode; default: all
                 equal.
 
@@ -137,7 +146,11 @@ class TransitionBuffer:
             raise TrainingError("the dataset has no transitions to learn from")
         lengths = dataset.episode_lengths
         counts = lengths + 1
+        if reward_scale is None:
+            spread = packing.scale_rewards and return_spread(dataset, packing.gamma)
+            reward_scale = spread or 1.0
         places, returns = n_step_returns(dataset, packing.n_steps, packing.gamma)
+        returns[0] /= reward_scale
         frames = encoder.encode(dataset.frames)
         actions = dataset.actions.astype(np.int64) - int(action_space.start)
         if actions.min() < 0 or actions.max() >= action_space.n:
@@ -156,6 +169,7 @@ class TransitionBuffer:
             places=torch.from_numpy(places),
             actions=torch.from_numpy(actions),
             returns=torch.from_numpy(returns),
+            reward_scale=reward_scale,
         )
         return buffer if weights is None else buffer.with_weights(np.repeat(weights, lengths))
 
@@ -233,6 +247,17 @@ class TransitionBuffer:
     def image_inputs(self) -> list[ImageInput]:
         """Shape and normalization of each image that a network receives."""
         return [image.stacked(self.packing.frame_stack) for image in self.encoder.image_inputs]
+
+
+def return_spread(dataset: Dataset, gamma: float) -> float:
+    """Return the standard deviation of the discounted returns of all transitions.
+
+    Returns end with the episode, also where it was truncated. The result is 0 if a reward is not
+    finite.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        spread = float(returns_to_go(dataset.rewards, dataset.episode_lengths, gamma).std())
+    return spread if math.isfinite(spread) else 0.0
 
 
 def choose_device(name: str) -> torch.device:

@@ -29,12 +29,12 @@ class TransitionDataset(torch.utils.data.Dataset[Tensors]):
     """Map-style dataset of the transitions of logs, or of sequences of them.
 
     An item is a dict of tensors; `dataset[rows]` with a sequence of B rows is a batch, in which
-    each tensor has B rows. Without `length` it contains, for each transition:
+    each tensor has B rows. Without `length`, an item contains one transition:
 
         observation         in the space's dtype; a dict for a Dict space
         action              int64, or the space's dtype
         reward              float32, the discounted sum of up to n_steps rewards
-        next_observation    up to n_steps later
+        next_observation    observation up to n_steps later
         terminated          bool, whether next_observation is terminal
         truncated           bool, whether the episode was truncated at next_observation
         discount            float32, gamma to the power of the number of rewards; 0 if terminated

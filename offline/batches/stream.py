@@ -112,7 +112,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         part_items = max(buffer // _PARTS_PER_BLOCK, 1)
         self._parts = self._source.parts(self._options, part_items)
         self._count = sum(part.items for part in self._parts)
-        # Epoch, and number of batches of it to skip; shared, so that workers see changes.
+        # Epoch, and number of its batches to skip; in shared memory, so that workers see changes.
         self._position = torch.zeros(2, dtype=torch.int64)
         self._position.share_memory_()  # type: ignore[no-untyped-call]
         self._done = 0
@@ -123,7 +123,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         return int(self._position[0])
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch of the next iteration, from its beginning."""
+        """Choose the epoch of the next iteration, which starts with the epoch's first batch."""
         self._position[:] = torch.tensor([epoch, 0])
         self._done = 0
 
@@ -184,7 +184,8 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         full = [self._batch_size] * min(count // self._batch_size, number - 1)
         rest = count - sum(full)
         if rest == 0 and full and self._batch_size > 1:
-            # Other shards have one more item, and thus one more batch: split the last batch.
+            # Other shards have one more item, which forms one more batch. To have the same number
+            # of batches, split the last batch of this shard.
             full[-1] -= 1
             rest = 1
         return [*full, rest] if rest else full
@@ -302,7 +303,7 @@ def _cut(blocks: Iterator[_Rows], sizes: list[int], skipped: int) -> Iterator[Te
 
 
 def _grouped(shares: list[_Share], size: int) -> Iterator[list[_Share]]:
-    """Yield successive shares in groups of at least `size` items; the last group may have fewer."""
+    """Yield blocks of successive shares with at least `size` items; the last may have fewer."""
     group, items = list[_Share](), 0
     for share in shares:
         group.append(share)

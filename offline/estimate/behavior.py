@@ -141,7 +141,9 @@ def estimate_behavior(
     """
     count = len(dataset.episode_lengths)
     if folds < 2 or updates < 1:
-        raise UsageError(f"folds is {folds} and updates is {updates}: expected at least 2 and 1")
+        raise UsageError(
+            f"folds is {folds}, expected at least 2, and updates is {updates}, expected at least 1"
+        )
     if count < max(folds, 3):
         raise UsageError(
             f"estimating behavior_prob in {folds} folds needs {max(folds, 3)} episodes or more;"

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from mcaprl.offline.algorithms.config import TrainingConfig
@@ -62,7 +63,7 @@ class FQEConfig(TrainingConfig):
 
 
 class FQE(Learner):
-    """Learner of the Q-values of a given policy."""
+    """Learner of the Q-values of given policies, one network for each policy."""
 
     name = "fqe"
     config_type: ClassVar[type[TrainingConfig]] = FQEConfig
@@ -78,11 +79,14 @@ class FQE(Learner):
         Args:
             config: Settings.
             buffer: N transitions of the log.
-            seeds: Seeds of the weights and the batches.
-            pi_t: Probabilities (N, A) of the evaluated policy in each next state.
+            seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
+                initial weights and batches, which reduces the noise of differences.
+            pi_t: Probabilities (K, N, A) of each policy in each next state.
         """
         super().__init__(config, buffer, seeds)
-        self.pi_t = pi_t
+        self._pi_t = pi_t.flatten(0, 1)
+        networks = torch.arange(len(seeds), device=buffer.device)
+        self._offsets = (networks * len(buffer)).repeat_interleave(config.batch_size)
         self.target_network = self.add_target_network("q", config.target_interval)
         rewards, _ = buffer.returns
         drawn = rewards if buffer.drawable is None else rewards[buffer.drawable]
@@ -96,19 +100,20 @@ class FQE(Learner):
         """Return half the squared temporal difference."""
         q_tm1 = self.outputs("q", batch.observations)
         q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
-        pi_t = self.pi_t.index_select(0, batch.rows)
+        pi_t = self._pi_t.index_select(0, batch.rows + self._offsets)
         target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
         td_loss = square_regression(q_tm1, batch.actions, target_tm1)
         return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 
     def values(self, *, next_states: bool) -> Tensor:
-        """Return the values (N, A) of the first seed's network, clipped to the possible returns."""
+        """Return the values (K, N, A) of the networks, clipped to the possible returns."""
         outputs = outputs_of_buffer(self.models["q"], self.buffer, next_states=next_states)
-        return outputs[: len(self.buffer)].clamp(self.low, self.high)
+        values = outputs.view(len(self.seeds), len(self.buffer), -1)
+        return values.clamp(self.low, self.high)
 
 
 def return_bounds(rewards: Tensor, gamma: float) -> tuple[float, float]:
-    """Return the bounds of the discounted return of episodes with only these rewards."""
+    """Return bounds on the discounted return of episodes with rewards in the range of `rewards`."""
     steps = 1 / (1 - gamma) if gamma < 1 else float("inf")
     low, high = float(rewards.min()), float(rewards.max())
     return min(low, low * steps) if low else 0.0, max(high, high * steps) if high else 0.0

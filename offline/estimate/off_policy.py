@@ -38,7 +38,7 @@ RESAMPLES: Final = 1000
 FOLDS: Final = 2
 TRUSTED: Final = "ok"
 BY_ESTIMATES: Final = "; behavior_prob is estimated"
-"""End of the verdicts that rest on estimated behavior probabilities."""
+"""Suffix of verdicts that are based on estimated behavior probabilities."""
 PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS")
 """Estimators for rankings, from the most to the least reliable."""
 _ROWS_AT_ONCE = 4096
@@ -64,7 +64,7 @@ class Estimate:
         interval: 95 % bootstrap-t interval over episodes; None for FQE or if `value` is None.
         effective_sample_size: Number of the policy's own episodes that would be as informative.
         verdict: `ok`, or `refused: ` or `no interval: ` and the reason. FQE is never `ok`.
-            A verdict that rests on estimated behavior probabilities ends with `BY_ESTIMATES`.
+            A verdict based on estimated behavior probabilities ends with `BY_ESTIMATES`.
     """
 
     policy: str
@@ -224,13 +224,13 @@ class OffPolicyEvaluator:
                 self._config,
                 training,
                 [self._seed + held_out],
-                torch.from_numpy(pi_next.astype(np.float32)),
+                torch.from_numpy(pi_next.astype(np.float32)).unsqueeze(0),
             )
             for _ in range(self._config.updates):
                 learner.update()
                 on_update()
-            values = learner.values(next_states=False).numpy().astype(np.float64)
-            values_next = learner.values(next_states=True).numpy()
+            values = learner.values(next_states=False)[0].numpy().astype(np.float64)
+            values_next = learner.values(next_states=True)[0].numpy()
             q[evaluated] = values[np.arange(len(fold)), actions][evaluated]
             v[evaluated] = (pi * values).sum(1)[evaluated]
             v_next[evaluated] = (pi_next * values_next.astype(np.float64)).sum(1)[evaluated]

@@ -35,12 +35,13 @@ _RESAMPLES_AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class RatioEstimate:
-    """Estimate sum_k w_k (mean a_k / mean b_k + ...): one ratio per pair, means over E episodes.
+    """Estimate sum_k w_k (mean a_k / mean b_k), where the means are over E episodes.
+
+    With several pairs of arrays a and b, the ratios of all pairs are added for each k.
 
     Attributes:
         weights: Weights w (K,).
-        pairs: Arrays a (E, K) and b (E, K) of each ratio; if b is 0 in all episodes, so is the
-            ratio.
+        pairs: Pairs of arrays a (E, K) and b (E, K). Where b is 0 in all episodes, the ratio is 0.
     """
 
     weights: Floats

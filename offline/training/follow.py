@@ -96,7 +96,11 @@ def with_more_data(
     weights = np.ones(len(dataset.episodes))
     weights[held_out_episodes] = 0.0
     buffer = TransitionBuffer.from_dataset(
-        dataset, learner.config.packing, encoder=learner.buffer.encoder, weights=weights
+        dataset,
+        learner.config.packing,
+        encoder=learner.buffer.encoder,
+        reward_scale=learner.buffer.reward_scale,
+        weights=weights,
     ).to(learner.buffer.device)
     grown = type(learner)(learner.config, buffer, learner.seeds)
     for seed in learner.seeds:

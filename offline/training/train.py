@@ -103,10 +103,12 @@ def train(
     folder = Path(out)
     with locked_run(folder, resume):
         held_out = choose_held_out(len(weights), config.held_out)
+        encoder, reward_scale = _earlier_scales(folder) if resume and other_data else (None, None)
         buffer = TransitionBuffer.from_dataset(
             dataset,
             config.packing,
-            encoder=_earlier_encoder(folder) if resume and other_data else None,
+            encoder=encoder,
+            reward_scale=reward_scale,
             weights=np.where(np.isin(np.arange(len(weights)), held_out), 0.0, weights),
         ).to(place)
         open_run(folder, identity, resume, env_id=dataset.env_id, transitions=len(dataset))
@@ -260,10 +262,13 @@ class _Run:
         return False
 
 
-def _earlier_encoder(folder: Path) -> ObservationEncoder | None:
-    """Return the encoder, with normalization, of the run in a folder; None if there is no run."""
+def _earlier_scales(folder: Path) -> tuple[ObservationEncoder | None, float | None]:
+    """Return encoder and reward scale of the run in a folder; None for both if there is no run."""
     policies = policy_files(folder)
-    return read_policy(policies[0].parent).encoder if policies else None
+    if not policies:
+        return None, None
+    policy = read_policy(policies[0].parent)
+    return policy.encoder, policy.reward_scale
 
 
 def _fingerprint(dataset: Dataset, weights: NDArray[np.float64]) -> str:

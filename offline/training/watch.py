@@ -26,7 +26,7 @@ MIN_HORIZON_FRACTION = 0.3
 MAX_EXCESS = 2.0
 """Ratio of a mean value to the largest possible return; a higher ratio counts as divergence."""
 _CUT_OFF = 0.05
-"""Largest discount of the rewards missing after a truncation for which a return is not NaN."""
+"""A return is NaN if the first reward missing after a truncation has a larger discount."""
 
 
 class HeldOut:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -263,3 +264,38 @@ def test_a_value_that_is_not_finite_is_reported(column: str, bad: float) -> None
     values[2] = bad
     with pytest.raises(TrainingError, match=f"{column} of row 2"):
         TransitionBuffer.from_dataset(numbered(4, **{column: values}))
+
+
+def test_rewards_are_scaled_by_the_spread_of_returns() -> None:
+    # Returns with gamma .5 are 2, 2, 0 and 4 in two episodes, so their standard deviation is
+    # sqrt(2).
+    data = Dataset.from_arrays(
+        observations=np.zeros((4, 1), np.float32),
+        actions=np.zeros(4, np.int64),
+        rewards=[1.0, 2.0, -2.0, 4.0],
+        terminated=[False, True, False, False],
+        truncated=[False, False, False, True],
+        next_observations=np.zeros((4, 1), np.float32),
+    )
+    packing = Packing(gamma=0.5, scale_rewards=True)
+    buffer = TransitionBuffer.from_dataset(data, packing)
+    assert buffer.reward_scale == pytest.approx(math.sqrt(2))
+    rewards = buffer.returns[0] * math.sqrt(2)
+    assert rewards.tolist() == pytest.approx([1, 2, -2, 4])
+    again = TransitionBuffer.from_dataset(data, packing, reward_scale=2.0)
+    assert again.returns[0].tolist() == [0.5, 1.0, -1.0, 2.0]
+    unscaled = TransitionBuffer.from_dataset(data, Packing(gamma=0.5))
+    assert unscaled.returns[0].tolist() == [1, 2, -2, 4]
+
+
+def test_equal_returns_do_not_scale_rewards() -> None:
+    data = Dataset.from_arrays(
+        observations=np.zeros((2, 1), np.float32),
+        actions=np.zeros(2, np.int64),
+        rewards=[3.0, 3.0],
+        terminated=[True, True],
+        truncated=[False, False],
+        next_observations=np.zeros((2, 1), np.float32),
+    )
+    buffer = TransitionBuffer.from_dataset(data, Packing(scale_rewards=True))
+    assert (buffer.reward_scale, buffer.returns[0].tolist()) == (1.0, [3.0, 3.0])

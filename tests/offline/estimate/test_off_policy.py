@@ -93,10 +93,10 @@ def test_fitted_q_evaluation_learns_the_true_values() -> None:
     data = log(1_000)
     buffer = TransitionBuffer.from_dataset(data, FAST.packing)
     pi_t = torch.from_numpy(task.EVALUATED[data.next_observations.argmax(1)].astype(np.float32))
-    learner = FQE(FAST, buffer, [0], pi_t)
+    learner = FQE(FAST, buffer, [0], pi_t.unsqueeze(0))
     for _ in range(FAST.updates):
         learner.update()
-    values = learner.values(next_states=False).numpy()
+    values = learner.values(next_states=False)[0].numpy()
     learned = [values[data.observations[:, state] == 1][0] for state in (0, 1)]
     np.testing.assert_allclose(learned, task.TRUE_Q, rtol=0.08)
 

@@ -310,14 +310,14 @@ def test_an_existing_run_is_not_replaced(tmp_path: Path) -> None:
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_folder_without_a_run_is_not_touched(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "thesis.tex").write_text("")
-    message = "holds no run to resume" if resume else "choose another folder"
+    message = "has no run to resume" if resume else "choose another folder"
     with pytest.raises(TrainingError if resume else OutputExistsError, match=message):
         train(corridor(), SHORT_CQL, tmp_path, resume=resume, progress=silent)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_resuming_a_missing_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(TrainingError, match="run holds no run to resume: check the path"):
+    with pytest.raises(TrainingError, match="run has no run to resume: check the path"):
         train(corridor(), SHORT_CQL, tmp_path / "run", resume=True, progress=silent)
     assert not (tmp_path / "run").exists()
 
