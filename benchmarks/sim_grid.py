@@ -28,6 +28,7 @@ from benchmarks.sim_data import NAMES, make_logs
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
 from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, train
+from mcaprl.offline.algorithms.config import TrainingConfig
 from mcaprl.sims import Policy, PolicyScore, evaluate, make_pilot, make_sim, make_sims, normalize
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000
@@ -98,15 +99,8 @@ def learn(
     sim: str, data: mcaprl.Dataset, algo: str, out: Path, random: PolicyScore, pilot: PolicyScore
 ) -> Cell:
     """Train all seeds on a log and score them."""
-    name, special = ALGOS[algo]
-    config_type = ALGORITHMS[name].config_type
-    given = {**SHARED, **SETTINGS[sim], **special}
-    if issubclass(config_type, DQNConfig):
-        given["target_interval"] = TARGET_INTERVAL
-    if not issubclass(config_type, BootstrapConfig):
-        given = {name: value for name, value in given.items() if name not in ("gamma", "n_steps")}
     shutil.rmtree(out, ignore_errors=True)
-    train(data, config_type(**given), out, seeds=SEEDS, progress=lambda _: None)
+    train(data, settings_of(sim, *ALGOS[algo]), out, seeds=SEEDS, progress=lambda _: None)
     score = normalize(run(sim, list(load_policies(out))), random, pilot)
     assert score.normalized_score is not None
     assert score.normalized_interval is not None
@@ -118,6 +112,17 @@ def learn(
         ],
         "ends": score.ends,
     }
+
+
+def settings_of(sim: str, algo: str, special: dict[str, Any]) -> TrainingConfig:
+    """Return the settings of an algorithm for a sim; `special` differs from the shared ones."""
+    config_type = ALGORITHMS[algo].config_type
+    given = {**SHARED, **SETTINGS[sim], **special}
+    if issubclass(config_type, DQNConfig):
+        given["target_interval"] = TARGET_INTERVAL
+    if not issubclass(config_type, BootstrapConfig):
+        given = {name: value for name, value in given.items() if name not in ("gamma", "n_steps")}
+    return config_type(**given)
 
 
 def run(sim: str, policies: Sequence[Policy | None], env: Any = None) -> PolicyScore:

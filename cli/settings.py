@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import click
@@ -16,7 +16,7 @@ class SettingsCommand(click.Command):
     def __init__(
         self,
         *arguments: Any,
-        configs: Callable[[], Iterable[Settings]],
+        configs: Callable[[], Mapping[str, Settings]],
         tuned: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
         **others: Any,
     ) -> None:
@@ -24,7 +24,7 @@ class SettingsCommand(click.Command):
 
         Args:
             *arguments: Arguments of `click.Command`.
-            configs: Function that loads the algorithms and returns their default settings.
+            configs: Function that loads the algorithms, and returns the default settings of each.
             tuned: Function that returns, for each sim, the settings that differ from the defaults.
             **others: Arguments of `click.Command`.
         """
@@ -35,9 +35,25 @@ class SettingsCommand(click.Command):
         """Return the options of the command and of the algorithms."""
         return [*super().get_params(ctx), *setting_options(self._configs(), self._tuned())]
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options of the command, then those of the algorithms that share them."""
+        configs = self._configs()
+        settings = {option.name: option for option in setting_options(configs, self._tuned())}
+        options = [param for param in super().get_params(ctx) if isinstance(param, click.Option)]
+        own = [option for option in options if option.name not in settings]
+        sections = {"Options": own}
+        for name, option in settings.items():
+            algos = [algo for algo, config in configs.items() if hasattr(config, name)]
+            whose = "all algorithms" if len(algos) == len(configs) else ", ".join(algos)
+            sections.setdefault(f"Settings of {whose}", []).append(option)
+        for title, params in sections.items():
+            records = [record for param in params if (record := param.get_help_record(ctx))]
+            with formatter.section(title):
+                formatter.write_dl(records)
+
 
 def setting_options(
-    configs: Iterable[Settings], tuned: Mapping[str, Mapping[str, Any]]
+    configs: Mapping[str, Settings], tuned: Mapping[str, Mapping[str, Any]]
 ) -> list[click.Option]:
     """Return one option for each field of the given settings.
 
@@ -45,7 +61,7 @@ def setting_options(
     so that the default of the algorithm, or of the sim, is used.
     """
     options: dict[str, click.Option] = {}
-    for config in configs:
+    for config in configs.values():
         for name, line in field_help(type(config)).items():
             if name not in options:
                 options[name] = _option(name, line, getattr(config, name), tuned)
@@ -57,7 +73,8 @@ def _option(
 ) -> click.Option:
     if isinstance(default, bool):
         both = f"{flag(name)}/--no-{name.replace('_', '-')}"
-        return click.Option([both, name], default=None, help=line)
+        state = "yes" if default else "no"
+        return click.Option([both, name], default=None, help=f"{line}  [default: {state}]")
     kind = _Widths() if isinstance(default, tuple) else type(default)
     sims: dict[Any, list[str]] = {}
     for sim, settings in tuned.items():
@@ -70,7 +87,7 @@ def _option(
 
 
 def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
+    return ",".join(map(str, value)) or "none" if isinstance(value, tuple) else f"{value}"
 
 
 class _Widths(click.ParamType[tuple[int, ...]]):

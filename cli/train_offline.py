@@ -16,10 +16,10 @@ from mcaprl.settings import Settings
 from mcaprl.texts import counted
 
 
-def _configs() -> list[Settings]:
+def _configs() -> dict[str, Settings]:
     from mcaprl.offline.algorithms.registry import all_algorithms
 
-    return [learner.config_type() for learner in all_algorithms().values()]
+    return {name: learner.config_type() for name, learner in all_algorithms().items()}
 
 
 @click.command(cls=SettingsCommand, configs=_configs)
@@ -40,11 +40,11 @@ def _configs() -> list[Settings]:
     "--device",
     default="cpu",
     show_default=True,
-    help="Device that holds the data and networks: cpu or cuda.",
+    help="Device for the data and networks: cpu or cuda.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--follow", is_flag=True, help="Use episodes added to DATA during training.")
-@click.option("--other-data", is_flag=True, help="With --resume: allow other DATA.")
+@click.option("--other-data", is_flag=True, help="With --resume: allow DATA other than the run's.")
 @mapping_options
 def train_offline(data: tuple[str, ...], out: Path, **request: Any) -> None:
     """Train a policy on DATA: files, folders or globs of logs.

@@ -18,10 +18,10 @@ from mcaprl.settings import Settings
 from mcaprl.sims import SIMS
 
 
-def _configs() -> list[Settings]:
+def _configs() -> dict[str, Settings]:
     from mcaprl.online.algorithms import ALGORITHMS
 
-    return [algorithm.config_type() for algorithm in ALGORITHMS.values()]
+    return {name: algorithm.config_type() for name, algorithm in ALGORITHMS.items()}
 
 
 def _tuned() -> dict[str, dict[str, Any]]:
@@ -52,8 +52,8 @@ def _tuned() -> dict[str, dict[str, Any]]:
     "sources",
     multiple=True,
     metavar="DATA|POLICY",
-    help="Logs to put into the replay buffer, or a policy that initializes the agents (one seed of"
-    " a run per agent); may be given twice.",
+    help="Logs to put into the replay buffer, or a policy that initializes the agents (each agent"
+    " from one seed of the run); may be given twice.",
 )
 @click.option("--resume", is_flag=True, help="Resume training from the checkpoints in OUT.")
 @click.option("--live", is_flag=True, help="Show the training in Foxglove.")

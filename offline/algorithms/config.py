@@ -61,7 +61,7 @@ class BootstrapConfig(TrainingConfig):
     """number of rewards in a target before the bootstrap value"""
     target_interval: int = 500
     """updates between two updates of the target network"""
-    scale_rewards: bool = True
+    scale_rewards: bool = False
     """divide rewards by the standard deviation of the discounted returns of the log"""
 
     def __post_init__(self) -> None:

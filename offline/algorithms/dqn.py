@@ -88,10 +88,10 @@ class DQN(Learner):
         return {"mean_q": mean_q, "loss": td_loss}
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the values of the logged actions, and their absolute errors.
+        """Return the values of the logged actions, and their absolute TD errors.
 
-        The learning network also computes the targets, because the time since the last update of
-        the target network differs from one validation to the next.
+        The targets come from the learning network, because the time since the last update of the
+        target network differs from one validation to the next.
         """
         q_a_tm1 = chosen(mean_values(self.outputs("q", batch.observations)), batch.actions)
         target_tm1 = self.targets(batch, self.outputs("q", batch.next_observations))

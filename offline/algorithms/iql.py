@@ -4,14 +4,14 @@
         V(s)    expectile regression to Q'(s, a_data): close to the value of the best logged action
         Q(s,a)  regression to r + gamma V(s')
         pi      behavior cloning, each action weighted with exp(beta A(s, a))
-        A(s, a) Q'(s, a) - V(s), divided by its root mean square in the batch
+        A(s, a) Q'(s, a) - V(s)
 
 Q' is the minimum of two target networks, one for each of two networks Q that learn from the same
 targets. The target networks are synced every `target_interval` updates.
 
 Departures from the paper: discrete actions, so the policy is a classifier and Q has one output per
-action; target networks are synced at intervals instead of averaged; Huber loss for Q; advantages
-are normalized, because their size differs by more than ten times between tasks.
+action; target networks are synced at intervals instead of averaged; Huber loss for Q. Optionally,
+advantages are divided by their root mean square, because their size differs between tasks.
 """
 
 from __future__ import annotations
@@ -47,8 +47,10 @@ class IQLConfig(BootstrapConfig):
     """updates between two syncs of the target networks"""
     expectile: float = 0.8
     """expectile of the action values that V estimates; 0.5 is the mean, near 1 the maximum"""
-    beta: float = 1.0
-    """inverse temperature of the normalized advantages in cloning; 0 weights all actions equally"""
+    beta: float = 3.0
+    """inverse temperature of the advantage weights in cloning; 0 weights all actions equally"""
+    normalize_advantages: bool = False
+    """divide advantages by their root mean square in the batch; beta is then about 0.3 to 1"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -89,7 +91,9 @@ class IQL(Learner):
             huber_regression(self.outputs(name, batch.observations), batch.actions, target_tm1)
             for name in _TWINS
         )
-        advantage = self._normalized(q_a_tm1 - v_tm1.detach().squeeze(1))
+        advantage = q_a_tm1 - v_tm1.detach().squeeze(1)
+        if self.config.normalize_advantages:
+            advantage = self.normalized(advantage)
         weight = (self.config.beta * advantage).exp().clamp(max=MAX_WEIGHT)
         logits_tm1 = self.outputs("logits", batch.observations)
         policy_loss = weight * cross_entropy(logits_tm1, batch.actions)
@@ -102,12 +106,12 @@ class IQL(Learner):
         }
 
     def validate(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the values of the logged actions, and their absolute errors."""
+        """Return the values Q of the logged actions, and their absolute TD errors."""
         q_a_tm1 = chosen(self.outputs("q", batch.observations), batch.actions)
         terms = {"q": q_a_tm1, "td_error": (self.targets(batch) - q_a_tm1).abs()}
         return {name: self.in_reward_units(term) for name, term in terms.items()}
 
-    def _normalized(self, advantages: Tensor) -> Tensor:
+    def normalized(self, advantages: Tensor) -> Tensor:
         """Return advantages (R,), divided by the root mean square of each seed's batch."""
         of_seeds = advantages.view(len(self.seeds), -1)
         size = of_seeds.square().mean(1, keepdim=True).sqrt().clamp_min(_SMALLEST_ADVANTAGE)

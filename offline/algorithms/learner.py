@@ -25,10 +25,10 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class NotFiniteError(ArithmeticError):
-    """Error of a loss term that is NaN or infinite.
+    """Exception for a term of the loss that is NaN or infinite.
 
     Attributes:
-        update: Number of the update, from 1.
+        update: Number of the update in which this happened, from 1.
     """
 
     def __init__(self, message: str, update: int) -> None:
@@ -153,7 +153,7 @@ class Learner(ABC):
         return self.target_networks[name]
 
     def seed_means(self, terms: Mapping[str, Tensor]) -> list[dict[str, float]]:
-        """Return the means of terms (R,) over each seed's rows."""
+        """Return each seed's mean of terms (R,), which have the rows of all seeds."""
         means = {
             name: term.view(len(self.seeds), -1).mean(1).tolist() for name, term in terms.items()
         }

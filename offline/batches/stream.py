@@ -123,7 +123,7 @@ class TransitionStream(torch.utils.data.IterableDataset[Tensors]):
         return int(self._position[0])
 
     def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch of the next iteration, which starts with the epoch's first batch."""
+        """Choose the epoch that the next iteration yields from its first batch on."""
         self._position[:] = torch.tensor([epoch, 0])
         self._done = 0
 

@@ -72,7 +72,12 @@ class FQE(Learner):
     config: FQEConfig
 
     def __init__(
-        self, config: FQEConfig, buffer: TransitionBuffer, seeds: Sequence[int], pi_t: Tensor
+        self,
+        config: FQEConfig,
+        buffer: TransitionBuffer,
+        seeds: Sequence[int],
+        pi_t: Tensor,
+        fixed_v_t: Tensor | None = None,
     ) -> None:
         """Initialize the network with random weights, and copy them to the target network.
 
@@ -82,9 +87,12 @@ class FQE(Learner):
             seeds: Seeds of the weights and batches of each of K policies. Equal seeds give equal
                 initial weights and batches, which reduces the noise of differences.
             pi_t: Probabilities (K, N, A) of each policy in each next state.
+            fixed_v_t: Values (K, N) of next states that are not learned, NaN where they are;
+                default: all are learned.
         """
         super().__init__(config, buffer, seeds)
         self._pi_t = pi_t.flatten(0, 1)
+        self._fixed_v_t = None if fixed_v_t is None else fixed_v_t.flatten()
         networks = torch.arange(len(seeds), device=buffer.device)
         self._offsets = (networks * len(buffer)).repeat_interleave(config.batch_size)
         self.target_network = self.add_target_network("q", config.target_interval)
@@ -100,8 +108,13 @@ class FQE(Learner):
         """Return half the squared temporal difference."""
         q_tm1 = self.outputs("q", batch.observations)
         q_t = self.target_network.outputs(batch).clamp(self.low, self.high)
-        pi_t = self._pi_t.index_select(0, batch.rows + self._offsets)
+        rows = batch.rows + self._offsets
+        pi_t = self._pi_t.index_select(0, rows)
         target_tm1 = expected_sarsa_target(batch.rewards, batch.discounts, q_t, pi_t)
+        if self._fixed_v_t is not None:
+            fixed_v_t = self._fixed_v_t.index_select(0, rows)
+            fixed_tm1 = batch.rewards + batch.discounts * fixed_v_t
+            target_tm1 = torch.where(fixed_v_t.isnan(), target_tm1, fixed_tm1)
         td_loss = square_regression(q_tm1, batch.actions, target_tm1)
         return {"mean_q": chosen(q_tm1, batch.actions), "loss": td_loss}
 

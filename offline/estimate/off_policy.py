@@ -24,6 +24,7 @@ from mcaprl.offline.estimate.importance import (
     mean_weight,
 )
 from mcaprl.offline.estimate.self_normalized import Floats, RatioEstimate
+from mcaprl.offline.estimate.values import by_rows
 from mcaprl.recorder.dataset.calibration import calibration
 from mcaprl.recorder.format.probability import is_impossible
 
@@ -41,7 +42,6 @@ BY_ESTIMATES: Final = "; behavior_prob is estimated"
 """Suffix of verdicts that are based on estimated behavior probabilities."""
 PREFERENCE: Final = ("WDR", "WPDIS", "DR", "PDIS")
 """Estimators for rankings, from the most to the least reliable."""
-_ROWS_AT_ONCE = 4096
 _STANDARD_ERRORS = 4.0
 """Deviation of the mean weight from 1, in standard errors, above which an estimate is refused."""
 
@@ -197,11 +197,7 @@ class OffPolicyEvaluator:
         uniform = np.full((len(self._buffer), actions), 1 / actions)
         if policy is None:
             return uniform
-        parts = [
-            policy.action_probabilities(_rows(observations, start, start + _ROWS_AT_ONCE))
-            for start in range(0, len(self._buffer), _ROWS_AT_ONCE)
-        ]
-        own = np.concatenate(parts).astype(np.float64)
+        own = by_rows(policy.action_probabilities, observations).astype(np.float64)
         if own.shape != uniform.shape:
             raise SpaceError(f"the policy has {own.shape[1]} actions, but the log has {actions}")
         return (1 - epsilon) * own + epsilon * uniform
@@ -346,9 +342,3 @@ def _verdict(size: float) -> str:
     if size >= LEAST_SAMPLE_SIZE:
         return TRUSTED
     return f"refused: {size:.1f} effective episodes, {LEAST_SAMPLE_SIZE:.0f} needed"
-
-
-def _rows(observations: Any, start: int, stop: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: _rows(part, start, stop) for key, part in observations.items()}
-    return observations[start:stop]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -22,6 +23,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.runs import CONFIG_NAME
 
 Columns = dict[str, NDArray[Any]]
+_ROWS_AT_ONCE = 4096
 
 
 class ValuePolicy(Protocol):
@@ -120,6 +122,18 @@ def normalized_entropy(probabilities: NDArray[np.float32]) -> NDArray[np.float32
     return entropy
 
 
+def by_rows(function: Callable[[Any], NDArray[Any]], observations: Any) -> NDArray[Any]:
+    """Apply a function of B observations to slices of N observations, and join the results.
+
+    The slices have a limited size, which bounds the memory of networks on images.
+    """
+    part = next(iter(observations.values())) if isinstance(observations, dict) else observations
+    starts = range(0, len(part), _ROWS_AT_ONCE)
+    return np.concatenate(
+        [function(_rows(observations, start, start + _ROWS_AT_ONCE)) for start in starts]
+    )
+
+
 def gamma_of_run(path: Path) -> float:
     """Return the discount in the settings of a run or seed folder, or the default of DQN."""
     for folder in (path, path.parent):
@@ -130,6 +144,12 @@ def gamma_of_run(path: Path) -> float:
             except (ValueError, KeyError, TypeError):
                 break
     return DQNConfig().gamma
+
+
+def _rows(observations: Any, start: int, stop: int) -> Any:
+    if isinstance(observations, dict):
+        return {key: _rows(part, start, stop) for key, part in observations.items()}
+    return observations[start:stop]
 
 
 def _with_last(observations: Any, next_observations: Any) -> Any:

@@ -50,9 +50,7 @@ def learner_of(config: TrainingConfig, dataset: Dataset) -> Learner:
 
 def learner_with_outputs(learner_type: type[Learner], *outputs: list[float]) -> Learner:
     """A learner whose networks have constant outputs."""
-    unscaled = {} if learner_type is BC else {"scale_rewards": False}
-    config = learner_type.config_type(**{**TINY, "hidden": (), **unscaled})
-    learner = learner_of(config, corridor())
+    learner = learner_of(learner_type.config_type(**{**TINY, "hidden": ()}), corridor())
     for name, constants in zip(learner.policy_models, outputs, strict=True):
         *_, weight, bias = learner.network(name, 0).parameters()
         with torch.no_grad():
@@ -67,7 +65,7 @@ def saved_and_loaded(folder: Path, learner: Learner) -> Policy:
 
 
 def test_a_loaded_policy_has_the_saved_networks_values(tmp_path: Path) -> None:
-    learner = learner_of(CQLConfig(**TINY), corridor())
+    learner = learner_of(CQLConfig(**TINY, scale_rewards=True), corridor())
     policy = saved_and_loaded(tmp_path, learner)
     with torch.no_grad():
         seen = Observations(torch.from_numpy(inner_observations()))
@@ -136,8 +134,8 @@ def test_iql_acts_by_its_policy_and_has_values(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "config",
     [
-        DQNConfig(**TINY, dueling=True),
-        DQNConfig(**TINY, n_quantiles=3),
+        DQNConfig(**TINY, dueling=True, scale_rewards=True),
+        DQNConfig(**TINY, n_quantiles=3, scale_rewards=True),
         DQNConfig(**TINY, layer_norm=True, normalize=True),
     ],
 )

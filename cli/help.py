@@ -1,0 +1,89 @@
+"""Help texts of the program: groups of commands, groups of settings, and examples."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import click
+
+SECTIONS: Final[dict[str, tuple[str, ...]]] = {
+    "Record and learn": ("record", "train-online", "train-offline", "evaluate", "export"),
+    "Look at logs": ("info", "replay", "layout", "annotate"),
+    "Check and repair logs": ("check", "recover"),
+    "Convert and edit logs": ("convert", "merge", "split", "filter", "slice"),
+}
+"""Commands in the order of the program's help."""
+
+EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
+    "record": (
+        "mcaprl record lane --policy pilot --epsilon 0.1 --episodes 25 --out data/pilot.mcap",
+        "mcaprl record CartPole-v1 --policy random --episodes 10 --out cartpole.mcap",
+        "mcaprl record lane --policy runs/cql --episodes 3 --camera --out replay.mcap",
+    ),
+    "train-online": (
+        "mcaprl train-online lane --steps 80000 --out runs/online",
+        "mcaprl train-online lane --record online.mcap --out runs/recorded",
+        "mcaprl train-online CartPole-v1 --algo ppo --out runs/ppo",
+    ),
+    "train-offline": (
+        "mcaprl train-offline data --algo cql --seeds 2 --out runs/cql",
+        "mcaprl train-offline data/pilot.mcap:2 data/random.mcap --algo iql --out runs/iql",
+        "mcaprl train-offline data --resume --out runs/cql",
+    ),
+    "evaluate": (
+        "mcaprl evaluate runs/cql pilot random --sim lane --behavior data --report report",
+        "mcaprl evaluate runs/cql --data data",
+    ),
+    "export": ("mcaprl export runs/cql --out policy.onnx",),
+    "info": (
+        "mcaprl info data",
+        "mcaprl info data/pilot.mcap --report report",
+    ),
+    "replay": (
+        "mcaprl replay replay.mcap",
+        "mcaprl replay replay.mcap --episode 0 --video episode.mp4",
+        "mcaprl replay replay.mcap --verify",
+    ),
+    "layout": ("mcaprl layout replay.mcap --out foxglove-layout.json",),
+    "annotate": ("mcaprl annotate replay.mcap --policy runs/cql --out annotated.mcap",),
+    "check": ("mcaprl check data/pilot.mcap",),
+    "recover": ("mcaprl recover damaged.mcap recovered.mcap",),
+    "convert": (
+        "mcaprl convert data/pilot.mcap pilot.parquet --to parquet",
+        "mcaprl convert --suggest bag > robot.yaml",
+        "mcaprl convert bag robot.mcap --mapping robot.yaml",
+    ),
+    "merge": ("mcaprl merge data/pilot.mcap data/random.mcap all.mcap --shift",),
+    "split": ("mcaprl split all.mcap parts --ratio 8:1:1 --seed 0",),
+    "filter": ("mcaprl filter 'return > 100' data/pilot.mcap good.mcap",),
+    "slice": ("mcaprl slice data/pilot.mcap part.mcap --steps 0:1000",),
+}
+"""Examples of each command, shown at the end of its help."""
+
+
+class Program(click.Group):
+    """Group of commands whose help has sections, and whose commands have examples."""
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command, with its examples as the end of its help."""
+        super().add_command(cmd, name)
+        lines = EXAMPLES.get(name or cmd.name or "", ())
+        if lines:
+            # A line with only \\b keeps the following lines as they are.
+            cmd.epilog = "\n".join(["\b", "Examples:", *(f"  {line}" for line in lines)])
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of the commands in the order of `SECTIONS`."""
+        known = [name for names in SECTIONS.values() for name in names]
+        return [*known, *(name for name in super().list_commands(ctx) if name not in known)]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write one section for each group of commands."""
+        for title, names in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, self._summary(ctx, name)) for name in names])
+
+    def _summary(self, ctx: click.Context, name: str) -> str:
+        command = self.get_command(ctx, name)
+        assert command is not None
+        return command.get_short_help_str(limit=1_000)

@@ -1,0 +1,225 @@
+"""Evidence that a log alone gives for or against trained policies, for choosing among them.
+
+Fitted Q evaluation (FQE) estimates the value of each policy. The log's episodes are divided into
+two halves, and the model that is trained on one half evaluates the policies on the other. All
+policies share the initial weights and the batches, which reduces the noise of their differences.
+
+    FQE for selecting policies    Paine et al., https://arxiv.org/abs/2007.09055
+
+FQE overestimates policies whose actions are rare in the log. A pessimistic evaluation ends an
+episode at such an action, with a value that is exceeded by 99 % of the returns in the log:
+
+    Pessimistic model             Kidambi et al., https://arxiv.org/abs/2005.05951
+
+An action is rare if a clone of the behavior gives it less than `LIKELY` times the probability of
+the most likely action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mcaprl.errors import PolicyError, UsageError
+from mcaprl.offline.batches.buffer import TransitionBuffer
+from mcaprl.offline.batches.items import returns_to_go
+from mcaprl.offline.estimate.fqe import FQE, FQEConfig
+from mcaprl.offline.estimate.self_normalized import Floats
+from mcaprl.offline.estimate.values import by_rows
+
+if TYPE_CHECKING:
+    from mcaprl.recorder.dataset.dataset import Dataset
+
+FOLDS: Final = 2
+LIKELY: Final = 0.1
+"""Smallest probability under the clone, relative to the most likely action, of a likely action."""
+LOW_PERCENTILE: Final = 1.0
+_SYNCS_PER_HORIZON: Final = 6.0
+
+
+class Actor(Protocol):
+    """Trained policy that selects actions."""
+
+    def act(self, observations: Any) -> NDArray[np.int64]:
+        """Return the actions (B,) for B observations."""
+
+    def q_values(self, observations: Any) -> NDArray[np.floating[Any]]:
+        """Return the values (B, A); raise PolicyError if the policy has none."""
+
+
+class Clone(Protocol):
+    """Policy that imitates the behavior of a log."""
+
+    def action_probabilities(self, observations: Any) -> NDArray[np.floating[Any]]:
+        """Return the probabilities (B, A) of the actions for B observations."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Scores of one policy on one log. Values are discounted returns in units of the reward.
+
+    Attributes:
+        first_value: FQE's mean value of the first states of the episodes.
+        mean_value: FQE's mean value of all states of the log.
+        support: Fraction of the states in which the policy's action is likely under the clone.
+        agreement: Fraction of the states in which the policy's action is the logged one.
+        own_value: Mean of the policy's own largest Q in the first states; None if it has no Q.
+        bellman_error: Root mean square of r + gamma max_a Q(s', a) - Q(s, a), divided by the
+            standard deviation of Q; None if the policy has no Q.
+    """
+
+    first_value: float
+    mean_value: float
+    support: float
+    agreement: float
+    own_value: float | None
+    bellman_error: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the attributes as plain JSON types."""
+        return asdict(self)
+
+
+def fqe_config(gamma: float, updates: int, hidden: tuple[int, ...] = (64, 64)) -> FQEConfig:
+    """Return settings of FQE with enough updates of the target network for the discount."""
+    interval = max(1, int(updates * (1 - gamma) / _SYNCS_PER_HORIZON))
+    return FQEConfig(
+        updates=updates, gamma=gamma, batch_size=128, hidden=hidden, target_interval=interval
+    )
+
+
+class EvidenceCollector:
+    """Evaluator of many policies on one log, side by side."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        clone: Clone,
+        config: FQEConfig,
+        *,
+        pessimistic: bool = True,
+        seed: int = 0,
+    ) -> None:
+        """Prepare a log.
+
+        Args:
+            dataset: Log with discrete actions.
+            clone: Policy that imitates the behavior of the log, such as one trained by BC.
+            config: Settings of FQE; its `gamma` is the discount of all values.
+            pessimistic: Whether an episode ends at a policy's first rare action.
+            seed: Seed of the models and of the halves of the log.
+
+        Raises:
+            UsageError: There are too few episodes.
+        """
+        lengths = dataset.episode_lengths
+        if len(lengths) < FOLDS:
+            raise UsageError(f"choosing a policy needs {FOLDS} episodes or more in the log")
+        self._dataset = dataset
+        self._config = config
+        self._pessimistic = pessimistic
+        self._seed = seed
+        self._buffer = TransitionBuffer.from_dataset(dataset, config.packing)
+        halves = np.random.default_rng(seed).permutation(len(lengths)) % FOLDS
+        self._fold = np.repeat(halves, lengths)
+        self._first = np.cumsum(lengths) - lengths
+        self._likely, self._next_likely = (
+            _likely(by_rows(clone.action_probabilities, observations))
+            for observations in (dataset.observations, dataset.next_observations)
+        )
+        returns = returns_to_go(dataset.rewards, lengths, config.gamma)
+        self.low_value = float(np.percentile(returns, LOW_PERCENTILE))
+
+    def collect(
+        self, policies: Sequence[Actor], on_update: Callable[[], None] = lambda: None
+    ) -> list[Evidence]:
+        """Return the evidence for each policy.
+
+        Args:
+            policies: Policies to evaluate.
+            on_update: Function called after each update of the models: FOLDS * updates times.
+
+        Raises:
+            PolicyError: The observations do not fit a policy.
+        """
+        actions, next_actions = (
+            np.stack([self._actions(policy, observations) for policy in policies])
+            for observations in (self._dataset.observations, self._dataset.next_observations)
+        )
+        values = self._values(actions, next_actions, on_update)
+        return [
+            self._evidence(policy, mine, value)
+            for policy, mine, value in zip(policies, actions, values, strict=True)
+        ]
+
+    def _actions(self, policy: Actor, observations: Any) -> NDArray[np.int64]:
+        """Return the indexes (N,) of the policy's actions, from 0."""
+        indexes: NDArray[np.int64] = by_rows(policy.act, observations)
+        return indexes - int(self._buffer.action_space.start)
+
+    def _values(
+        self,
+        actions: NDArray[np.int64],
+        next_actions: NDArray[np.int64],
+        on_update: Callable[[], None],
+    ) -> Floats:
+        """Return FQE's values (P, N) of the states for P policies."""
+        pi_t = np.eye(int(self._buffer.action_space.n), dtype=np.float32)[next_actions]
+        rows = np.arange(actions.shape[1])
+        fixed_v_t = None
+        if self._pessimistic:
+            ends = ~self._next_likely[rows, next_actions]
+            fixed_v_t = torch.from_numpy(np.where(ends, self.low_value, np.nan).astype(np.float32))
+        values = np.zeros(actions.shape)
+        for held_out in range(FOLDS):
+            judged = self._fold == held_out
+            training = self._buffer.with_weights((~judged).astype(np.float64))
+            seeds = [self._seed + held_out] * len(actions)
+            learner = FQE(self._config, training, seeds, torch.from_numpy(pi_t), fixed_v_t)
+            for _ in range(self._config.updates):
+                learner.update()
+                on_update()
+            q = learner.values(next_states=False).numpy()
+            v = np.take_along_axis(q, actions[:, :, None], 2)[:, :, 0]
+            values[:, judged] = v[:, judged]
+        if self._pessimistic:
+            values[~self._likely[rows, actions]] = self.low_value
+        return values
+
+    def _evidence(self, policy: Actor, actions: NDArray[np.int64], values: Floats) -> Evidence:
+        rows = np.arange(len(actions))
+        own_value, bellman_error = self._own_values(policy)
+        return Evidence(
+            first_value=float(values[self._first].mean()),
+            mean_value=float(values.mean()),
+            support=float(self._likely[rows, actions].mean()),
+            agreement=float((actions == self._buffer.actions.numpy()).mean()),
+            own_value=own_value,
+            bellman_error=bellman_error,
+        )
+
+    def _own_values(self, policy: Actor) -> tuple[float | None, float | None]:
+        """Return the policy's own mean value of first states, and its relative Bellman error."""
+        try:
+            q, q_t = (
+                by_rows(policy.q_values, observations)
+                for observations in (self._dataset.observations, self._dataset.next_observations)
+            )
+        except PolicyError:
+            return None, None
+        rewards, discounts = self._buffer.returns.numpy()
+        taken = q[np.arange(len(q)), self._buffer.actions.numpy()]
+        error = rewards + discounts * q_t.max(1) - taken
+        spread = max(float(taken.std()), 1e-12)
+        return float(q[self._first].max(1).mean()), float(np.sqrt((error**2).mean())) / spread
+
+
+def _likely(probabilities: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+    """Return whether actions (N, A) are at least `LIKELY` times as likely as the most likely."""
+    likely: NDArray[np.bool_] = probabilities >= LIKELY * probabilities.max(1, keepdims=True)
+    return likely

@@ -1,0 +1,60 @@
+"""Help texts: every command is listed, has examples that parse, and its settings are grouped."""
+
+from __future__ import annotations
+
+import shlex
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from mcaprl.cli import cli
+from mcaprl.cli.help import EXAMPLES, SECTIONS
+
+TOP = click.Context(cli, info_name="mcaprl")
+LINES = [(name, line) for name, lines in EXAMPLES.items() for line in lines]
+
+
+def help_of(*arguments: str) -> str:
+    """Return the help at 80 columns."""
+    result = CliRunner().invoke(cli, [*arguments, "--help"], terminal_width=80)
+    assert result.exit_code == 0
+    return result.output
+
+
+def test_every_command_is_in_one_section_and_has_examples() -> None:
+    listed = [name for names in SECTIONS.values() for name in names]
+    assert sorted(listed) == sorted(cli.commands) == sorted(EXAMPLES)
+
+
+@pytest.mark.parametrize(("name", "line"), LINES)
+def test_an_example_is_a_valid_command_line(name: str, line: str) -> None:
+    program, command, *arguments = shlex.split(line)
+    assert (program, command) == ("mcaprl", name)
+    found = cli.get_command(TOP, name)
+    assert found is not None
+    found.make_context(name, arguments, parent=TOP)
+    assert line in help_of(name)
+
+
+def test_summaries_are_not_cut_and_lines_fit() -> None:
+    text = help_of()
+    for name, command in cli.commands.items():
+        summary = " ".join((command.help or "").split("\n\n")[0].split())
+        assert summary.split(". ")[0].removesuffix(".") in " ".join(text.split()), name
+    for output in (text, *(help_of(name) for name in cli.commands)):
+        shown = output.split("Examples:")[0]
+        assert max(map(len, shown.splitlines())) <= 80
+
+
+def test_settings_are_listed_with_the_algorithms_that_have_them() -> None:
+    text = help_of("train-offline")
+    sections = {part.split(":")[0]: part for part in text.split("\nSettings of ")[1:]}
+    assert "--updates" in sections["all algorithms"]
+    assert "--expectile" in sections["iql"]
+    assert "--gamma" in sections["dqn, double-dqn, cql, bcq, iql"]
+    assert "--dueling" in sections["dqn, double-dqn, cql, bcq"]
+    assert "--gamma" not in sections["all algorithms"]
+    online = help_of("train-online")
+    assert "Settings of dqn, double-dqn:" in online
+    assert "Settings of ppo:" in online
