@@ -32,7 +32,7 @@ def tables(folder: Path) -> list[Table]:
             lambda: mcaprl.merge(halves, out / "log.mcap"),
         ),
         _table(
-            f"Filtering a log, {size}: all but one episode",
+            f"Filtering a log, {size}: keep all episodes but one",
             out,
             [log],
             lambda: mcaprl.filter("episode != 700", log, out / "log.mcap"),

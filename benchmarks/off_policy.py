@@ -38,7 +38,8 @@ SCOPE_RL_NAMES: Final = {
 }
 """Names of the estimators in SCOPE-RL.
 
-WDR is missing: SCOPE-RL's self-normalized DR differs, because it does not normalize V's weights.
+WDR is missing: SCOPE-RL's self-normalized DR does not normalize the importance weights of V, so it
+is another estimator.
 """
 
 

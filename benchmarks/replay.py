@@ -1,9 +1,9 @@
-"""Measure what long logs cost a viewer: chunks, index, and the memory of our player for a seek.
+"""Measure chunk sizes and index sizes of long logs, and the memory of our player for a seek.
 
     python benchmarks/replay.py
 
-Creates two logs in a temporary folder: a million steps without a scene, and an hour of the lane sim
-with one.
+Creates two logs in a temporary folder: one of a million steps without a scene, and one of an hour
+of the lane sim with a scene.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Constant(gym.Env[Any, Any]):
         return self.observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Return the same observation."""
+        """Return the same observation at every step."""
         self.step_number += 1
         return self.observation, 1.0, False, self.step_number == self.episode_steps, {}
 

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 )
 @origin_option
 @click.option("--verify", "verifies", is_flag=True, help="Compare each step with the sim.")
-@click.option("--video", type=click.Path(path_type=Path), help="Video to write: .mp4 or .gif.")
-@click.option("--contact-sheet", type=click.Path(path_type=Path), help="Image to write: .png.")
+@click.option("--video", type=click.Path(path_type=Path), help="Video to write, .mp4 or .gif.")
+@click.option("--contact-sheet", type=click.Path(path_type=Path), help="PNG image to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing video or image.")
 @click.option("--sim", help="Sim to step instead of the logged one.")
 @trust_option

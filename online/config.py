@@ -63,7 +63,7 @@ class DQNConfig(OnlineConfig):
     target_update_interval: int = 10_000
     """environment steps between two updates of the target network"""
     target_update_episodes: int = 0
-    """episodes between two updates of the target network; 0 counts steps instead"""
+    """episodes between two updates of the target network; 0 selects an interval in steps"""
     n_steps: int = 1
     """number of rewards in a target before the bootstrap value"""
     exploration_fraction: float = 0.1

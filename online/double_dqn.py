@@ -41,10 +41,12 @@ class WarmDQN(DQN):
 
 
 class DoubleDQN(WarmDQN):
-    """SB3's DQN with the Double DQN target; its `.zip` files also load as `DQN`.
+    """SB3's DQN with the Double DQN target and, optionally, CQL's penalty.
+
+    Its `.zip` files also load as `DQN`.
 
     Attributes:
-        alpha: Weight of CQL's penalty on actions that are not in the replay buffer.
+        alpha: Weight of CQL's penalty on actions that are not in the replay buffer; 0 disables it.
     """
 
     alpha = 0.0

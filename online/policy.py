@@ -50,7 +50,7 @@ _POLICY_TYPES: Final[dict[str, tuple[type[BasePolicy], ...]]] = {
     "q-network": (DQNPolicy, CnnPolicy, MultiInputPolicy),
     "actor-critic": (ActorCriticPolicy, ActorCriticCnnPolicy, MultiInputActorCriticPolicy),
 }
-"""SB3's classes for vectors, images and dicts; files cannot select other classes."""
+"""SB3's policy classes for vectors, images and dicts; a file that names another is refused."""
 _ACTIVATIONS: Final[dict[str, type[torch.nn.Module]]] = {
     "ReLU": torch.nn.ReLU,
     "Tanh": torch.nn.Tanh,
@@ -64,14 +64,14 @@ class OnlinePolicy:
     """Trained policy with NumPy inputs and outputs, for B observations and A actions.
 
     Attributes:
-        name: Name of the file, or of the folders of the run and the seed.
+        name: Name of the file or, for a policy in a run folder, RUN/seed-K.
         algo: Name of the algorithm that trained it.
         observation_space: Space of one observation; None if the file lacks its bounds.
         action_space: Space of one action.
         env_id: Gymnasium id of the training environment; empty if unknown.
         env_kwargs: Arguments of that environment.
         frame_stack: Number of successive observations that the network receives; see `act`.
-        network: Policy of SB3.
+        network: SB3's policy object.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Topics of MCAP files from any program."""
+"""Topics of MCAP files, whichever program wrote them."""
 
 from __future__ import annotations
 

@@ -208,7 +208,7 @@ def only(
 
 
 def _uniform_indexes(chunk: memoryview) -> dict[int, NDArray[Any]] | None:
-    """Return the indexes of a chunk if all records are messages of equal length, else None."""
+    """Return the message indexes of a chunk of messages of equal length; None for others."""
     if len(chunk) < MESSAGE_HEADER.itemsize or chunk[0] != Opcode.MESSAGE:
         return None
     size = RECORD_HEADER_BYTES + RECORD_HEADER.unpack_from(chunk)[1]

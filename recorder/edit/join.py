@@ -205,7 +205,7 @@ def _leave_out_repeated(logs: Sequence[FinishedLog], sources: Sequence[Source]) 
 
 
 def _repeated(source: Source, other: Source) -> dict[int, Times]:
-    """Return log_times of the messages of `other` that `source` also has, by channel of `other`."""
+    """Return the log times of messages that are in both sources, by the channel id in `other`."""
     by_new = {new: old for old, new in source.ids.items()}
     found = {}
     for old, new in other.ids.items():

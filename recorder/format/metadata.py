@@ -46,7 +46,7 @@ from mcaprl.texts import encodable
 
 FORMAT_VERSION = "1"
 ESTIMATED = "estimated"
-# A plot of more actions than this is not readable if their names are only numbers.
+# With more actions than this, a plot that labels them by numbers is not readable.
 MAX_NUMBERED_ACTIONS = 1_000
 METADATA_NAME = "mcaprl.dataset"
 # All recordings in one file have equal values of these fields. The other fields describe the first

@@ -11,7 +11,7 @@ from mcaprl.errors import LogError
 from mcaprl.recorder.bags.bag import Bag, TopicInfo
 
 _NS_PER_S = 1e9
-# Words in the names of topics and types that are probably commands.
+# Words in the name of a topic or type which suggest that it carries commands.
 _COMMAND_WORDS = ("cmd", "command", "action", "target", "setpoint", "ackermann", "control")
 _MAX_RATE_HZ, _MIN_RATE_HZ = 20.0, 1.0
 _MAX_OBSERVED = 12

@@ -199,7 +199,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
             else:
                 self._observe(values)
         except BaseException:
-            # The log may lack the last step of the environments, so no episode can continue.
+            # The environments may have made a step that the log lacks, so all episodes end here.
             self._interrupt(self._every)
             raise
         return observations, rewards, terminated, truncated, infos
@@ -220,7 +220,7 @@ class RecordVecMcap(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
         probs = np.asarray(self.behavior_probs, np.float32)
         if probs.shape not in ((), steps.shape):
             raise SpaceError(f"behavior_probs has shape {probs.shape}, expected {steps.shape}")
-        # An environment that resets itself takes no action, so its entry of `probs` is not checked.
+        # An environment that is reset in this step ignores its action, so its entry is not checked.
         for number in np.flatnonzero(is_impossible(probs) & self._running):
             prob = float(np.broadcast_to(self.behavior_probs, steps.shape)[number])
             check_probability(prob, f"behavior_probs[{number}]")

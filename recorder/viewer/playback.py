@@ -114,7 +114,7 @@ class _Place(NamedTuple):
 
 
 class _TopicIndex:
-    """The message ranges of one channel, each sorted by time."""
+    """Index of one channel's messages: those of each chunk, sorted by time."""
 
     def __init__(self, reader: McapReader, channel: Channel) -> None:
         self.channel = channel

@@ -120,18 +120,47 @@ def evaluate(
     results = []
     for policy in policies:
         on_policy(name if policy is None or len(policies) == 1 else policy.name)
-        if envs is not None and policy is not None:
-            seeds = [episode_seed(seed, episode) for episode in range(episodes)]
-            results.append(tuple(batch_rollout(envs, policy, seeds, on_episode)))
-            continue
-        behavior = EpsilonGreedy(policy, 0.0, env.action_space)
         results.append(
-            tuple(rollout(env, behavior, seed=seed, episodes=episodes, on_episode=on_episode))
+            greedy_episodes(
+                env, policy, episodes=episodes, seed=seed, envs=envs, on_episode=on_episode
+            )
         )
+    return score_of(name, results, env)
+
+
+def greedy_episodes(
+    env: gym.Env[Any, Any],
+    policy: Policy | None,
+    *,
+    episodes: int,
+    seed: int,
+    first_episode: int = 0,
+    envs: gym.vector.VectorEnv[Any, Any, Any] | None = None,
+    on_episode: Callable[[EpisodeResult], None] | None = None,
+) -> list[EpisodeResult]:
+    """Run episodes of one policy greedily; arguments as for `evaluate` and `rollout`."""
+    if envs is not None and policy is not None:
+        numbers = range(first_episode, first_episode + episodes)
+        seeds = [episode_seed(seed, episode) for episode in numbers]
+        return batch_rollout(envs, policy, seeds, on_episode)
+    return rollout(
+        env,
+        EpsilonGreedy(policy, 0.0, env.action_space),
+        seed=seed,
+        episodes=episodes,
+        first_episode=first_episode,
+        on_episode=on_episode,
+    )
+
+
+def score_of(
+    name: str, results: Sequence[Sequence[EpisodeResult]], env: gym.Env[Any, Any]
+) -> PolicyScore:
+    """Return the score of a policy, given the episodes of each of its training seeds."""
     returns = np.array([[episode.total_reward for episode in one] for one in results])
     return PolicyScore(
         name,
-        tuple(results),
+        tuple(map(tuple, results)),
         float(returns.mean()),
         mean_interval(returns),
         successes=getattr(env.unwrapped, "success_reasons", None),

@@ -98,7 +98,7 @@ class EpsilonGreedy:
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Return the seed of an episode, which depends only on the two arguments."""
+    """Return the seed of an episode; it depends only on the base seed and the episode's number."""
     return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
 
 

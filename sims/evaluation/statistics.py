@@ -74,9 +74,9 @@ def mean_interval(returns: Floats, *, seed: int = 0) -> tuple[float, float]:
 
     With several seeds, the result combines two intervals: the interval of Student's t for the means
     of the seeds, which covers the variation between seeds; and the bootstrap-t interval for the
-    means of the starts, which covers the variation between starts. On each side, the distance
-    of the limit from the mean is the root of the sum of the squares of the corresponding
-    distances of the two intervals.
+    means of the starts, which covers the variation between starts. If the lower
+    limits of the two intervals are a and b below the mean, the lower limit of the result is
+    sqrt(a^2 + b^2) below the mean. The upper limit is computed in the same way.
 
     Args:
         returns: (S, E) returns.

@@ -203,7 +203,7 @@ class HighwayLaneEnv(RenderedEnv[FollowView]):
 
     @property
     def course(self) -> Course:
-        """Course of the car's lane."""
+        """Center line of the car's lane."""
         return self.courses[self._lane]
 
     @property

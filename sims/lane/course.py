@@ -64,7 +64,10 @@ class Box(NamedTuple):
 
 
 def streets() -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return both ends (2,) of each leg, meters; the leg that both squares share occurs once."""
+    """Return the start point and the end point of each leg, (2,) each, meters.
+
+    The leg that belongs to both squares of the course is listed once.
+    """
     legs = {tuple(sorted(ends)) for ends in itertools.pairwise(CORNERS_M)}
     return [(np.array(start), np.array(end)) for start, end in sorted(legs)]
 

@@ -28,9 +28,9 @@ NO_BARRIERS = 0
 WORLDS_M: NDArray[np.float64] = np.array(
     [_boxes_m(_FAR_AWAY, _FAR_AWAY), *(_boxes_m(*closed) for closed in barriers())]
 )
-"""(3, K, 4) x and y of the center of each obstacle, and half of its size along x and y. The index
-of the first axis is 0 without barriers, 1 with the barriers for a car on the first square, and 2
-with the barriers for a car on the second square."""
+"""(3, K, 4) three sets of K obstacles: x and y of the center, and half of the size along x and y.
+Set 0 has no barriers. The course consists of two squares; set 1 has the barriers for a car on the
+first square, and set 2 those for a car on the second square."""
 _LENGTH_M = COURSE.length_m
 _HUGE = 1e12
 """Finite replacement for 1 / 0."""

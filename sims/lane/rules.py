@@ -135,7 +135,7 @@ def wheel_angle(steering: float, speed_m_s: float) -> float:
 
 @inlined
 def located(motion: Motion, steering: float, near_m: float, slow_s: float) -> Car:
-    """Return the car with this motion; search near `near_m` for its position along the path."""
+    """Return the state of the car after a motion; its position along the path is near `near_m`."""
     place = course_project(motion.x_m, motion.y_m, near_m - BACK_M, near_m + AHEAD_M)
     return Car(
         motion.x_m,

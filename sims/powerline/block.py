@@ -25,9 +25,9 @@ from mcaprl.sims.powerline.quadrotor import (
 )
 
 LANES = 8
-"""Number of drones in a block."""
+"""Number of drones in a block, whose states one loop computes together."""
 _MIN_BLOCK = 3
-"""Minimum number of drones for which a block is faster than single drones."""
+"""Minimum number of drones that are computed faster as a block than one by one."""
 _COMMAND, _WIND = DRONE_SIZE * LANES, (DRONE_SIZE + 3) * LANES
 _BLOCK_NUMBERS = DRONE_SIZE + 6
 """Number of values per drone in a block: state, command and wind."""
