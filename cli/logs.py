@@ -10,6 +10,7 @@ import click
 import mcaprl
 from mcaprl.cli.options import integer_option, json_option, mapping_options, trust_option
 from mcaprl.cli.show import echo, print_facts, print_json, print_problems
+from mcaprl.page import PAGE_NAME
 from mcaprl.progress import terminal_bar
 from mcaprl.texts import counted
 
@@ -40,6 +41,8 @@ def info(
         print_facts(found.title, rows)
         for moment in found.moments:
             echo(moment)
+        if report is not None:
+            echo(f"report: {report / PAGE_NAME}")
     return int(strict and bool(found.problems))
 
 

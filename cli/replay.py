@@ -58,6 +58,8 @@ def replay(
 
     Several files play side by side: all start at the same time, each with its own topic prefix.
     """
+    if verifies and (video or contact_sheet):
+        raise UsageError("--verify writes no video or image: run replay once for each")
     if verifies:
         same = [_verify(path, episode, sim, trust_env) for path in find_logs(files)]
         return int(not all(same))

@@ -17,6 +17,8 @@ from mcaprl.figures import to_svg
 from mcaprl.files import write_atomically
 from mcaprl.texts import encodable
 
+PAGE_NAME = "index.html"
+"""Name of the page in the folder of a report."""
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*( to [-+]?\d[\d.,]*)?( [%a-zA-Z]{1,3})?")
 
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from mcaprl.errors import SpaceError, UnknownNameError
+from mcaprl.errors import SpaceError, UnknownNameError, UsageError
 from mcaprl.networks import Architecture
 from mcaprl.online.config import (
     A2CConfig,
@@ -135,9 +135,11 @@ def own_architecture(config: OnlineConfig, space: spaces.Space[Any]) -> Architec
 def _arguments(config: OnlineConfig, space: spaces.Space[Any]) -> dict[str, Any]:
     """Return SB3's constructor arguments; DQN on images or stacks gets a `FrameReplayBuffer`."""
     arguments = config.arguments()
+    if getattr(config, "image_shift", 0) and not _has_images(space):
+        raise UsageError("image_shift is for images, but the observations have none")
     if isinstance(config, DQNConfig) and (config.frame_stack > 1 or _has_images(space)):
         extra = {"n_steps": arguments.pop("n_steps"), "gamma": config.gamma}
-        extra["frame_stack"] = config.frame_stack
+        extra |= {"frame_stack": config.frame_stack, "image_shift": config.image_shift}
         architecture = own_architecture(config, space)
         if architecture is not None:
             extra["pools"] = pools_of(channels_first(space), architecture)

@@ -76,6 +76,8 @@ class DQNConfig(OnlineConfig):
     """factor on epsilon at each step; 0 selects the linear decay"""
     dueling: bool = False
     """learn the value of a state separately from the advantages of its actions"""
+    image_shift: int = 0
+    """largest random shift of the images in a batch, in pixels of the network's input"""
 
     def __post_init__(self) -> None:
         """Validate the settings."""
@@ -85,6 +87,7 @@ class DQNConfig(OnlineConfig):
         )
         self._require("buffer_size", self.buffer_size >= self.envs, f"at least envs ({self.envs})")
         self._require("learning_starts", self.learning_starts >= 0, "at least 0")
+        self._require("image_shift", self.image_shift >= 0, "at least 0")
         self._require("target_update_episodes", self.target_update_episodes >= 0, "at least 0")
         self._require_fraction("exploration_fraction", "exploration_initial_eps")
         self._require_fraction("exploration_final_eps", "exploration_decay")

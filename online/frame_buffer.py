@@ -5,6 +5,9 @@ of the following step: 7 GB for 500,000 depth images of 84x84. Here, the next ob
 from the following row, and only the last observation of an episode is stored separately. Each frame
 of stacked observations is also stored once, and images may be stored at the smaller size to which
 the network averages them.
+
+The images of a batch may be shifted at random, which keeps a network from learning single images by
+heart ("Image Augmentation Is All You Need", https://arxiv.org/abs/2004.13649).
 """
 
 from __future__ import annotations
@@ -57,6 +60,7 @@ class FrameReplayBuffer(BaseBuffer):
         gamma: float = 1.0,
         frame_stack: int = 1,
         pools: Mapping[str, int] | None = None,
+        image_shift: int = 0,
     ) -> None:
         """Reserve the memory; the operating system allocates it as the buffer fills.
 
@@ -71,10 +75,12 @@ class FrameReplayBuffer(BaseBuffer):
             gamma: Discount per step.
             frame_stack: k, the number of successive frames in an observation.
             pools: Factor by which the images of each key are averaged when they are stored.
+            image_shift: Largest shift of the images in a batch, in pixels of the stored size.
         """
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
         self.buffer_size = rows = max(buffer_size // n_envs, 1)
         self.n_steps, self.gamma, self.frame_stack = n_steps, gamma, frame_stack
+        self._image_shift = image_shift
         self._pools = {key: pool for key, pool in (pools or {}).items() if pool > 1}
         frames = parts_of_space(_frame_space(observation_space, frame_stack))
         parts = {
@@ -170,9 +176,9 @@ class FrameReplayBuffer(BaseBuffer):
         rows, returns, discounts = self._look_ahead(batch_inds, envs)
         terminated = self.dones[rows, envs] * (1 - self.timeouts[rows, envs])
         samples = (
-            self._tensors(self._stacks(batch_inds, envs)),
+            self._tensors(self._shifted(self._stacks(batch_inds, envs))),
             self.to_torch(self.actions[batch_inds, envs]),
-            self._tensors(self._following(rows, envs)),
+            self._tensors(self._shifted(self._following(rows, envs))),
             self.to_torch(terminated[:, None]),
             self.to_torch(returns[:, None]),
             self.to_torch(discounts[:, None]) if self.n_steps > 1 else None,
@@ -180,6 +186,19 @@ class FrameReplayBuffer(BaseBuffer):
         if WHOLE in self.frames:
             return ReplayBufferSamples(*samples)
         return DictReplayBufferSamples(*samples)
+
+    def _shifted(self, parts: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return observations whose images (B, channels, height, width) are shifted at random.
+
+        All images have the same shift; the pixels at the edge fill the gap.
+        """
+        if not self._image_shift:
+            return parts
+        most = self._image_shift
+        shift = np.random.randint(-most, most + 1, size=2)  # noqa: NPY002
+        return {
+            key: shifted(part, *shift) if part.ndim == 4 else part for key, part in parts.items()
+        }
 
     def _look_ahead(
         self, rows: NDArray[Any], envs: NDArray[Any]
@@ -267,6 +286,14 @@ class FrameReplayBuffer(BaseBuffer):
     def _tensors(self, parts: dict[str, NDArray[Any]]) -> Any:
         tensors = {key: self.to_torch(part, copy=False) for key, part in parts.items()}
         return whole_of(tensors)
+
+
+def shifted(images: NDArray[Any], down: int, right: int) -> NDArray[Any]:
+    """Return images (..., height, width) shifted by pixels; the edge is repeated in the gap."""
+    height, width = images.shape[-2:]
+    rows = np.clip(np.arange(height) - down, 0, height - 1)
+    columns = np.clip(np.arange(width) - right, 0, width - 1)
+    return images.take(rows, -2).take(columns, -1)
 
 
 def _pooled(images: NDArray[np.uint8], pool: int) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ from mcaprl.api.data import MappingFile, Paths, mapped, open_data
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import LogError, OutputExistsError, ReportError, UsageError, import_extra
 from mcaprl.files import size_of, write_json
+from mcaprl.page import PAGE_NAME
 from mcaprl.problem import Problem
 from mcaprl.recorder.dataset.calibration import Calibration, calibration
 from mcaprl.recorder.dataset.dataset import Dataset
@@ -48,8 +49,8 @@ class LogInfo:
         observations: Observation space.
         actions: Action space.
         action_counts: Number of times each action was taken, by its name.
-        behavior_prob: Number of actions, estimated as the mean of 1 / `behavior_prob`, to compare
-            with the action space; None if unknown.
+        behavior_prob: Mean of 1 / `behavior_prob`, which estimates the number of actions, and the
+            number of actions in the action space; None if unknown.
         behavior_estimated: Whether `behavior_prob` was estimated, not logged by the policy.
         policies: Names of the policies that acted.
         ends: Number of episodes by the reason of their end.
@@ -161,7 +162,7 @@ def info(
         folder = Path(report)
         write_json(folder / "dataset.json", found.to_json(), ReportError)
         dataset_figure(folder / "dataset.png", dataset, found.title)
-        dataset_page(folder / "index.html", dataset, found.title, found.rows(), found.findings)
+        dataset_page(folder / PAGE_NAME, dataset, found.title, found.rows(), found.findings)
     return found
 
 
@@ -239,9 +240,9 @@ def check(
 ) -> CheckResult:
     """Read logs completely; validate structure, CRCs, indexes, episodes and metadata.
 
-    With a mapping, the bag is read by the mapping. A problem is reported if many steps have missing
-    or outdated values, are in episodes that are too short, or have commands far from every named
-    action.
+    With a mapping, the bag is read by the mapping. Possible problems are then missing or outdated
+    values, commands that are far from every named action, and episodes that are too short. They are
+    reported only if they affect many steps.
 
     Args:
         data: File, folder or glob of logs, or several of them. A path without logs is

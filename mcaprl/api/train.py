@@ -65,8 +65,8 @@ def train(
         resume: Whether training continues from the checkpoints in `out`.
         follow: Whether episodes that another process adds to the logs meanwhile are also used.
         other_data: Whether `resume` accepts checkpoints trained on other data.
-        mapping: Mapping of a ROS bag or another log, see `open`; the mapping is copied to `out`.
-            With a mapping, paths cannot have weights such as `:2`.
+        mapping: Mapping of another robot's bag; see `open`. The mapping is copied to `out`. With a
+            mapping, paths cannot have weights such as `:2`.
         trust_code: Whether the mapping may name a Python function.
         on_data: Function called with the algorithm and the dataset before the first update.
         progress: Function called with each row of metrics.
@@ -97,7 +97,12 @@ def train(
     out = Path(out)
     if resume:
         earlier = run_to_resume(out)
-        algo = algo or earlier.get("algo")
+        was = earlier.get("algo", algo)
+        if algo not in (None, was):
+            raise UsageError(
+                f"{out} is a run of {was}: resume it without algo, or choose another folder"
+            )
+        algo = was
         settings = {**settings_from_json(earlier.get("config")), **settings}
     algo = algo or "cql"
     _, defaults = choose_algorithm(algo)
@@ -251,7 +256,10 @@ def train_online(
 
 
 def _experience(sources: list[str]) -> tuple[Dataset | None, list[TrainedPolicy] | None]:
-    """Return the logs in `sources` as one dataset, and the policies of its run; None if absent."""
+    """Return the dataset of the logs in `sources`, and the policies of the run in `sources`.
+
+    The dataset is None if there are no logs, and the list of policies is None if there is no run.
+    """
     policies = [source for source in sources if is_policy(Path(source))]
     if len(policies) > 1:
         raise UsageError(f"pass at most one policy to start from, not {' and '.join(policies)}")

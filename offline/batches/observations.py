@@ -241,4 +241,5 @@ def _check_shape(leaf: Leaf, observations: Any) -> None:
     if len(got) == 0 or got[1:] != leaf.shape:
         wanted = ", ".join(map(str, ("B", *leaf.shape)))
         where = f" of {'.'.join(leaf.path)}" if leaf.path else ""
-        raise SpaceError(f"expects observations ({wanted}){where}, got {got}")
+        hint = "; add an axis to a single one: observation[None]" if got == leaf.shape else ""
+        raise SpaceError(f"expects observations ({wanted}){where}, got {got}{hint}")

@@ -88,6 +88,9 @@ def describe_seeds(summaries: Sequence[OfflineSummary]) -> list[str]:
     lines = []
     for summary in summaries:
         done = summary.steps - summary.resumed_at
+        if not done:
+            lines.append(f"{summary.folder}: finished before, with {summary.steps} updates")
+            continue
         rate = done / summary.seconds if summary.seconds else 0.0
         terms = ", ".join(f"{name} {value:.4g}" for name, value in summary.terms.items())
         lines.append(f"{summary.folder}: {done} updates, {rate:.0f} per second; {terms}")

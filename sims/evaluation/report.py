@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mcaprl.figures import COLORS, INK, PALE, new_figure, save_png, tick_labels, to_svg
-from mcaprl.page import Card, Figure, Section, Table, write_page
+from mcaprl.page import PAGE_NAME, Card, Figure, Section, Table, write_page
 from mcaprl.sims.drawing.scene import Shape
 from mcaprl.sims.drawing.top_view import patches
 from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore
@@ -180,7 +180,7 @@ def evaluation_page(
     if curves:
         sections.append(Section("Learning curves", figures=curves))
     episodes = sum(score.returns.size for score in scores)
-    write_page(folder / "index.html", title, f"{episodes} episodes, greedy actions", sections)
+    write_page(folder / PAGE_NAME, title, f"{episodes} episodes, greedy actions", sections)
 
 
 def _score_table(scores: Sequence[PolicyScore]) -> Table:

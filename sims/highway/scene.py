@@ -63,6 +63,7 @@ def static_shapes(network: Any, courses: Sequence[Course]) -> tuple[Shape, ...]:
 
     Args:
         network: A `highway_env.road.road.RoadNetwork`.
+        courses: Center lines of the lanes.
     """
     points_m = np.concatenate([course.points_m for course in courses])
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 
-from mcaprl.online.frame_buffer import FrameReplayBuffer
+from mcaprl.errors import UsageError
+from mcaprl.online import Agent, Scale, Task
+from mcaprl.online.frame_buffer import FrameReplayBuffer, shifted
 from mcaprl.online.frames import FrameMemory, stacked_space
 
 IMAGE = spaces.Box(0, 255, (1, 6, 6), np.uint8)
@@ -203,3 +207,41 @@ def test_images_are_stored_at_the_networks_size(frame_stack: int) -> None:
         else:
             expected = other
         np.testing.assert_array_equal(mine, expected)
+
+
+def test_a_shift_repeats_the_edge() -> None:
+    image = np.arange(9).reshape(1, 1, 3, 3)
+    assert shifted(image, 1, 0)[0, 0].tolist() == [[0, 1, 2], [0, 1, 2], [3, 4, 5]]
+    assert shifted(image, 0, -2)[0, 0].tolist() == [[2, 2, 2], [5, 5, 5], [8, 8, 8]]
+
+
+def test_all_images_of_a_batch_are_shifted_alike_and_vectors_are_not() -> None:
+    plain = FrameReplayBuffer(40, DICT, ACTIONS, "cpu", 2)
+    moved = FrameReplayBuffer(40, DICT, ACTIONS, "cpu", 2, image_shift=2)
+    feed([plain, moved], DICT, 30, 2, 0)
+    rows = np.arange(10)
+    shifts = set()
+    for seed in range(60):
+        np.random.seed(seed)  # noqa: NPY002
+        expected = plain._get_samples(rows).observations
+        np.random.seed(seed)  # noqa: NPY002
+        found = moved._get_samples(rows).observations
+        for key, part in expected.items():
+            if part.ndim != 4:
+                assert torch.equal(found[key], part)
+                continue
+            same = [
+                (down, right)
+                for down in range(-2, 3)
+                for right in range(-2, 3)
+                if np.array_equal(found[key].numpy(), shifted(part.numpy(), down, right))
+            ]
+            assert len(same) == 1
+            shifts.add(same[0])
+    assert {down for down, _ in shifts} == {right for _, right in shifts} == set(range(-2, 3))
+
+
+def test_a_shift_needs_images(tmp_path: Path) -> None:
+    task = Task.for_sim("lane", steps=20, image_shift=2)
+    with pytest.raises(UsageError, match="image_shift is for images"):
+        Agent(task, "lane", tmp_path, 0, Scale(0.0, 1.0))

@@ -1,0 +1,73 @@
+"""What commands print about their reports, logs and finished runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mcaprl
+from mcaprl import cli
+from mcaprl.errors import PolicyError
+from mcaprl.recorder.dataset.dataset import Dataset
+from tests.support.offline_tasks import corridor
+
+SMALL = ["--updates", "3", "--batch-size", "4", "--hidden", "4", "--gamma", "0.5"]
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    dataset: Dataset = corridor()
+    dataset.save(tmp_path / "corridor.mcap")
+    return tmp_path / "corridor.mcap"
+
+
+def test_the_package_can_be_run_as_a_module() -> None:
+    command = [sys.executable, "-m", "mcaprl", "--version"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert printed.stdout == f"mcaprl {mcaprl.__version__}\n"
+
+
+def test_info_names_its_page(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra report")
+    folder = data.parent / "report"
+    assert cli.run(["info", str(data), "--report", str(folder)]) == 0
+    page = folder / "index.html"
+    assert page.is_file()
+    assert f"report: {page}" in capsys.readouterr().out
+
+
+def test_resuming_a_finished_run_says_so(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = data.parent / "run"
+    assert cli.run(["train-offline", str(data), "--out", str(run), *SMALL]) == 0
+    capsys.readouterr()
+    assert cli.run(["train-offline", str(data), "--out", str(run), "--resume"]) == 0
+    assert f"{run / 'seed-0'}: finished before, with 3 updates" in capsys.readouterr().out
+
+
+def test_resuming_with_another_algorithm_is_refused(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = data.parent / "run"
+    assert cli.run(["train-offline", str(data), "--out", str(run), *SMALL]) == 0
+    assert cli.run(["train-offline", str(data), "--out", str(run), "--resume", "--algo", "bc"]) == 2
+    assert f"{run} is a run of cql: resume it without algo" in capsys.readouterr().err
+
+
+def test_a_comparison_and_a_video_are_not_made_together(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["replay", str(data), "--verify", "--video", "x.mp4"]) != 0
+    assert "--verify writes no video or image" in capsys.readouterr().err
+
+
+def test_one_observation_without_an_axis_is_refused_with_a_hint(data: Path) -> None:
+    run = data.parent / "run"
+    assert cli.run(["train-offline", str(data), "--out", str(run), *SMALL]) == 0
+    policy = mcaprl.load_policy(run)
+    one = mcaprl.open(data).observations[0]
+    with pytest.raises(PolicyError, match=r"got \(5,\); add an axis .* observation\[None\]"):
+        policy.act(one)
+    assert policy.act(one[None]).shape == (1,)
