@@ -29,8 +29,7 @@ from benchmarks.sim_data import NAMES, make_logs
 from benchmarks.sim_grid import SETTINGS, normalize_mean, run, settings_of
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
-from mcaprl.offline import train
-from mcaprl.offline.estimate.evidence import EvidenceCollector, fqe_config
+from mcaprl.offline import EvidenceCollector, fqe_config, train
 from mcaprl.sims import make_pilot, make_sim
 
 CANDIDATES: Final[dict[str, tuple[str, dict[str, Any]]]] = {

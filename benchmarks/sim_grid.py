@@ -27,8 +27,7 @@ from benchmarks.page import write_section
 from benchmarks.sim_data import NAMES, make_logs
 from mcaprl.api import load_policies
 from mcaprl.files import write_json
-from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, train
-from mcaprl.offline.algorithms.config import TrainingConfig
+from mcaprl.offline import ALGORITHMS, BootstrapConfig, DQNConfig, TrainingConfig, train
 from mcaprl.sims import Policy, PolicyScore, evaluate, make_pilot, make_sim, make_sims, normalize
 
 SEEDS, EPISODES, EPISODE_SEED = 4, 30, 1_000_000

@@ -29,11 +29,14 @@ __all__ = [
     "DQNConfig",
     "DoubleDQN",
     "EpisodeTable",
+    "EvidenceCollector",
     "FQEConfig",
     "Learner",
     "OffPolicyEvaluator",
     "Scores",
+    "TrainingConfig",
     "TransitionBuffer",
+    "fqe_config",
     "train",
 ]
 
@@ -41,12 +44,13 @@ __all__ = [
 __getattr__ = lazy_attributes(
     __name__,
     {
-        "mcaprl.offline.algorithms.config": ("BootstrapConfig",),
+        "mcaprl.offline.algorithms.config": ("BootstrapConfig", "TrainingConfig"),
         "mcaprl.offline.algorithms.cql": ("CQL", "CQLConfig"),
         "mcaprl.offline.algorithms.dqn": ("DQNConfig", "DoubleDQN"),
         "mcaprl.offline.algorithms.learner": ("Learner",),
         "mcaprl.offline.algorithms.registry": ("ALGORITHMS",),
         "mcaprl.offline.batches.buffer": ("TransitionBuffer",),
+        "mcaprl.offline.estimate.evidence": ("EvidenceCollector", "fqe_config"),
         "mcaprl.offline.estimate.fqe": ("FQEConfig",),
         "mcaprl.offline.estimate.importance": ("ESTIMATORS", "EpisodeTable"),
         "mcaprl.offline.estimate.off_policy": ("OffPolicyEvaluator",),
