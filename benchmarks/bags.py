@@ -30,7 +30,7 @@ FIELDS = {
     "sensor_msgs/msg/JointState": ("position",),
     "sensor_msgs/msg/LaserScan": ("ranges",),
 }
-"""Fields to read, by message type; each type has a topic of its own, such as `/odometry`."""
+"""Fields to read, by message type; each type is on a separate topic, such as `/odometry`."""
 LIMIT_S = 300.0
 """Maximum time for reading a gigabyte, in seconds; users require at most five minutes."""
 

@@ -177,8 +177,8 @@ class EvidenceCollector:
             fixed_v_t = torch.from_numpy(np.where(ends, self.low_value, np.nan).astype(np.float32))
         values = np.zeros(actions.shape)
         for held_out in range(FOLDS):
-            judged = self._fold == held_out
-            training = self._buffer.with_weights((~judged).astype(np.float64))
+            evaluated = self._fold == held_out
+            training = self._buffer.with_weights((~evaluated).astype(np.float64))
             seeds = [self._seed + held_out] * len(actions)
             learner = FQE(self._config, training, seeds, torch.from_numpy(pi_t), fixed_v_t)
             for _ in range(self._config.updates):
@@ -186,7 +186,7 @@ class EvidenceCollector:
                 on_update()
             q = learner.values(next_states=False).numpy()
             v = np.take_along_axis(q, actions[:, :, None], 2)[:, :, 0]
-            values[:, judged] = v[:, judged]
+            values[:, evaluated] = v[:, evaluated]
         if self._pessimistic:
             values[~self._likely[rows, actions]] = self.low_value
         return values
