@@ -20,6 +20,7 @@ from mcaprl._version import __version__
 from mcaprl.cli.convert import convert
 from mcaprl.cli.edit import filter_, merge, slice_, split
 from mcaprl.cli.evaluate import evaluate
+from mcaprl.cli.help import Program
 from mcaprl.cli.logs import annotate, check, info, layout, recover
 from mcaprl.cli.record import record
 from mcaprl.cli.replay import replay
@@ -29,7 +30,10 @@ from mcaprl.cli.train_online import train_online
 from mcaprl.errors import McaprlError
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    cls=Program,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
 @click.version_option(__version__, prog_name="mcaprl", message="%(prog)s %(version)s")
 def cli() -> None:
     """Record reinforcement learning episodes as MCAP logs, learn from logs, and replay them."""
@@ -107,6 +111,7 @@ def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def _on_thread_error(arguments: threading.ExceptHookArgs) -> None:
     """Print an exception raised in a thread, unless it is an OSError."""
-    # An OSError comes from TensorBoard's writer, which raises it again in the training thread.
+    # TensorBoard's writer thread may raise an OSError. TensorBoard raises it again in the training
+    # thread, and `run` prints it.
     if not issubclass(arguments.exc_type, OSError):
         threading.__excepthook__(arguments)

@@ -17,9 +17,9 @@ from mcaprl.texts import counted
 @click.argument("paths", nargs=-1, required=True, metavar="SRC... [DST]")
 @mapping_options
 @click.option("--from", "source_format", metavar="FORMAT", help="Format of SRC if not detected.")
-@click.option("--to", metavar="FORMAT", help="Format of DST if its name does not say it.")
+@click.option("--to", metavar="FORMAT", help="Format of DST if not clear from its name.")
 @click.option("--lossy", is_flag=True, help="Convert or omit data that the format cannot store.")
-@click.option("--suggest", is_flag=True, help="Print a mapping for SRC to edit; takes no DST.")
+@click.option("--suggest", is_flag=True, help="Print a draft of a mapping for SRC; takes no DST.")
 @click.option("--dry-run", is_flag=True, help="Read SRC and write nothing; takes no DST.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--upload", metavar="URL", help="Copy the finished file to a URL.")
@@ -42,7 +42,7 @@ def convert(
     SRC is a log, a dataset of another tool, or, with --mapping, the bag of another robot: an MCAP
     file of any writer, a rosbag2 folder or database, or a ROS 1 bag. For a bag, begin with
     `mcaprl convert --suggest BAG > robot.yaml`. DST is a log if it ends with .mcap, otherwise a
-    dataset of the format --to: lerobot, minari, parquet, npz, d3rlpy or hdf5.
+    dataset in the format that --to names: lerobot, minari, parquet, npz, d3rlpy or hdf5.
     """
     if suggest:
         click.echo(mcaprl.suggest_mapping(paths), nl=False)

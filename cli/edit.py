@@ -33,7 +33,7 @@ def merge(logs: tuple[str, ...], shift: bool, overwrite: bool, as_json: bool) ->
 @click.argument("out")
 @click.option("--episodes", type=int, help="Number of episodes of each part.")
 @click.option("--ratio", metavar="A:B[:C...]", help="Relative sizes of the parts, such as 8:1:1.")
-@click.option("--seed", type=click.IntRange(0), help="Seed to assign episodes to parts at random.")
+@click.option("--seed", type=click.IntRange(0), help="Assign episodes at random with this seed.")
 @_overwrite_option
 @json_option
 def split(

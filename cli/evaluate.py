@@ -9,9 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, json_option, mapping_options, sim_options
+from mcaprl.cli.options import (
+    integer_option,
+    json_option,
+    mapping_options,
+    ray_options,
+    sim_options,
+)
 from mcaprl.cli.show import echo, print_json, print_table
 from mcaprl.errors import UsageError
+from mcaprl.page import PAGE_NAME
 from mcaprl.progress import terminal_bar
 from mcaprl.sims.evaluation.statistics import interquartile_mean
 from mcaprl.texts import counted
@@ -32,7 +39,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
 )
 @integer_option(
     "--seed",
-    "Seed of the episodes; with --data, of the model and the resampling.",
+    "Seed of the episodes; with --data, seed of the model and of the resampling.",
     least=0,
     default=1_000_000,
 )
@@ -64,6 +71,7 @@ _OF_DATA = ("gamma", "epsilon", "updates", "estimate_behavior", "threads", "mapp
 @click.option("--record", type=click.Path(path_type=Path), help="Log to write.")
 @click.option("--report", type=click.Path(path_type=Path), help="Output folder of the HTML report.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing log.")
+@ray_options
 @json_option
 def evaluate(
     policies: tuple[str, ...],
@@ -77,8 +85,9 @@ def evaluate(
     """Evaluate each POLICY on the same episodes of SIM, or estimate its return from logs.
 
     POLICY is pilot, random, or a trained run; each seed of a run is evaluated. Actions are greedy.
-    If the sim has a pilot, scores are normalized so that random scores 0 and pilot 1. With --data,
-    discounted returns are estimated, and a verdict says whether the logs suffice for the estimate.
+    If the sim has a pilot, scores are normalized: the score of random is 0, and the score of pilot
+    is 1. With --data, discounted returns are estimated, and a verdict says whether the logs suffice
+    for the estimate.
     """
     given = {name: value for name, value in others.items() if value}
     if data is not None and sim is None:
@@ -92,7 +101,14 @@ def evaluate(
         found = mcaprl.evaluate(
             policies, sim, episodes=episodes, seed=seed, progress=terminal_bar, **given
         )
-        print_json(found.to_json()) if as_json else _print_scores(found, episodes)
+        if as_json:
+            print_json(found.to_json())
+            return
+        _print_scores(found, episodes)
+        if others["report"] is not None:
+            echo(f"report: {others['report'] / PAGE_NAME}")
+        if others["record"] is not None:
+            echo(f"log: {others['record']}")
     else:
         raise UsageError("evaluate needs either --sim SIM or --data DATA")
 

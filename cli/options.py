@@ -13,7 +13,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 trust_option = click.option(
     "--trust-env",
     is_flag=True,
-    help="Trust FILE: import the module that its environment id names, and pass on all arguments.",
+    help="Trust FILE: import the module in the logged environment id, and use logged arguments.",
 )
 origin_option = click.option(
     "--allow-origin",
@@ -52,3 +52,19 @@ def integer_option(
     """Return an option for an integer from `least` to `most`; a `default` of None means `least`."""
     default, kind = least if default is None else default, click.IntRange(least, most)
     return click.option(name, default=default, show_default=True, type=kind, help=help)
+
+
+def ray_options(command: F) -> F:
+    """Add the options that run a command on a Ray cluster."""
+    flag = click.option("--ray", is_flag=True, help="Run on Ray workers; see docs/ray.md.")
+    workers = click.option(
+        "--workers",
+        type=click.IntRange(1),
+        help="With --ray: number of workers.  [default: CPUs of the cluster]",
+    )
+    address = click.option(
+        "--address",
+        metavar="HOST:PORT",
+        help="With --ray: address of the cluster.  [default: RAY_ADDRESS, or a local cluster]",
+    )
+    return flag(workers(address(command)))

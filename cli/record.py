@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 import mcaprl
-from mcaprl.cli.options import integer_option, sim_options
+from mcaprl.cli.options import integer_option, ray_options, sim_options
 from mcaprl.cli.show import echo
 from mcaprl.progress import terminal_bar
 from mcaprl.recorder.format.writing import COMPRESSIONS
@@ -58,6 +58,12 @@ from mcaprl.texts import counted, size
 )
 @click.option(
     "--upload", metavar="URL", help="Copy the finished log to a URL, such as s3://bucket/lane.mcap."
+)
+@ray_options
+@click.option(
+    "--shards",
+    type=click.IntRange(1),
+    help="With --ray: number of files that are written into the folder OUT.  [default: up to 64]",
 )
 def record(no_scene: bool, **request: Any) -> None:
     """Record episodes of SIM into an MCAP file.

@@ -22,7 +22,7 @@ from mcaprl.recorder.dataset.episode import Episode
 from mcaprl.sims import make_sim
 
 if TYPE_CHECKING:
-    from mcaprl import torch
+    from mcaprl import ray, torch
     from mcaprl.api.annotate import annotate
     from mcaprl.api.behavior import estimate_behavior
     from mcaprl.api.convert import convert, suggest_mapping
@@ -58,6 +58,7 @@ __all__ = [
     "make_sim",
     "merge",
     "open",
+    "ray",
     "record",
     "recover",
     "render",
@@ -83,6 +84,7 @@ __getattr__ = lazy_attributes(
         "mcaprl.api.policies": ["export", "load_policy"],
         "mcaprl.api.replay": ["render", "replay", "verify"],
         "mcaprl.api.train": ["train", "train_online"],
+        "mcaprl.ray": ["ray"],
         "mcaprl.torch": ["torch"],
         "mcaprl.recorder.record.wrapper": ["RecordMcap"],
         "mcaprl.recorder.record.vector_wrapper": ["RecordVecMcap"],

@@ -13,6 +13,7 @@ McaprlError
 ├── SpaceError            spaces that cannot be logged or do not agree (exit code 1)
 ├── PolicyError           a saved policy cannot be used                (exit code 1)
 ├── TrainingError         training cannot continue                     (exit code 1)
+├── ClusterError          a Ray cluster cannot be used                 (exit code 1)
 └── ReportError           a figure, video or report cannot be written  (exit code 1)
 """
 
@@ -49,7 +50,7 @@ class UnknownNameError(UsageError):
             kind: Kind of the named thing, such as `policy`.
             name: Unknown name.
             known: Known names, which the message lists.
-            others: More known names, which are only suggested if they are similar.
+            others: More known names. The message does not list them, but suggests similar ones.
         """
         names, more = sorted(known), sorted(others)
         near = difflib.get_close_matches(name, [*names, *more], n=3, cutoff=0.5)
@@ -79,7 +80,7 @@ class NotMcapError(LogError):
 
 
 class NoStepsError(LogError):
-    """The file holds no transitions: no `/rl/step` topic, or no finished episode."""
+    """The file contains no transitions: no `/rl/step` topic, or no finished episode."""
 
 
 class NoEpisodesError(NoStepsError):
@@ -100,6 +101,10 @@ class PolicyError(McaprlError):
 
 class TrainingError(McaprlError):
     """Training cannot continue."""
+
+
+class ClusterError(McaprlError):
+    """A Ray cluster cannot be reached, or its workers cannot run the task."""
 
 
 class ReportError(McaprlError):

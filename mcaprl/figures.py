@@ -73,7 +73,10 @@ def save_png(figure: Any, path: Path) -> None:
 
 
 def to_svg(figure: Any) -> str:
-    """Convert a figure to SVG with the page's colors: text color for `INK`, `--pale` for `PALE`."""
+    """Convert a figure to SVG, and replace two colors by those of the HTML page.
+
+    `INK` becomes the page's text color, and `PALE` becomes the CSS variable `--pale`.
+    """
     matplotlib = import_extra("matplotlib", "report")
     text = io.StringIO()
     _make_literal(figure)

@@ -91,7 +91,8 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     try:
         mode = path.lstat().st_mode
     except OSError:
-        # There is no file, or its folder is unreadable, which creating the file will report.
+        # There is no file, or its folder is unreadable. In the second case, creating the file
+        # fails later.
         return
     if stat.S_ISLNK(mode):
         raise OutputExistsError(f"{path} is a symbolic link: choose the path of a regular file")

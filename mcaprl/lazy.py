@@ -13,8 +13,9 @@ def lazy_attributes(package: str, sources: Mapping[str, Sequence[str]]) -> Calla
 
     Args:
         package: Name of the package.
-        sources: Public names that each module defines, by the module's full name. If a name
-            is also the module's name, as `torch` in `mcaprl.torch`, it refers to the module.
+        sources: Dict from the full name of each module to the public names that the module defines.
+            If a name is the last part of the module's own name, as `torch` in `mcaprl.torch`, the
+            name refers to the module.
     """
     modules = {name: module for module, names in sources.items() for name in names}
 

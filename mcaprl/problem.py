@@ -89,7 +89,7 @@ class Shortlist(list[F]):
         return self._counts.total()
 
     def rest(self) -> list[Problem]:
-        """Return one problem for each kind with unlisted findings; it states how many there are."""
+        """Return, for each kind with unlisted findings, a problem that states their number."""
         return [
             Problem(f"{count - LISTED} more findings of the kind: {kind}", "not listed")
             for kind, count in self._counts.items()

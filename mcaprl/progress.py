@@ -25,7 +25,8 @@ from mcaprl.texts import printable
 Advance = Callable[[int], None]
 """Function called with the amount of completed work."""
 ProgressBar = Callable[[str, int | None], AbstractContextManager[Advance]]
-"""Context manager that shows a progress bar, given its text and total; yields an `Advance`."""
+"""Function that is called with a text and a total, and returns a context manager. The context
+manager shows a progress bar, and yields an `Advance`."""
 FIRST_LINE_S: Final = 5.0
 """Time until the first line of progress if stderr is not a terminal."""
 LINE_INTERVAL_S: Final = 30.0

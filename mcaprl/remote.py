@@ -1,4 +1,4 @@
-"""Files on other machines, by fsspec: parts of a file are fetched when they are needed.
+"""Files on other machines, accessed with fsspec: parts of a file are fetched when needed.
 
 Each remote file has a sparse local file of the same size. Fetched blocks are written to it, so
 readers can memory-map it like any local file.
@@ -144,7 +144,7 @@ class RemotePath(type(Path())):  # type: ignore[misc]
 
     @classmethod
     def of(cls, url: str) -> RemotePath:
-        """Open a remote file; errors as in `RemoteFile`."""
+        """Open a remote file; raise the same errors as `RemoteFile`."""
         remote = RemoteFile(url)
         path = cls(remote.local)
         path.remote = remote

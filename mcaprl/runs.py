@@ -1,6 +1,6 @@
 """Run folders and summaries of offline and online training.
 
-RUN/config.json                         algorithm, settings, and the source of experience
+RUN/config.json                         algorithm, settings, and the data or sim
 RUN/seed-K/checkpoint.safetensors       state to resume from
 RUN/seed-K/metrics.csv                  loss terms of an offline run
 RUN/seed-K/policy.json, .safetensors    policy of an offline run
@@ -38,6 +38,8 @@ Curve = dict[str, NDArray[np.float64]]
 class RunSummary:
     """Result of training one seed.
 
+    The first training of a run is a session, and so is each resumption of the run.
+
     Attributes:
         folder: Folder of the seed, RUN/seed-K.
         algo: Name of the algorithm.
@@ -60,7 +62,7 @@ class RunIdentity:
     """Parts of a run that must match for the run to be resumed.
 
     Attributes:
-        parts: Algorithm (`algo`), settings (`config`) and source of experience as plain JSON types.
+        parts: Algorithm (`algo`), settings (`config`), and the data or sim, as plain JSON types.
         other_data: Whether `parts["data"]`, the fingerprint of the data, may differ.
     """
 
@@ -170,7 +172,7 @@ def run_to_resume(folder: Path) -> dict[str, Any]:
         return read_config(folder)
     if not folder.is_dir() or _leftovers(folder) is None:
         raise TrainingError(
-            f"{folder} holds no run to resume: check the path, or start a new run without --resume"
+            f"{folder} has no run to resume: check the path, or start a new run without --resume"
         )
     return {}
 

@@ -52,10 +52,11 @@ def run_workers(
     """Run a task in one process for each request, until all are done.
 
     If a worker fails, or this process is interrupted, all other tasks receive a KeyboardInterrupt,
-    and this function waits until they end. They also receive it if this process is killed.
+    and this function waits until they end. If this process is killed, all tasks receive a
+    KeyboardInterrupt, too.
 
     Args:
-        task: Function of a module, called with a request and a function that sends a message.
+        task: Module-level function, called with a request and a function that sends a message.
         requests: Arguments of the tasks; they are pickled.
         on_message: Function called with the index of the request and the message.
 

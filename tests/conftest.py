@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -11,8 +12,12 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from mcaprl.ray.cluster import LOCAL, connect, local_settings
+
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Ray reads these when it is imported: its clusters in tests listen on 127.0.0.1 only.
+os.environ.update(local_settings())
 
 # Disk access and JIT compilation make the first example slow, so there is no deadline.
 settings.register_profile(
@@ -49,6 +54,20 @@ def need(available: bool, reason: str) -> None:
         pytest.fail(f"CI must have it: {reason}")
     if not available:
         pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def ray_cluster() -> Iterator[None]:
+    """Start a Ray cluster of two workers on 127.0.0.1; this process stays connected to it."""
+    ray = pytest.importorskip("ray")
+    with pytest.MonkeyPatch.context() as patch:
+        # The workers import environments of the tests.
+        paths = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+        assert connect(LOCAL, workers=2, store_bytes=200 << 20)
+    logging.getLogger("ray.data").setLevel(logging.ERROR)
+    yield
+    ray.shutdown()
 
 
 @pytest.fixture(scope="module")

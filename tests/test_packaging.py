@@ -31,7 +31,7 @@ def modules() -> list[str]:
 
 
 def test_every_folder_is_a_package() -> None:
-    found = {"mcaprl", "mcaprl.api"}
+    found = {"mcaprl", "mcaprl.api", "mcaprl.ray"}
     for root in ROOTS:
         for init in (ROOT / root).rglob("__init__.py"):
             found.add("mcaprl." + ".".join(init.parent.relative_to(ROOT).parts))
@@ -54,6 +54,7 @@ def test_links_lead_to_the_folders() -> None:
 
 def test_importing_loads_no_engine() -> None:
     heavy = {"torch", "numba", "stable_baselines3", "pygame", "matplotlib", "pandas", "pyarrow"}
+    heavy |= {"ray"}
     code = (
         "import sys, mcaprl, mcaprl.cli, mcaprl.sims, mcaprl.recorder.record.wrapper\n"
         f"print(sorted({heavy!r} & set(sys.modules)))"

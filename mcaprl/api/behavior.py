@@ -27,12 +27,14 @@ def estimate_behavior(
     """Estimate the probability of each logged action under the policy that took it.
 
     Most robots do not log these probabilities, but estimators with importance weights need them.
-    The episodes are split into folds. A classifier predicts the actions of one fold; it is trained
-    on the episodes of the other folds, and calibrated on some of these that are held out.
+    The episodes are split into folds. For each fold, a classifier is trained on the other folds,
+    except for some of their episodes, on which the classifier is calibrated. It then predicts the
+    actions of the fold.
 
     Args:
         data: Dataset, file, folder or glob of logs, or several of them; actions are discrete.
-        folds: Number of folds of the episodes; each one is predicted from the others.
+        folds: Number of folds of the episodes; the actions of each fold are predicted by a
+            classifier trained on the other folds.
         updates: Number of gradient steps for each fold.
         seed: Seed of the folds and of the networks.
         threads: Number of threads of PyTorch and of the reader.

@@ -77,7 +77,7 @@ def convert(
     Args:
         source: Logs or a dataset of another tool; with a mapping: MCAP files, rosbag2 folders and
             databases, or ROS 1 bags.
-        out: Path of the log or dataset; None to write none.
+        out: Path of the log or dataset; None to write nothing.
         mapping: Mapping file, or its keys and values; see docs/bags.md.
         source_format: Name of the format of `source`; default: detected from the path.
         to: Name of the format to write; default: a log if `out` ends with .mcap, otherwise the

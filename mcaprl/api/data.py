@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Paths = str | Path | Sequence[str | Path]
 """A file, a folder or a glob of logs, or several of them."""
 MAPPING_NAME = "mapping.json"
-"""Name of the mapping's copy in the folder of a run that was trained with it."""
+"""Name of the file in a run folder that contains a copy of the mapping used for training."""
 Data = Dataset | Paths
 """A dataset, or paths of logs."""
 MappingFile = str | Path | Mapping[str, Any]
@@ -43,17 +43,17 @@ def open_data(
     without a finished episode are skipped, with a warning.
 
     Args:
-        data: A file, a folder of `.mcap` files, a glob, or a sequence of these. The logs must have
-            the same spaces; their episodes are concatenated in the order of the files. Or one
-            dataset of another tool; see docs/formats.md. With a mapping: MCAP files of any writer,
-            rosbag2 folders and databases, or ROS 1 bags.
+        data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, or a sequence of
+            these. The logs must have the same spaces; their episodes are concatenated in the order
+            of the files. Or one dataset of another tool; see docs/formats.md. With a mapping: MCAP
+            files of any writer, rosbag2 folders and databases, or ROS 1 bags.
         mapping: Mapping that says which topics and fields of a bag are observations, actions,
             rewards and episode ends; see docs/bags.md. None for logs of this package.
         trust_code: Whether the mapping may name a Python function, which is imported.
         format: Name of the other tool's format; default: detected from the path.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
-            key. The dataset's observation space contains only these. An empty sequence reads no
-            observations. Actions, rewards and end flags are always read. Default: all keys.
+            key. The dataset's observation space contains only these keys. An empty sequence reads
+            no observations. Actions, rewards and end flags are always read. Default: all keys.
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
@@ -114,7 +114,7 @@ def _other_format(data: Paths, name: str | None) -> Format | None:
 
 
 def mapped(data: Paths, mapping: MappingFile, *, trust_code: bool = False) -> MappedBag:
-    """Read a bag by a mapping; errors as in `open_data`."""
+    """Read a bag by a mapping; raise the same errors as `open_data`."""
     import_extra("pydantic", "bags")
     from mcaprl.recorder.mapping.read import read_bag
 

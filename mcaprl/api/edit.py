@@ -17,14 +17,14 @@ def merge(logs: Paths, out: str | Path, *, shift: bool = False, overwrite: bool 
 
     The episodes of the new log are in the order of their times. The logs must be finished, and have
     the same spaces, environment, names of observations and actions, and step duration. Other
-    metadata fields are empty in the new log if they differ. A message that several logs contain
-    with the same time and bytes is written once.
+    metadata fields are empty in the new log if they differ between the logs. A message that several
+    logs contain with the same time and bytes is written once.
 
     Args:
         logs: Two or more logs: files, folders or globs.
         out: Path of the new log.
         shift: Whether a log whose episodes overlap in time with those of earlier logs is delayed
-            until they have ended. The timestamps inside its messages are delayed, too.
+            to begin after those logs end. The timestamps inside its messages are delayed, too.
         overwrite: Whether an existing file is replaced.
 
     Raises:

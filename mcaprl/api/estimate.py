@@ -29,11 +29,11 @@ class LogEstimates:
         data: Names of the logs.
         episodes: Number of episodes.
         gamma: Discount of all values.
-        epsilon: Probability of a random action of the evaluated policies.
+        epsilon: Probability with which the evaluated policies take a random action.
         behavior_return: Mean discounted return of the logged episodes.
         behavior_interval: 95 % confidence interval of that mean.
-        behavior_calibration: Number of actions, estimated as the mean of 1 / `behavior_prob`, to
-            compare with the action space; None if unknown.
+        behavior_calibration: Mean of 1 / `behavior_prob`, which estimates the number of actions,
+            and the number of actions in the action space; None if unknown.
         behavior_estimate: Quality of the estimated `behavior_prob`; None if it was not estimated
             for this evaluation.
         coverage: Mean probability of the logged actions under each policy.
@@ -89,7 +89,7 @@ def estimate(
         gamma: Discount of the returns.
         epsilon: Probability of a random action instead of the policy's.
         updates: Number of gradient steps of the model that FQE, DR and WDR use. The classifier
-            that estimates the behavior probabilities uses at most 2,000 of them.
+            that estimates the behavior probabilities is trained with at most 2,000 steps.
         estimate_behavior: Whether the behavior probabilities are estimated from the actions, as by
             `mcaprl.estimate_behavior`, instead of taken from the logs.
         seed: Seed of the model and of the resampling.
@@ -147,7 +147,7 @@ def estimate(
 
 
 def _policies(names: Sequence[str], dataset: Dataset) -> dict[str, StochasticPolicy | None]:
-    """Load the policies, and return them by their names for tables; random is None."""
+    """Load the policies; return a dict by their names in tables. The value of `random` is None."""
     shown = policy_names(names)
     found: dict[str, StochasticPolicy | None] = {}
     for name in dict.fromkeys(names):

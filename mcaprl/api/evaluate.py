@@ -12,7 +12,9 @@ from typing import Any
 
 import gymnasium as gym
 
+from mcaprl.api.cluster import ClusterOptions
 from mcaprl.api.environments import all_options
+from mcaprl.api.evaluate_parts import Part, results_on_ray
 from mcaprl.api.policies import SCRIPTED, Names, as_names, policies_of, policy_names
 from mcaprl.api.ranges import check_least
 from mcaprl.errors import ReportError, UsageError, import_extra
@@ -23,7 +25,13 @@ from mcaprl.recorder.dataset.open import find_logs, open_logs
 from mcaprl.recorder.format.metadata import same_env
 from mcaprl.recorder.record.wrapper import RecordMcap
 from mcaprl.sims import make_sim, make_sims
-from mcaprl.sims.evaluation.evaluate import Improvement, PolicyScore, improvements, normalize
+from mcaprl.sims.evaluation.evaluate import (
+    Improvement,
+    PolicyScore,
+    improvements,
+    normalize,
+    score_of,
+)
 from mcaprl.sims.evaluation.evaluate import evaluate as evaluate_policy
 from mcaprl.sims.evaluation.rollout import Policy
 from mcaprl.sims.evaluation.statistics import mean_interval
@@ -93,6 +101,9 @@ def evaluate(
     record: str | Path | None = None,
     report: str | Path | None = None,
     overwrite: bool = False,
+    ray: bool = False,
+    workers: int | None = None,
+    address: str | None = None,
     progress: ProgressBar = no_progress,
 ) -> Evaluation:
     """Evaluate policies greedily on the same episodes of a sim.
@@ -112,19 +123,30 @@ def evaluate(
         record: Output log of the episodes of `policies`.
         report: Output folder of the HTML report, images and JSON.
         overwrite: Whether an existing log is replaced.
+        ray: Whether the episodes run on Ray workers, which see the policies; the results are the
+            same.
+        workers: Number of Ray workers; default: number of CPUs of the cluster.
+        address: Address of a Ray cluster, `HOST:PORT` or `auto`; default: RAY_ADDRESS, else a
+            local cluster for this call.
         progress: Function that opens a progress bar.
 
     Raises:
-        UsageError: `behavior` was recorded in another sim or would be overwritten, or a number is
-            out of range.
+        UsageError: `behavior` was recorded in another sim or would be overwritten, a number is
+            out of range, or options exclude each other.
         UnknownNameError: There is no such sim or policy.
         PolicyError: A policy has other spaces than the sim.
         OutputExistsError: `record` exists.
-        MissingExtraError: The packages of the sim, the policies or the report are not installed.
+        MissingExtraError: The packages of the sim, the policies, the report or Ray are not
+            installed.
         ReportError: The report cannot be written.
+        ClusterError: The Ray cluster cannot be used, or its workers died repeatedly.
     """
     check_least(1, episodes=episodes)
     check_least(0, seed=seed)
+    on_cluster = ClusterOptions(ray, workers, address)
+    on_cluster.check()
+    if ray and record is not None:
+        raise UsageError("--record needs one process: omit --ray")
     names, options = as_names(policies), all_options(observation, rules, sim_options)
     log, folder = (None if path is None else Path(path) for path in (record, report))
     env = make_sim(sim, **options)
@@ -136,14 +158,18 @@ def evaluate(
             import_extra("jinja2", "report")
             write_json(folder / RESULT_NAME, {}, ReportError)
         world = list(getattr(env.unwrapped, "static_scene", list)())
-        envs = None
-        if env.spec is not None and env.spec.vector_entry_point and log is None:
-            envs = make_sims(sim, episodes, **options)
+        is_batched = env.spec is not None and bool(env.spec.vector_entry_point) and log is None
         found = _policies(names, env)
         shown, scores = policy_names(list(found)), {}
         with ExitStack() as stack:
             total = sum(map(len, found.values())) * episodes
             advance = stack.enter_context(progress("evaluating", total))
+            if ray:
+                request = Part(sim, options, seed, is_batched)
+                results = results_on_ray(request, found, episodes, on_cluster, advance)
+                scores = {name: score_of(shown[name], results[name], env) for name in found}
+                found = {}
+            envs = make_sims(sim, episodes, **options) if is_batched and found else None
             recorder = None
             if log is not None:
                 recorder = RecordMcap(env, log, seed=seed, overwrite=overwrite, epsilon=0.0)
@@ -171,7 +197,7 @@ def evaluate(
 
 
 def _policies(names: Sequence[str], env: gym.Env[Any, Any]) -> dict[str, list[Policy | None]]:
-    """Return the policies to evaluate by name: the named ones, random and the pilot."""
+    """Return a dict from names to policies; it includes `random` and, if there is one, `pilot`."""
     found = {name: policies_of(name, env) for name in dict.fromkeys(names)}
     for name in SCRIPTED:
         if name not in found:
@@ -233,8 +259,9 @@ def _write_report(
 
 
 def learning_curves(names: Sequence[str]) -> list[Figure]:
-    """Return the learning curves of the runs among the names: run folders or seed folders.
+    """Return the learning curves of runs; ignore names that belong to no run.
 
+    A name is the path of a run folder, or of a folder or policy file in a run folder.
     Online runs are compared in one figure; an offline run has one figure for each term of its loss.
     """
     folders = dict.fromkeys(filter(None, (_run_folder(Path(name)) for name in names)))
@@ -257,7 +284,7 @@ def learning_curves(names: Sequence[str]) -> list[Figure]:
 
 
 def _run_folder(path: Path) -> Path | None:
-    """Return the run folder that is, or contains, the path; None if there is none."""
+    """Return the run folder to which a path belongs; None if it belongs to no run."""
     of_seed = [seed.parent for seed in (path, path.parent) if seed.name.startswith("seed-")]
     for folder in (path, *of_seed):
         if any(any(folder.glob(f"seed-*/{name}")) for name in ("curve.csv", "metrics.csv")):

@@ -208,8 +208,8 @@ def _found_files(path: Path) -> list[Path]:
     files = policy_files(path)
     if not files:
         raise PolicyError(
-            f"{path} has no policy: neither {POLICY_NAME} nor {BEST_NAME}, nor a seed-K folder with"
-            " one; training writes the policy with its first checkpoint"
+            f"{path} has no policy: it contains no {POLICY_NAME}, no {BEST_NAME}, and no seed-K"
+            " folder with a policy; training writes the policy with its first checkpoint"
         )
     return files
 

@@ -170,8 +170,8 @@ class Rendering:
 
     Attributes:
         episode: Index of the episode.
-        frames: Number of images of the video; 0 without one.
-        stills: Number of images of the contact sheet; 0 without one.
+        frames: Number of images of the video; 0 without a video.
+        stills: Number of images of the contact sheet; 0 without a contact sheet.
     """
 
     episode: int
@@ -191,7 +191,7 @@ def render(
     trust_env: bool = False,
     progress: ProgressBar = no_progress,
 ) -> Rendering:
-    """Render one episode of a log from its scene or, without one, with the sim.
+    """Render one episode of a log from the logged scene; if the log has no scene, with the sim.
 
     Args:
         file: Path of the log.

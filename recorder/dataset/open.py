@@ -16,6 +16,7 @@ from mcaprl.errors import LogError, NoEpisodesError, UsageError
 from mcaprl.recorder.dataset.dataset import Dataset
 from mcaprl.recorder.dataset.image_cache import Storage
 from mcaprl.recorder.dataset.log_reader import LogReader, Selection
+from mcaprl.recorder.dataset.manifest import is_manifest, listed_logs
 from mcaprl.remote import as_path, find_remote, is_url
 
 Result = TypeVar("Result")
@@ -37,11 +38,12 @@ def open_logs(
     without a finished episode are skipped, with a warning.
 
     Args:
-        data: A file, a folder of `.mcap` files, a glob, a URL, or a sequence of these. The logs
-            must have the same spaces; their episodes are concatenated in the order of the files.
+        data: A file, a folder of `.mcap` files, its `manifest.json`, a glob, a URL, or a sequence
+            of these. The logs must have the same spaces; their episodes are concatenated in the
+            order of the files.
         columns: Keys to read from a Dict observation space, for example `joints/q` for a nested
-            key. The dataset's observation space contains only these. An empty sequence reads no
-            observations. Actions, rewards and end flags are always read. Default: all keys.
+            key. The dataset's observation space contains only these keys. An empty sequence reads
+            no observations. Actions, rewards and end flags are always read. Default: all keys.
         episodes: Index, slice or indexes of the episodes to read, counted over all logs and
             returned in the logs' order. Default: all episodes.
         images: Storage of image observations: `memory`, `mapped` or `auto`. `mapped` leaves images
@@ -88,7 +90,7 @@ def _call_each(
 
 def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
     counted = _call_each(logs, lambda log: len(log.lengths))
-    numbers = _episode_indexes(episodes, sum(count for _, count in counted))
+    numbers = episode_indexes(episodes, sum(count for _, count in counted))
     parts, first = [], 0
     for log, count in counted:
         mine = numbers[(first <= numbers) & (numbers < first + count)]
@@ -98,7 +100,7 @@ def _read_episodes(logs: Sequence[LogReader], episodes: Episodes) -> Dataset:
     return Dataset.concatenate(parts)
 
 
-def _episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
+def episode_indexes(episodes: Episodes, count: int) -> NDArray[np.int64]:
     """Resolve a selection of episodes to sorted, unique indexes.
 
     Raises:
@@ -127,6 +129,8 @@ def find_logs(data: str | Path | Sequence[str | Path]) -> list[Path]:
             raise LogError("no data: the list of files is empty")
         # A file that is listed under several paths is read once.
         return list({os.path.realpath(path): path for path in every}.values())
+    if is_manifest(data):
+        return listed_logs(data)
     if is_url(data):
         return list(find_remote(str(data)))
     path = as_path(data)

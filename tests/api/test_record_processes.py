@@ -16,7 +16,7 @@ import pytest
 from gymnasium import spaces
 
 import mcaprl
-from mcaprl.api import record
+from mcaprl.api import record_file
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.repair.check import check_log
 from tests.support.recordings import ScriptedEnv
@@ -139,7 +139,8 @@ def test_a_request_that_cannot_be_logged_leaves_old_shards(
     mcaprl.record("CartPole-v1", tmp_path / "shard-00.mcap", policy="random", episodes=1)
     before = (tmp_path / "shard-00.mcap").read_bytes()
     text = spaces.Text(3)
-    monkeypatch.setattr(record, "make_sim", lambda sim: ScriptedEnv(text, spaces.Discrete(2), []))
+    env = ScriptedEnv(text, spaces.Discrete(2), [])
+    monkeypatch.setattr(record_file, "make_sim", lambda sim: env)
     with pytest.raises(SpaceError):
         mcaprl.record("Text-v0", tmp_path, policy="random", episodes=2, envs=2, overwrite=True)
     assert [path.name for path in tmp_path.iterdir()] == ["shard-00.mcap"]

@@ -1,0 +1,51 @@
+"""Compare the time of two Ray workers that record with that of two plain processes.
+
+    python -m benchmarks.ray_record
+
+Both record the same episodes. The time is that of a clock, since several processes work; the start
+of the Ray cluster does not count. On a busy machine, repeat the comparison.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import mcaprl
+import mcaprl.ray
+from benchmarks.measure import OURS, Side, compare
+
+EPISODES, WORKERS, SHARDS = 100, 2, 8
+
+
+def main() -> None:
+    """Print the ratio."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        # The first reading starts a cluster, which stays.
+        _record(folder / "envs", envs=WORKERS)
+        mcaprl.ray.read(folder / "envs")
+        compare(
+            f"Recording of {EPISODES} episodes of lane by {WORKERS} processors",
+            [
+                Side(OURS, lambda: _record(folder / "envs", envs=WORKERS)),
+                Side(
+                    "mcaprl on Ray",
+                    lambda: _record(folder / "ray", ray=True, workers=WORKERS, shards=SHARDS),
+                ),
+            ],
+            goal="at most 1.18 times the time of plain processes, an efficiency of .85",
+            rounds=3,
+            clock=time.perf_counter,
+            unit="time, plain processes = 1",
+        )
+
+
+def _record(folder: Path, **options: Any) -> None:
+    mcaprl.record("lane", folder, episodes=EPISODES, overwrite=True, **options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""The options of commands that can run on a Ray cluster."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from mcaprl.api.ranges import check_least
+from mcaprl.errors import UsageError
+from mcaprl.settings import flag
+
+
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Cluster and workers of a command.
+
+    Attributes:
+        ray: Whether the command runs on Ray.
+        workers: Number of workers; None for the number of CPUs of the cluster.
+        address: Address of the cluster; None for RAY_ADDRESS, or else a local cluster.
+    """
+
+    ray: bool
+    workers: int | None
+    address: str | None
+
+    def check(self, **others: int | None) -> None:
+        """Check these options, and numbers that require Ray, by the name of their argument.
+
+        Raises:
+            UsageError: An option is given without `ray`, or a number is below 1.
+        """
+        check_least(1, workers=self.workers, **others)
+        given = {"workers": self.workers, "address": self.address, **others}
+        for name, value in given.items():
+            if value is not None and not self.ray:
+                raise UsageError(f"{flag(name)} requires --ray")
+
+    def connected(self) -> AbstractContextManager[Any]:
+        """Connect to the cluster for the duration of the context; errors as `ray.cluster`."""
+        from mcaprl.ray.cluster import cluster
+
+        return cluster(self.address, workers=self.workers)

@@ -1,0 +1,105 @@
+"""Recording of one file in this process."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from mcaprl.api.policies import policies_of, policy_names
+from mcaprl.files import work_folder
+from mcaprl.recorder.record.wrapper import RecordMcap
+from mcaprl.sims import make_sim
+from mcaprl.sims.evaluation.rollout import EpisodeResult, EpsilonGreedy, rollout
+
+
+@dataclass(frozen=True)
+class FileRequest:
+    """One file to record; its fields are the arguments of `record`.
+
+    Attributes:
+        first_episode: Number of the first episode; an episode's seed depends on its number.
+    """
+
+    sim: str
+    out: Path
+    policy: str
+    epsilon: float
+    episodes: int | None
+    steps: int | None
+    seed: int
+    sim_options: Mapping[str, Any]
+    scene: bool
+    camera: bool
+    infos: bool | Sequence[str]
+    compression: str
+    overwrite: bool
+    append: bool
+    rotate_mb: float | None
+    first_episode: int = 0
+
+
+def record_file(
+    request: FileRequest, on_episode: Callable[[EpisodeResult], None] | None = None
+) -> list[EpisodeResult]:
+    """Record one file in this process."""
+    with closing(make_sim(request.sim, **request.sim_options)) as env:
+        behavior = _behavior(request, env)
+        recorder = _recorder(request, env, behavior)
+
+        def set_probability(probability: float) -> None:
+            recorder.behavior_prob = probability
+
+        with closing(recorder):
+            return rollout(
+                recorder,
+                behavior,
+                seed=request.seed,
+                episodes=request.episodes,
+                steps=request.steps,
+                # Appended episodes continue the numbers, and thus the seeds, of the earlier ones.
+                first_episode=request.first_episode + recorder.episodes,
+                on_action=set_probability,
+                on_episode=on_episode,
+            )
+
+
+def try_request(request: FileRequest) -> None:
+    """Create and remove the file of a request, without episodes.
+
+    Raises:
+        McaprlError: The sim, the policy or another argument is not valid.
+    """
+    with (
+        work_folder(request.out) as trial,
+        closing(make_sim(request.sim, **request.sim_options)) as env,
+    ):
+        behavior = _behavior(request, env)
+        _recorder(replace(request, out=trial / "trial.mcap"), env, behavior).close()
+
+
+def _behavior(request: FileRequest, env: gym.Env[Any, Any]) -> EpsilonGreedy:
+    return EpsilonGreedy(policies_of(request.policy, env)[0], request.epsilon, env.action_space)
+
+
+def _recorder(request: FileRequest, env: gym.Env[Any, Any], behavior: EpsilonGreedy) -> RecordMcap:
+    megabytes = request.rotate_mb
+    return RecordMcap(
+        env,
+        request.out,
+        policy=policy_names([request.policy])[request.policy],
+        epsilon=behavior.epsilon,
+        seed=request.seed,
+        compression=request.compression,
+        overwrite=request.overwrite,
+        append=request.append,
+        max_file_bytes=None if megabytes is None else math.ceil(megabytes * 1e6),
+        scene=request.scene,
+        camera=request.camera,
+        infos=request.infos,
+    )

@@ -1,0 +1,203 @@
+"""Recording of several files into a folder: by processes of this machine, or on a Ray cluster."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from mcaprl.api.cluster import ClusterOptions
+from mcaprl.api.policies import SCRIPTED
+from mcaprl.api.record_file import FileRequest, record_file, try_request
+from mcaprl.errors import LogError, OutputExistsError
+from mcaprl.files import check_target, locked_file, locked_folder
+from mcaprl.progress import Advance
+from mcaprl.recorder.dataset.manifest import MANIFEST_NAME, LogFile, write_manifest
+from mcaprl.sims.evaluation.rollout import EpisodeResult
+from mcaprl.texts import counted
+from mcaprl.workers import WorkerEndedError, run_workers
+
+# Defaults for the files that Ray workers write: most files, and least number of steps of a file.
+_MOST_SHARDS, _LEAST_STEPS = 64, 10_000
+
+
+def record_shards(
+    whole: FileRequest, processes: int, on_episode: Callable[[EpisodeResult], None]
+) -> list[EpisodeResult]:
+    """Record episodes in parallel, with one file per process.
+
+    Raises:
+        OutputExistsError: The folder contains logs that may not be replaced.
+        LogError: Another recording is writing to the folder, or a process was killed.
+    """
+    shards = _divided(whole, processes)
+    with _new_folder(whole, shards[0]):
+        results: list[list[EpisodeResult]] = [[] for _ in shards]
+
+        def on_message(shard: int, result: EpisodeResult) -> None:
+            results[shard].append(result)
+            on_episode(result)
+
+        try:
+            run_workers(_record_shard, shards, on_message)
+        except WorkerEndedError as error:
+            episodes = counted(len(results[error.index]), "finished episode")
+            raise LogError(
+                f"{shards[error.index].out}: its process {error.cause}; the {episodes} in it and"
+                " those of the other shards are kept"
+            ) from error
+    return [result for shard in results for result in shard]
+
+
+def _divided(whole: FileRequest, parts: int) -> list[FileRequest]:
+    """Return the requests of the shards."""
+    shares = enumerate(_shares(whole.episodes or whole.steps or 0, parts))
+    digits = max(2, len(str(parts - 1)))
+    return [
+        replace(
+            whole,
+            out=whole.out / f"shard-{number:0{digits}d}.mcap",
+            episodes=None if whole.episodes is None else end - start,
+            steps=None if whole.steps is None else end - start,
+            # With `steps`, the number of episodes is unknown: reserve 2**20 numbers per shard.
+            first_episode=start if whole.episodes is not None else number << 20,
+        )
+        for number, (start, end) in shares
+        if end > start
+    ]
+
+
+@contextmanager
+def _new_folder(whole: FileRequest, first: FileRequest) -> Iterator[None]:
+    """Lock the folder of the shards, and remove an earlier recording; errors as `record_shards`.
+
+    A trial recording lets an invalid request fail before any file is removed.
+    """
+    if whole.out.is_file():
+        raise OutputExistsError(f"{whole.out} exists and is a file: choose the name of a folder")
+    with locked_folder(whole.out):
+        old = _replaceable(whole.out, overwrite=whole.overwrite)
+        try_request(first)
+        for path in old:
+            with locked_file(path):
+                path.unlink()
+        # The manifest of an earlier recording lists other files.
+        (whole.out / MANIFEST_NAME).unlink(missing_ok=True)
+        yield
+
+
+def _record_shard(request: FileRequest, send: Callable[[EpisodeResult], None]) -> None:
+    record_file(request, send)
+
+
+def record_on_ray(
+    whole: FileRequest, parts: int | None, options: ClusterOptions, advance: Advance
+) -> list[EpisodeResult]:
+    """Record shards on the workers of a Ray cluster, then write the manifest of the folder.
+
+    The shards do not depend on the workers, so that the episodes do not, either.
+
+    Raises:
+        OutputExistsError: The folder contains logs that may not be replaced.
+        LogError: Another recording is writing to the folder, or workers died repeatedly.
+        ClusterError: The cluster cannot be used.
+    """
+    from mcaprl.ray.shards import unfinished_folder
+    from mcaprl.ray.workers import WorkerDiedError, run_tasks
+
+    # Other machines have other working directories.
+    whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
+    shards = _divided(whole, _count(whole, parts))
+    with options.connected(), _new_folder(whole, shards[0]):
+        hidden = unfinished_folder(whole.out)
+        paths = [hidden] if whole.policy in SCRIPTED else [hidden, Path(whole.policy)]
+        try:
+            results = run_tasks(
+                _record_on_worker, shards, workers=options.workers, paths=paths, advance=advance
+            )
+        except WorkerDiedError as error:
+            raise LogError(
+                f"{shards[error.index].out}: workers died repeatedly without finishing another"
+                f" episode ({error.cause}); the other finished shards are kept"
+            ) from error
+        shutil.rmtree(hidden)
+        files = [
+            LogFile(shard.out.name, len(one), sum(e.length for e in one), shard.out.stat().st_size)
+            for shard, one in zip(shards, results, strict=True)
+        ]
+        write_manifest(whole.out, files)
+    return [result for shard in results for result in shard]
+
+
+def _record_on_worker(request: FileRequest, report: Callable[[int], None]) -> list[EpisodeResult]:
+    """Record a shard, or the rest of it if another worker was killed; return all its episodes."""
+    from mcaprl.ray.shards import Shard, episodes_of
+
+    shard = Shard(request.out)
+    if not shard.is_complete:
+        kept = shard.resume()
+        done = len(kept) if request.episodes else sum(result.length for result in kept)
+        report(done)
+        rest = (request.episodes or request.steps or 0) - done
+
+        def on_episode(result: EpisodeResult) -> None:
+            nonlocal done
+            done += 1 if request.episodes else result.length
+            report(done)
+
+        if rest > 0:
+            part = replace(
+                request,
+                out=shard.unfinished,
+                episodes=rest if request.episodes else None,
+                steps=rest if request.steps else None,
+                overwrite=False,
+                append=bool(kept),
+            )
+            record_file(part, on_episode)
+        shard.publish()
+    return episodes_of(shard.path)
+
+
+def _count(whole: FileRequest, parts: int | None) -> int:
+    """Return the number of shards; none is empty."""
+    if whole.episodes is not None:
+        return min(parts or _MOST_SHARDS, whole.episodes)
+    steps = whole.steps or 0
+    return min(parts or _MOST_SHARDS, steps if parts else max(steps // _LEAST_STEPS, 1))
+
+
+def _absolute(policy: str) -> str:
+    return policy if policy in SCRIPTED else os.path.abspath(policy)
+
+
+def _replaceable(folder: Path, *, overwrite: bool) -> list[Path]:
+    """Return the shards of an earlier recording.
+
+    Raises:
+        OutputExistsError: The shards may not be replaced, or the folder contains other logs.
+        LogError: A shard is being recorded.
+    """
+    old = sorted(folder.glob("*.mcap"))
+    foreign = [path.name for path in old if not path.name.startswith("shard-")]
+    if foreign:
+        raise OutputExistsError(f"{folder} has other logs ({foreign[0]}): choose another folder")
+    if old and not overwrite:
+        raise OutputExistsError(f"{folder} exists: choose another folder, or pass --overwrite")
+    for path in old:
+        check_target(path, overwrite=True)
+    return old
+
+
+def _shares(total: int, parts: int) -> list[tuple[int, int]]:
+    """Split a count into half-open ranges whose lengths differ by at most one.
+
+    >>> _shares(5, 2)
+    [(0, 2), (2, 5)]
+    """
+    edges = [total * part // parts for part in range(parts + 1)]
+    return list(itertools.pairwise(edges))

@@ -1,0 +1,93 @@
+"""A log that one worker after another may continue, and that appears when it is complete."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from mcaprl.errors import LogError, NoStepsError
+from mcaprl.files import locked_file
+from mcaprl.recorder.dataset.log_reader import LogReader
+from mcaprl.recorder.format.episode_summary import INTERRUPTED
+from mcaprl.recorder.repair.recover import recover_log
+from mcaprl.sims.evaluation.rollout import EpisodeResult
+
+_UNFINISHED = ".unfinished"
+
+
+class Shard:
+    """A log in a folder, and its unfinished content in a hidden folder beside it.
+
+    Attributes:
+        path: Path of the complete log.
+        unfinished: Path of the log while it is recorded.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Create a shard without reading anything."""
+        self.path = path
+        self.unfinished = path.parent / _UNFINISHED / path.name
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the log is complete."""
+        return self.path.exists()
+
+    def resume(self) -> list[EpisodeResult]:
+        """Repair what a killed worker left, so that it can be appended to; return its episodes.
+
+        Raises:
+            LogError: A worker is still recording it, or it cannot be written.
+        """
+        if not self.unfinished.exists():
+            return []
+        repaired = self.unfinished.with_suffix(".repaired")
+        with locked_file(self.unfinished):
+            pass
+        try:
+            recover_log(self.unfinished, repaired, overwrite=True)
+            kept = episodes_of(repaired)
+        except LogError:
+            # It has no finished episode.
+            kept = []
+        # A worker that ended in good order has cut off its last episode.
+        if kept and kept[-1].reason != INTERRUPTED:
+            os.replace(repaired, self.unfinished)
+            return kept
+        repaired.unlink(missing_ok=True)
+        self.unfinished.unlink()
+        return []
+
+    def publish(self) -> None:
+        """Move the complete log to its path."""
+        with self.unfinished.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(self.unfinished, self.path)
+
+
+def unfinished_folder(folder: Path) -> Path:
+    """Return the hidden folder of a recording's unfinished logs, which is new and empty."""
+    hidden = folder / _UNFINISHED
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir(parents=True)
+    return hidden
+
+
+def episodes_of(path: Path) -> list[EpisodeResult]:
+    """Return the result of each episode of a log, without positions.
+
+    Raises:
+        LogError: The log is damaged.
+    """
+    try:
+        summaries = LogReader(path).episode_summaries()
+    except NoStepsError:
+        return []
+    nowhere = np.empty((0, 2))
+    return [
+        EpisodeResult(one.seed or 0, one.total_reward, one.length, one.reason, nowhere)
+        for one in summaries
+    ]

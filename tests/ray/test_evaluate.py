@@ -1,0 +1,69 @@
+"""Evaluation on a Ray cluster: the same numbers as locally."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mcaprl
+from mcaprl.cli import run
+from mcaprl.errors import ClusterError, UsageError
+from tests.ray.seeded import SEEDED
+
+pytestmark = pytest.mark.usefixtures("ray_cluster")
+
+
+@pytest.fixture(scope="module")
+def lane_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run with two seeds, trained for some updates."""
+    pytest.importorskip("torch")
+    pytest.importorskip("numba")
+    folder = tmp_path_factory.mktemp("lane")
+    mcaprl.record("lane", folder / "log.mcap", episodes=2, epsilon=0.5)
+    data = mcaprl.open(folder / "log.mcap")
+    mcaprl.train(data, folder / "run", algo="bc", updates=20, batch_size=32, hidden=(8,), seeds=2)
+    return folder / "run"
+
+
+def test_numbers_are_those_of_one_process(lane_run: Path) -> None:
+    options: dict[str, Any] = {"episodes": 12, "seed": 7}
+    local = mcaprl.evaluate(lane_run, "lane", **options).to_json()
+    for workers in (1, 2):
+        found = mcaprl.evaluate(lane_run, "lane", ray=True, workers=workers, **options)
+        assert found.to_json() == local
+    assert len(local["policies"][0]["returns"]) == 24
+
+
+def test_the_command_prints_the_same(
+    lane_run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(lane_run.parent)
+    printed = []
+    for options in ([], ["--ray", "--workers", "2"]):
+        assert run(["evaluate", "run", "--sim", "lane", "--episodes", "3", "--json", *options]) == 0
+        printed.append(json.loads(capsys.readouterr().out))
+    assert printed[0] == printed[1]
+
+
+def test_positions_reach_the_report(lane_run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = mcaprl.evaluate(lane_run, "lane", episodes=2, ray=True, report=tmp_path / "report")
+    (first, _), _ = found.policies[0].results
+    assert first.positions.shape == (first.length + 1, 2)
+    assert (tmp_path / "report" / "index.html").exists()
+
+
+def test_options_that_exclude_each_other(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--record needs one process"):
+        mcaprl.evaluate("random", SEEDED, episodes=1, ray=True, record=tmp_path / "a.mcap")
+    with pytest.raises(UsageError, match="--workers requires --ray"):
+        mcaprl.evaluate("random", SEEDED, episodes=1, workers=2)
+
+
+def test_a_sim_that_kills_each_worker_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 2)
+    with pytest.raises(ClusterError, match="died repeatedly while they evaluated random"):
+        mcaprl.evaluate("random", SEEDED, episodes=1, ray=True, sim_options={"dies": True})

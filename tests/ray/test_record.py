@@ -1,0 +1,211 @@
+"""Recording on a Ray cluster: the same episodes as locally, whatever happens to the workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mcaprl
+from mcaprl.errors import LogError, OutputExistsError, UsageError
+from mcaprl.recorder.repair.check import check_log
+from tests.ray.seeded import SEEDED
+from tests.support.faults import count, tell
+
+pytestmark = pytest.mark.usefixtures("ray_cluster")
+EPISODES_PER_KILL = 60
+
+
+def contents(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def record(folder: Path, episodes: int, **options: Any) -> Any:
+    return mcaprl.record(
+        SEEDED, folder, policy="random", episodes=episodes, seed=3, ray=True, **options
+    )
+
+
+def recorded_locally(tmp_path: Path, episodes: int) -> mcaprl.Dataset:
+    path, fast = tmp_path / "local.mcap", {"pause_s": 0.0}
+    mcaprl.record(SEEDED, path, policy="random", episodes=episodes, seed=3, sim_options=fast)
+    return mcaprl.open(path)
+
+
+def test_episodes_are_those_of_one_process(tmp_path: Path) -> None:
+    expected = recorded_locally(tmp_path, 13)
+    for workers, shards in ((1, 3), (2, 5)):
+        folder, amounts = tmp_path / f"{workers}", list[int]()
+
+        @contextmanager
+        def bar(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
+            assert total == 13
+            yield amounts.append  # noqa: B023 (the bar ends before the next iteration)
+
+        found = record(folder, 13, workers=workers, shards=shards, progress=bar)
+        data = mcaprl.open(folder)
+        assert data.fingerprint == expected.fingerprint
+        assert [e.seed for e in data.episodes] == [e.seed for e in expected.episodes]
+        assert sum(amounts) == 13
+        assert (found.episodes, found.steps) == (13, len(expected))
+        assert [one.seed for one in found.results] == [e.seed for e in expected.episodes]
+        names = [f"shard-{number:02d}.mcap" for number in range(shards)]
+        assert contents(folder) == ["manifest.json", *names]
+
+
+def test_a_manifest_is_read_like_its_folder(tmp_path: Path) -> None:
+    record(tmp_path / "a", 5, shards=2)
+    path = tmp_path / "a" / "manifest.json"
+    assert mcaprl.open(path).fingerprint == mcaprl.open(tmp_path / "a").fingerprint
+    files = json.loads(path.read_text())["files"]
+    assert [file["episodes"] for file in files] == [2, 3]
+    assert sum(file["steps"] for file in files) == len(mcaprl.open(tmp_path / "a"))
+
+
+def test_an_upload_has_the_manifest(tmp_path: Path) -> None:
+    pytest.importorskip("fsspec")
+    url = f"file://{tmp_path}/copy"
+    record(tmp_path / "a", 3, shards=2, upload=url)
+    again = mcaprl.open(f"{url}/manifest.json")
+    assert again.fingerprint == mcaprl.open(tmp_path / "a").fingerprint
+
+
+def test_steps_do_not_depend_on_the_workers(tmp_path: Path) -> None:
+    prints = []
+    for workers in (1, 2):
+        folder = tmp_path / str(workers)
+        done = mcaprl.record(
+            SEEDED, folder, policy="random", steps=100, ray=True, workers=workers, shards=3
+        )
+        assert done.steps == 100
+        prints.append(mcaprl.open(folder).fingerprint)
+    assert prints[0] == prints[1]
+
+
+def worker_processes() -> list[int]:
+    """Return the processes below this one that are workers of ours."""
+    found, parents = list[int](), [os.getpid()]
+    while parents:
+        try:
+            parent = parents.pop()
+            text = Path(f"/proc/{parent}/task/{parent}/children").read_text()
+            children = [int(child) for child in text.split()]
+            for child in children:
+                name = Path(f"/proc/{child}/cmdline").read_bytes()
+                if name.startswith(b"ray::Worker"):
+                    found.append(child)
+            parents += children
+        except OSError:
+            # A process ended.
+            continue
+    return found
+
+
+class Killer(threading.Thread):
+    """Kills the oldest worker at random times after progress, up to a number of times."""
+
+    def __init__(self, kills: int) -> None:
+        super().__init__(daemon=True)
+        self.kills, self.killed, self.done = kills, 0, threading.Event()
+        self.progress = threading.Event()
+
+    def run(self) -> None:
+        randoms = random.Random(1)
+        while self.killed < self.kills and not self.done.wait(0.2 * randoms.random()):
+            if self.progress.wait(0.1):
+                workers = worker_processes()
+                if workers:
+                    self.progress.clear()
+                    os.kill(min(workers), signal.SIGKILL)
+                    self.killed += 1
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_killed_workers_lose_and_double_no_episode(tmp_path: Path) -> None:
+    kills, shards = count(5, 200), count(4, 40)
+    episodes = kills * EPISODES_PER_KILL
+    expected = recorded_locally(tmp_path, episodes)
+    killer = Killer(kills)
+    killer.start()
+    amounts = list[int]()
+
+    def advance(amount: int) -> None:
+        amounts.append(amount)
+        killer.progress.set()
+
+    @contextmanager
+    def bar(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
+        yield advance
+
+    found = record(tmp_path / "logs", episodes, shards=shards, workers=2, progress=bar)
+    killer.done.set()
+    killer.join()
+    assert killer.killed == kills, "the recording ended before the last kill"
+    data = mcaprl.open(tmp_path / "logs")
+    assert data.fingerprint == expected.fingerprint
+    assert [one.seed for one in data.episodes] == [one.seed for one in expected.episodes]
+    assert (found.episodes, sum(amounts)) == (episodes, episodes)
+    names = [f"shard-{number:02d}.mcap" for number in range(shards)]
+    assert contents(tmp_path / "logs") == ["manifest.json", *names]
+    for name in names:
+        assert check_log(tmp_path / "logs" / name) == []
+    tell(
+        "Ray workers killed with SIGKILL",
+        killed=kills,
+        episodes=episodes,
+        lost=0,
+        doubled=0,
+    )
+
+
+def test_a_sim_that_kills_each_worker_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mcaprl.ray.workers.MOST_DEATHS", 3)
+    with pytest.raises(LogError, match=r"shard-00\.mcap: workers died repeatedly without"):
+        record(tmp_path / "a", 2, shards=1, sim_options={"dies": True})
+    assert "manifest.json" not in contents(tmp_path / "a")
+
+
+def test_an_error_of_the_sim_ends_the_recording(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="pause"):
+        record(tmp_path / "a", 2, sim_options={"pause_s": "x"})
+
+
+def test_old_shards_are_replaced_only_on_request(tmp_path: Path) -> None:
+    record(tmp_path / "a", 2, shards=2)
+    with pytest.raises(OutputExistsError, match="pass --overwrite"):
+        record(tmp_path / "a", 2)
+    record(tmp_path / "a", 3, shards=1, overwrite=True)
+    assert contents(tmp_path / "a") == ["manifest.json", "shard-00.mcap"]
+    assert len(mcaprl.open(tmp_path / "a").episodes) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"envs": 2}, "--envs is for recording without --ray"),
+        ({"append": True}, "--append is for recording without --ray"),
+        ({"rotate_mb": 1.0}, "--rotate-mb is for recording without --ray"),
+        ({"workers": 0}, "--workers 0: give"),
+        ({"shards": 0}, "--shards 0: give"),
+    ],
+)
+def test_options_that_exclude_each_other(
+    tmp_path: Path, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        record(tmp_path / "a", 2, **options)
+    with pytest.raises(UsageError, match="requires --ray"):
+        mcaprl.record(SEEDED, tmp_path / "b", policy="random", episodes=1, shards=2)
+    with pytest.raises(UsageError, match="the name of a file"):
+        record(tmp_path / "a.mcap", 2)
+    assert list(tmp_path.iterdir()) == []
