@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # A change of these files reinstalls the environments.
 SETTINGS := pyproject.toml constraints.txt
 
-.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs wheel clean
+.PHONY: help demo test faults fuzz check bench bench-learning sim-grid docs docs-test wheel clean
 
 help:
 	@echo "make demo             record a car, train on its log offline, evaluate, and write the replay"
@@ -18,7 +18,8 @@ help:
 	@echo "make bench            measure speed relative to other libraries"
 	@echo "make bench-learning   measure training and off-policy estimates relative to d3rlpy, SB3 and SCOPE-RL"
 	@echo "make sim-grid         train offline on six logs of each sim, four seeds (hours; resumes if interrupted)"
-	@echo "make docs             generate the references and the images of the docs"
+	@echo "make docs             generate the references and images of the docs, and build their site"
+	@echo "make docs-test        run all commands of the docs as they are written (hours)"
 	@echo "make wheel            build the wheel and test it without extras in a fresh environment"
 	@echo "make clean            remove the environments and everything that was built"
 
@@ -31,7 +32,7 @@ test: $(VENV)/.dev $(VENV)/.lerobot $(VENV)/.s3 $(VENV)/.rivals tests/node/node_
 faults: $(VENV)/.dev
 	rm -f $(VENV)/fault-figures
 	MCAPRL_FAULTS=large MCAPRL_FAULT_FIGURES=$(VENV)/fault-figures OMP_NUM_THREADS=1 \
-	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py
+	  $(BIN)/pytest -q -s tests/recorder/repair/test_faults_*.py tests/ray/test_record.py
 	$(BIN)/python -m tests.support.fault_table $(VENV)/fault-figures docs/reliability.md
 
 fuzz: $(VENV)/.fuzz
@@ -58,6 +59,11 @@ sim-grid: $(VENV)/.dev
 
 docs: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
+	@echo "wrote the site: build/site/index.html"
+
+docs-test: $(VENV)/.dev tests/node/node_modules
+	OMP_NUM_THREADS=1 $(BIN)/pytest -m slow tests/docs
 
 wheel: $(VENV)/.dev
 	PYTHON="$(BIN)/python" sh .ci/check-wheel
@@ -78,7 +84,7 @@ $(VENV)/.demo: $(SETTINGS) | $(VENV)/bin/python
 
 $(VENV)/.dev: $(SETTINGS) | $(VENV)/bin/python
 	@echo "installing into $(VENV)"
-	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,remote,fast]' --group dev
+	$(PIP) -e '.[sims,offline,online,report,tables,video,export,foxglove,bags,remote,ray,fast]' --group dev
 	@touch $@
 
 # The libraries that the benchmarks compare with.

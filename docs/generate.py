@@ -182,7 +182,7 @@ class _Text(str):
 
 
 def _plain(parameter: inspect.Parameter) -> inspect.Parameter:
-    """Show annotations without quotes, and functions as defaults without their address."""
+    """Remove the quotes of an annotation, and replace a function as default by `...`."""
     if inspect.isfunction(parameter.default):
         parameter = parameter.replace(default=_Text("..."))
     if parameter.annotation is parameter.empty:
@@ -221,7 +221,7 @@ def contact_sheet(sheet: Sheet, policy: str) -> Figure:
 
 
 def _episode(envs: list[gym.Env[Any, Any]], policy: str, steps: int) -> Iterator[str]:
-    """Run one episode in all environments; yield the end reason, else "", at each step."""
+    """Run one episode in all environments; yield its end reason, or "" while it continues."""
     pilot, actions = make_pilot(envs[0]), envs[0].action_space
     actions.seed(SEED)
     for env in envs:

@@ -1,24 +1,20 @@
-"""The docs are correct: code runs, commands exist, generated pages are up to date."""
+"""The docs are correct: links lead somewhere, generated pages are up to date, options have help."""
 
 from __future__ import annotations
 
 import importlib.util
 import re
-import shlex
 from pathlib import Path
 from types import ModuleType
 
 import click
 import pytest
 
-from mcaprl.cli import cli, run
+from mcaprl.cli import cli
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
 PAGES = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
 PAGES += sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))
-# Sizes at which each of the README's commands takes seconds.
-SMALLER = {"--episodes": "2", "--steps": "200"}
 
 
 def _generator() -> ModuleType:
@@ -37,66 +33,6 @@ def test_generated_references_are_up_to_date(page: str, generate: str) -> None:
     pytest.importorskip("matplotlib")
     text = getattr(_generator(), f"{generate}_reference")()
     assert (ROOT / "docs" / f"{page}.md").read_text() == text, "stale: run `make docs`"
-
-
-def test_readme_code_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    exec(compile(code, "README.md", "exec"), {})
-    assert "Dataset(CartPole-v1: 10 episodes" in capsys.readouterr().out
-
-
-@pytest.mark.filterwarnings("ignore:0 updates of the target network")
-def test_bags_page_code_and_commands_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "bags.md").read_text()
-    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    exec(compile(code, "bags.md", "exec"), {})
-    (mapping,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    assert run(["convert", "--suggest", "bag"]) == 0
-    Path("suggested.yaml").write_text(capsys.readouterr().out)
-    assert run(["convert", "bag", "--mapping", "suggested.yaml", "--dry-run"]) == 0
-    Path("robot.yaml").write_text(mapping)
-    commands = re.findall(r"^ *mcaprl (.*robot.yaml.*)$", page, re.MULTILINE)
-    for command in commands[1:]:
-        options = ["--updates", "20"] if command.startswith(("train", "evaluate")) else []
-        assert run([*shlex.split(command), *options]) == 0, command
-    assert "3 episodes" in capsys.readouterr().out
-
-
-def test_sims_page_code_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("numba")
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "sims.md").read_text(), re.DOTALL)
-    for block in blocks:
-        exec(compile(block.replace("episodes=100", "episodes=3"), "sims.md", "exec"), {})
-    assert capsys.readouterr().out.splitlines() == [
-        "straight 0.5 (600, 600, 3)",
-        "(64, 12) (64,)",
-        "{'finished': 3}",
-    ]
-
-
-def test_readme_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    lines = [line for line in README.splitlines() if line.startswith("mcaprl ")]
-    assert len(lines) == 11
-    for line in lines:
-        arguments = shlex.split(line)[1:]
-        if arguments[0] == "train-offline":
-            arguments += ["--updates", "30", "--hidden", "16,16"]
-            arguments += ["--gamma", "0.5", "--target-interval", "3"]
-        if "--data" in arguments:
-            arguments += ["--updates", "10"]
-        if arguments[0] == "train-online":
-            arguments += ["--eval-episodes", "1", "--final-episodes", "1", "--envs", "2"]
-        for option, value in SMALLER.items():
-            if option in arguments:
-                arguments[arguments.index(option) + 1] = value
-        assert run(arguments) == 0, line
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -38,7 +38,7 @@ window.addEventListener("load", () => {
 </script>"""
 
 
-def browse(page: Path, *flags: str) -> tuple[str, str]:
+def browse(page: Path, *flags: str, query: str = "") -> tuple[str, str]:
     """Return the document after loading in a browser, and the browser's console output."""
     need(BROWSER is not None, "Chromium is not installed (Debian: apt-get install chromium)")
     done = subprocess.run(
@@ -52,7 +52,7 @@ def browse(page: Path, *flags: str) -> tuple[str, str]:
             "--virtual-time-budget=2000",
             *flags,
             "--dump-dom",
-            page.as_uri(),
+            page.as_uri() + query,
         ],
         capture_output=True,
         text=True,

@@ -1,0 +1,130 @@
+"""The site builds without warnings and network, and works in a browser."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+from tests.docs.pages import ROOT
+from tests.test_page import browse
+
+PAGES = sorted(str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md"))
+# Loaded by the browser when the page is shown; other links are followed by the reader.
+LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src")}
+# Width and colors of the page, written where the browser's document dump shows them.
+PROBE = """<script>
+addEventListener("load", () => {
+  const style = getComputedStyle(document.body);
+  document.title = [document.documentElement.scrollWidth, innerWidth, style.color,
+    style.backgroundColor].join("|");
+});
+</script>"""
+
+
+class Links(HTMLParser):
+    """Ids and links of a page."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.ids: set[str] = set()
+        self.loaded: list[str] = []
+        self.followed: list[str] = []
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id" and value:
+                self.ids.add(value)
+            if name in ("src", "href") and value:
+                (self.loaded if (tag, name) in LOADED else self.followed).append(value)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the site as `make docs` does."""
+    folder = tmp_path_factory.mktemp("site")
+    recipe = re.findall(r"sphinx-build (.*) docs build/site", (ROOT / "Makefile").read_text())
+    options = [*recipe[0].split(), "-d", str(folder.with_name("doctrees"))]
+    subprocess.run(
+        [sys.executable, "-m", "sphinx", *options, str(ROOT / "docs"), str(folder)],
+        stderr=subprocess.STDOUT,
+        check=True,
+    )
+    return folder
+
+
+def test_the_site_needs_no_network(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        for target in Links(page).loaded:
+            assert not target.startswith(("http", "//")), f"{page} loads {target}"
+    for style in site.rglob("*.css"):
+        assert not re.search(r"url\(.?(https?:)?//|@import .?http", style.read_text()), style
+
+
+def test_all_links_of_the_site_lead_somewhere(site: Path) -> None:
+    pages = {page: Links(page) for page in site.rglob("*.html")}
+    for page, links in pages.items():
+        for link in links.loaded + links.followed:
+            path, _, anchor = link.partition("#")
+            if re.match(r"\w+:", path):
+                continue
+            target = (page.parent / unquote(path.partition("?")[0])).resolve() if path else page
+            assert target.exists(), f"{page} links to {link}"
+            if anchor and target in pages:
+                assert unquote(anchor) in pages[target].ids, f"{page} links to {link}"
+
+
+def test_the_markdown_of_each_page_is_beside_it(site: Path) -> None:
+    listed = re.findall(r"^- \[.+\]\((.+)\): .+", (site / "llms.txt").read_text(), re.MULTILINE)
+    assert sorted(listed) == PAGES
+    for name in PAGES:
+        assert (site / name).read_text() == (ROOT / "docs" / name).read_text()
+        assert (site / name).with_suffix(".html").is_file()
+
+
+@pytest.mark.parametrize("word", ["behavior_prob", "mcap", "truncated"])
+def test_the_search_finds_pages(site: Path, word: str) -> None:
+    document, console = browse(
+        site / "search.html", "--allow-file-access-from-files", query=f"?q={word}"
+    )
+    assert console == ""
+    assert re.search(r'<a href="[^"]*log-format\.html', document)
+
+
+@pytest.mark.parametrize("page", ["index", "tutorial", "cli", "results"])
+@pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (390, True)])
+def test_pages_fit_phones_and_color_schemes(
+    site: Path, tmp_path: Path, page: str, width: int, dark: bool
+) -> None:
+    probed = site / f"{page}-probed.html"
+    probed.write_text((site / f"{page}.html").read_text() + PROBE)
+    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
+    outer = tmp_path / "outer.html"
+    outer.write_text(
+        f'<iframe id="f" src="{probed.as_uri()}" width="{width}" height="900"></iframe><script>'
+        "f.onload = () => setTimeout(() => { document.title = f.contentDocument.title }, 100)"
+        "</script>"
+    )
+    flags = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    document, console = browse(outer, "--allow-file-access-from-files", *flags)
+    probed.unlink()
+    assert console == ""
+    found = re.search(r"<title>(.*?)</title>", document)
+    assert found is not None, document[:500]
+    needed, offered, ink, back = found[1].split("|")
+    assert int(needed) <= int(offered) == width
+    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
+    assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
+
+
+def test_the_link_check_sees_ids_and_links(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text('<p id="a"><a href="x.html#b">x</a><img src="y.png"></p>')
+    links = Links(page)
+    assert (links.ids, links.loaded, links.followed) == ({"a"}, ["y.png"], ["x.html#b"])
