@@ -103,21 +103,23 @@ def test_vector_of_environments_appends_to_a_single_ones_log(log_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("env", "options", "reported"),
+    ("env_id", "env_kwargs", "options", "reported"),
     [
-        (gym.make("CartPole-v1", sutton_barto_reward=True), {}, "its env_kwargs is"),
-        (gym.make("CartPole-v0"), {}, "env_id is CartPole-v1, but the recording has CartPole-v0"),
-        (gym.make("CartPole-v1"), {"step_duration_s": 0.5}, "its step_duration_ns is 20000000"),
-        (gym.make("MountainCar-v0"), {}, "cannot be appended to"),
-        (gym.make("CartPole-v1"), {"start_time_ns": 1_000}, "must be later"),
-        (gym.make("CartPole-v1"), {"overwrite": True}, "mutually exclusive"),
+        ("CartPole-v1", {"sutton_barto_reward": True}, {}, "its env_kwargs is"),
+        ("CartPole-v0", {}, {}, "env_id is CartPole-v1, but the recording has CartPole-v0"),
+        ("CartPole-v1", {}, {"step_duration_s": 0.5}, "its step_duration_ns is 20000000"),
+        ("MountainCar-v0", {}, {}, "cannot be appended to"),
+        ("CartPole-v1", {}, {"start_time_ns": 1_000}, "must be later"),
+        ("CartPole-v1", {}, {"overwrite": True}, "mutually exclusive"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*CartPole-v0 is out of date:DeprecationWarning")
 def test_incompatible_recordings_are_not_appended(
-    log_path: Path, env: Any, options: dict[str, Any], reported: str
+    log_path: Path, env_id: str, env_kwargs: dict[str, Any], options: dict[str, Any], reported: str
 ) -> None:
     cartpole_log(log_path, 2)
     before = log_path.read_bytes()
+    env = gym.make(env_id, **env_kwargs)
     with pytest.raises((LogError, UsageError), match=reported):
         mcaprl.RecordMcap(env, log_path, append=True, **options)
     assert log_path.read_bytes() == before
