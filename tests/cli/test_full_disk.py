@@ -23,6 +23,7 @@ main(sys.argv[2:])
 """
 LOG, POLICY = "cartpole.mcap", "bc"
 SMALL = ["--hidden", "8", "--checkpoint-interval", "50"]
+OFTEN = ["--log-interval", "1", "--updates", "30"]
 CARTPOLE = ["record", "CartPole-v1", "--steps", "9999", "--policy", "random"]
 ONLINE = ["train-online", "CartPole-v1", "--algo", "dqn", "--steps", "300", "--out", "run", *SMALL]
 
@@ -50,7 +51,7 @@ def _inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (10, ["layout", LOG], "x.json"),
         (2_000, ["info", LOG, "--report"], "x"),
         (2_000, ["train-offline", LOG, *SMALL], "x/seed-0/"),
-        (700, ["train-offline", LOG, "--log-interval", "1", *SMALL], "x/seed-0/metrics.csv"),
+        (900, ["train-offline", LOG, *SMALL, *OFTEN], "x/seed-0/metrics.csv"),
         (2_000, ONLINE, "run/seed-0/"),
         (5_000, [*ONLINE, "--record", "x.mcap"], "x.mcap"),
     ],

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import re
 import zipfile
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,7 +18,6 @@ from mcaprl import Dataset
 from mcaprl.errors import LogError, SpaceError
 from mcaprl.recorder.dataset.formats.columns import EpisodeArrays, dataset_of
 from mcaprl.recorder.format.metadata import LogMetadata
-from tests.conftest import need
 from tests.recorder.dataset.formats.minari_sets import Cameras
 from tests.support.strategies import transitions
 
@@ -157,26 +154,6 @@ def test_without_next_observations_the_last_step_is_left_out_unless_terminal(
 
 
 @pytest.mark.filterwarnings("ignore:Implicitly cleaning up")
-@pytest.mark.parametrize("package", ["minari", "numpy"])
-def test_the_code_of_the_docs_runs(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    package: str,
-) -> None:
-    need(importlib.util.find_spec(package) is not None, package)
-    pytest.importorskip("numba", reason="needs the extra sims")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
-    page = (Path(__file__).parents[4] / "docs/formats.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    for block in blocks:
-        if f"import {package}" in block and "lane" in block:
-            exec(compile(block, "formats.md", "exec"), {})
-    printed = capsys.readouterr().out
-    assert ("EpisodeData(id=0" if package == "minari" else "'final_observations': (2,") in printed
-
-
 def _usual(**changes: Any) -> dict[str, Any]:
     arrays = {
         "observations": np.zeros((2, 3)),
