@@ -144,11 +144,10 @@ SIM_SETTINGS: Final[dict[str, dict[str, Any]]] = {
 
 
 _FROM_IMAGES: Final[dict[str, Any]] = {
-    "learning_rate": 5e-4,
-    "final_learning_rate_fraction": 0.04,
-    "hidden": (256, 256),
+    **_STEADY,
     "batch_size": 64,
-    "learning_starts": 2_000,
+    "buffer_size": 100_000,
+    "exploration_fraction": 0.15,
     "eval_interval": 20_000,
 }
 _LANE_IMAGES: Final[dict[str, Any]] = {
@@ -157,9 +156,7 @@ _LANE_IMAGES: Final[dict[str, Any]] = {
     "layer_norm": True,
     "steps": 200_000,
     "gamma": 0.97,
-    "buffer_size": 100_000,
     "target_update_interval": 4_000,
-    "exploration_fraction": 0.15,
 }
 IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
     (SIMS["lane"], "dashboard"): _LANE_IMAGES,
@@ -169,9 +166,7 @@ IMAGE_SETTINGS: Final[dict[tuple[str, str], dict[str, Any]]] = {
         "steps": 240_000,
         "gamma": 0.95,
         "n_steps": 3,
-        "buffer_size": 100_000,
         "target_update_interval": 2_000,
-        "exploration_fraction": 0.15,
     },
 }
 """Settings for learning from images, by the sim's id and its argument `observation`."""

@@ -27,13 +27,12 @@ from mcaprl.sims.evaluation.rollout import EpisodeResult
 from tests.conftest import need
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-# The page's measurements, written where the browser's document dump shows them.
+# Width and colors of a page and of its SVG texts, written where the document dump shows them.
 PROBE = """<script>
-window.addEventListener("load", () => {
-  const style = getComputedStyle(document.body);
-  document.title = [document.documentElement.scrollWidth, innerWidth,
-    style.color, style.backgroundColor, getComputedStyle(document.querySelector("svg text")).fill]
-    .join("|");
+addEventListener("load", () => {
+  const style = getComputedStyle(document.body), text = document.querySelector("svg text");
+  document.title = [document.documentElement.scrollWidth, innerWidth, style.color,
+    style.backgroundColor, text ? getComputedStyle(text).fill : ""].join("|");
 });
 </script>"""
 
@@ -62,6 +61,30 @@ def browse(page: Path, *flags: str, query: str = "") -> tuple[str, str]:
     return done.stdout, "\n".join(re.findall(r".*CONSOLE.*", done.stderr))
 
 
+def colors_at(page: Path, folder: Path, width: int, *, dark: bool) -> tuple[str, str]:
+    """Check that a page fits a width and a color scheme; return its text color and that of SVGs."""
+    probed = page.with_name(f"{page.stem}-{width}-{dark}.html")
+    probed.write_text(page.read_text() + PROBE)
+    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
+    outer = folder / "outer.html"
+    outer.write_text(
+        f'<iframe id="f" src="{probed.as_uri()}" width="{width}" height="900"></iframe><script>'
+        "f.onload = () => setTimeout(() => { document.title = f.contentDocument.title }, 100)"
+        "</script>"
+    )
+    flags = ["--blink-settings=preferredColorScheme=0"] if dark else []
+    document, console = browse(outer, "--allow-file-access-from-files", *flags)
+    probed.unlink()
+    assert console == ""
+    found = re.search(r"<title>(.*?)</title>", document)
+    assert found is not None, document[:500]
+    needed, offered, ink, back, svg_ink = found[1].split("|")
+    assert int(needed) <= int(offered) == width
+    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
+    assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
+    return ink, svg_ink
+
+
 @pytest.fixture(scope="module")
 def lane_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the report of a short lane log."""
@@ -88,25 +111,10 @@ def test_a_browser_reports_no_error(lane_page: Path) -> None:
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (390, True)])
-def test_the_page_fits_phones_and_color_schemes(lane_page: Path, width: int, dark: bool) -> None:
-    probed = lane_page.with_name(f"probed-{width}-{dark}.html")
-    probed.write_text(lane_page.read_text() + PROBE)
-    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
-    outer = lane_page.with_name(f"outer-{width}-{dark}.html")
-    outer.write_text(
-        f'<iframe id="f" src="{probed.name}" width="{width}" height="900"></iframe><script>'
-        "f.onload = () => setTimeout(() => { document.title = f.contentDocument.title }, 100)"
-        "</script>"
-    )
-    flags = ["--blink-settings=preferredColorScheme=0"] if dark else []
-    document, console = browse(outer, "--allow-file-access-from-files", *flags)
-    assert console == ""
-    found = re.search(r"<title>(.*?)</title>", document)
-    assert found is not None, document[:500]
-    needed, offered, ink, back, svg_ink = found[1].split("|")
-    assert int(needed) <= int(offered) == width
-    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
-    assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
+def test_the_page_fits_phones_and_color_schemes(
+    lane_page: Path, tmp_path: Path, width: int, dark: bool
+) -> None:
+    ink, svg_ink = colors_at(lane_page, tmp_path, width, dark=dark)
     assert svg_ink == ink, "what is drawn has the color of what is written"
 
 

@@ -12,19 +12,11 @@ from urllib.parse import unquote
 import pytest
 
 from tests.docs.pages import ROOT
-from tests.test_page import browse
+from tests.test_page import browse, colors_at
 
 PAGES = sorted(str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md"))
 # Loaded by the browser when the page is shown; other links are followed by the reader.
 LOADED = {("script", "src"), ("img", "src"), ("link", "href"), ("iframe", "src")}
-# Width and colors of the page, written where the browser's document dump shows them.
-PROBE = """<script>
-addEventListener("load", () => {
-  const style = getComputedStyle(document.body);
-  document.title = [document.documentElement.scrollWidth, innerWidth, style.color,
-    style.backgroundColor].join("|");
-});
-</script>"""
 
 
 class Links(HTMLParser):
@@ -102,25 +94,7 @@ def test_the_search_finds_pages(site: Path, word: str) -> None:
 def test_pages_fit_phones_and_color_schemes(
     site: Path, tmp_path: Path, page: str, width: int, dark: bool
 ) -> None:
-    probed = site / f"{page}-probed.html"
-    probed.write_text((site / f"{page}.html").read_text() + PROBE)
-    # Chromium's windows are at least 500 pixels wide; a frame can be narrower.
-    outer = tmp_path / "outer.html"
-    outer.write_text(
-        f'<iframe id="f" src="{probed.as_uri()}" width="{width}" height="900"></iframe><script>'
-        "f.onload = () => setTimeout(() => { document.title = f.contentDocument.title }, 100)"
-        "</script>"
-    )
-    flags = ["--blink-settings=preferredColorScheme=0"] if dark else []
-    document, console = browse(outer, "--allow-file-access-from-files", *flags)
-    probed.unlink()
-    assert console == ""
-    found = re.search(r"<title>(.*?)</title>", document)
-    assert found is not None, document[:500]
-    needed, offered, ink, back = found[1].split("|")
-    assert int(needed) <= int(offered) == width
-    brightness = [sum(map(int, re.findall(r"\d+", color)[:3])) / 3 for color in (ink, back)]
-    assert brightness[0] - brightness[1] > 150 if dark else brightness[1] - brightness[0] > 150
+    colors_at(site / f"{page}.html", tmp_path, width, dark=dark)
 
 
 def test_the_link_check_sees_ids_and_links(tmp_path: Path) -> None:
