@@ -2,8 +2,8 @@
 
     python -m benchmarks.ray_record
 
-Both record the same episodes. The time is that of a clock, since several processes work; the start
-of the Ray cluster does not count. On a busy machine, repeat the comparison.
+Both record the same episodes. Wall time is measured, because several processes work; the start of
+the Ray cluster is not included. On a busy machine, repeat the comparison.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main() -> None:
     """Print the ratio."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        # The first reading starts a cluster, which stays.
+        # The first call starts a cluster, which later calls use.
         _record(folder / "envs", envs=WORKERS)
         mcaprl.ray.read(folder / "envs")
         compare(

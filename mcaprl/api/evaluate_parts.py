@@ -54,7 +54,7 @@ def results_on_ray(
 ) -> dict[str, list[list[EpisodeResult]]]:
     """Return the episodes of each training seed of each policy, run by Ray workers.
 
-    The parts do not depend on the workers, so that the results do not, either.
+    The division into parts does not depend on the workers, so neither do the results.
 
     Args:
         request: Sim and seed.
@@ -69,7 +69,7 @@ def results_on_ray(
     """
     from mcaprl.ray.workers import WorkerDiedError, run_tasks
 
-    # Other machines have other working directories.
+    # Paths are absolute, because workers have other working directories.
     paths = {name: Path(name).absolute() for name in found if name not in SCRIPTED}
     parts, keys = [], []
     for name, candidates in found.items():

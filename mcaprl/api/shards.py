@@ -21,7 +21,7 @@ from mcaprl.sims.evaluation.rollout import EpisodeResult
 from mcaprl.texts import counted
 from mcaprl.workers import WorkerEndedError, run_workers
 
-# Defaults for the files that Ray workers write: most files, and least number of steps of a file.
+# Default number of files on Ray: at most 64, each with at least 10,000 steps.
 _MOST_SHARDS, _LEAST_STEPS = 64, 10_000
 
 
@@ -99,7 +99,7 @@ def record_on_ray(
 ) -> list[EpisodeResult]:
     """Record shards on the workers of a Ray cluster, then write the manifest of the folder.
 
-    The shards do not depend on the workers, so that the episodes do not, either.
+    The division into shards does not depend on the workers, so neither do the episodes.
 
     Raises:
         OutputExistsError: The folder contains logs that may not be replaced.
@@ -109,7 +109,7 @@ def record_on_ray(
     from mcaprl.ray.shards import unfinished_folder
     from mcaprl.ray.workers import WorkerDiedError, run_tasks
 
-    # Other machines have other working directories.
+    # Paths are absolute, because workers have other working directories.
     whole = replace(whole, out=whole.out.absolute(), policy=_absolute(whole.policy))
     shards = _divided(whole, _count(whole, parts))
     with options.connected(), _new_folder(whole, shards[0]):

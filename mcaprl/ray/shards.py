@@ -1,4 +1,4 @@
-"""A log that one worker after another may continue, and that appears when it is complete."""
+"""Log that workers continue if one of them is killed; it gets its name when it is complete."""
 
 from __future__ import annotations
 
@@ -51,9 +51,10 @@ class Shard:
             recover_log(self.unfinished, repaired, overwrite=True)
             kept = episodes_of(repaired)
         except LogError:
-            # It has no finished episode.
+            # The file has no finished episode.
             kept = []
-        # A worker that ended in good order has cut off its last episode.
+        # A worker that was stopped, not killed, has closed the log with an interrupted episode.
+        # Such a log is recorded again from its beginning.
         if kept and kept[-1].reason != INTERRUPTED:
             os.replace(repaired, self.unfinished)
             return kept

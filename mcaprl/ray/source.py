@@ -29,7 +29,7 @@ from mcaprl.recorder.dataset.open import Episodes, episode_indexes
 from mcaprl.recorder.dataset.tables import described
 from mcaprl.recorder.format.metadata import LogMetadata, installed_versions
 
-# Smaller blocks only cost time, if there are enough of them for all CPUs.
+# Smaller blocks take more time in total; they are made only if there are too few for all CPUs.
 _LEAST_BYTES = 16 << 20
 
 
@@ -52,7 +52,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What all tasks read.
+    """Columns that every task reads, and their description.
 
     Attributes:
         names: Names of the columns.
@@ -141,7 +141,7 @@ class LogSource(Datasource):  # type: ignore[misc]
         return "McapLogs"
 
     def supports_projection_pushdown(self) -> bool:
-        """Return that columns which later steps do not need are not read."""
+        """Return True: columns that no later step needs are not read."""
         return True
 
     def estimate_inmemory_data_size(self) -> int:

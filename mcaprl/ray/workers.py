@@ -190,7 +190,7 @@ class _Pool:
 
     def start(self) -> None:
         worker = self.kind.remote()
-        # A worker that finds no free CPU yet has no task, so that no task waits for it.
+        # A worker gets a task only when it has a CPU, so that no task waits for a free CPU.
         self.calls[worker.check.remote(installed_versions(), self.paths)] = (worker, None)
 
     def take_result(self, call: Any) -> None:
@@ -247,7 +247,7 @@ class _Pool:
         try:
             index, amount = self.ray.get(call)
         except self.ray.exceptions.RayError:
-            # The worker died, as the result of its task will show.
+            # The worker died; the call that runs its task reports the error.
             return
         if index >= 0 and index not in self.results:
             self.count(index, amount)

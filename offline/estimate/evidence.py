@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FOLDS: Final = 2
 LIKELY: Final = 0.1
-"""Smallest probability under the clone, relative to the most likely action, of a likely action."""
+"""Fraction of the largest probability under the clone that makes an action likely."""
 LOW_PERCENTILE: Final = 1.0
 _SYNCS_PER_HORIZON: Final = 6.0
 
